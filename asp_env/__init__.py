@@ -1,0 +1,1 @@
+"""Does this trajectory predictor make the car drive better?"""

@@ -1,0 +1,1 @@
+"""What was measured and what may be known: recordings, maps, scenarios, scenes, forecasts."""

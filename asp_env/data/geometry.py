@@ -1,0 +1,100 @@
+"""Frames, boxes and paths: the only definitions, for arrays with any leading axes."""
+
+import numpy as np
+from jaxtyping import Bool, Float, Shaped
+
+from asp_env.dynamics import wrap_angle
+
+
+def to_frame(
+    points: Shaped[np.ndarray, "*batch 2"], poses: Shaped[np.ndarray, "*poses n"]
+) -> Shaped[np.ndarray, "*out 2"]:
+    """Points seen from poses [x, y, heading, …] that broadcast against them: x ahead, y left."""
+    offset = points - poses[..., :2]
+    cos, sin = np.cos(poses[..., 2]), np.sin(poses[..., 2])
+    ahead = cos * offset[..., 0] + sin * offset[..., 1]
+    left = cos * offset[..., 1] - sin * offset[..., 0]
+    return np.stack([ahead, left], axis=-1)
+
+
+def from_frame(
+    points: Shaped[np.ndarray, "*batch 2"], poses: Shaped[np.ndarray, "*poses n"]
+) -> Shaped[np.ndarray, "*out 2"]:
+    """The inverse of `to_frame`."""
+    cos, sin = np.cos(poses[..., 2]), np.sin(poses[..., 2])
+    x = poses[..., 0] + cos * points[..., 0] - sin * points[..., 1]
+    y = poses[..., 1] + sin * points[..., 0] + cos * points[..., 1]
+    return np.stack([x, y], axis=-1)
+
+
+def states_to_frame(
+    states: Shaped[np.ndarray, "*batch 4"], poses: Shaped[np.ndarray, "*poses n"]
+) -> Shaped[np.ndarray, "*out 4"]:
+    """States [x, y, heading, speed] seen from poses: positions and headings turn, speeds stay."""
+    heading = wrap_angle(states[..., 2] - poses[..., 2])
+    speed = np.broadcast_to(states[..., 3], heading.shape)
+    xy = to_frame(states[..., :2], poses)
+    return np.concatenate([xy, heading[..., None], speed[..., None]], axis=-1)
+
+
+def box_corners(
+    states: Shaped[np.ndarray, "*batch n"], sizes: Shaped[np.ndarray, "*batch 2"]
+) -> Shaped[np.ndarray, "*batch 4 2"]:
+    """Corners of boxes (length, width) centred at states: front left, then clockwise."""
+    signs = np.array([(0.5, 0.5), (0.5, -0.5), (-0.5, -0.5), (-0.5, 0.5)], dtype=states.dtype)
+    return from_frame(sizes[..., None, :] * signs, states[..., None, :])
+
+
+def path_length(points: Shaped[np.ndarray, "*batch n 2"]) -> float | np.ndarray:
+    """Length of a polyline, metres; points without motion add nothing."""
+    return np.hypot(*np.moveaxis(np.diff(points, axis=-2), -1, 0)).sum(axis=-1)
+
+
+def resample(points: Float[np.ndarray, "n 2"], spacing_m: float) -> Float[np.ndarray, "m 2"]:
+    """Points `spacing_m` apart along a polyline, the first at its start, none beyond its end."""
+    steps = np.hypot(*np.diff(points, axis=0).T)
+    keep = np.concatenate([[True], steps > 1e-6])
+    points, steps = points[keep], steps[steps > 1e-6]
+    arc = np.concatenate([[0.0], np.cumsum(steps, dtype=np.float64)])
+    at = np.arange(0.0, arc[-1] + 1e-9, spacing_m)
+    columns = [np.interp(at, arc, points[:, axis]) for axis in (0, 1)]
+    return np.stack(columns, axis=-1).astype(points.dtype)
+
+
+def route_along(states: Float[np.ndarray, "n 4"], *, beyond_m: float) -> Float[np.ndarray, "m 2"]:
+    """The way of a track: its positions 1 m apart, then straight on for `beyond_m`.
+
+    Points are taken only where the vehicle got on, so that standing and jitter leave no trace.
+    """
+    kept = [states[0, :2]]
+    for point in states[1:, :2]:
+        if np.hypot(*(point - kept[-1])) >= 0.5:
+            kept.append(point)
+    end = kept[-1]
+    if len(kept) > 1:
+        direction = (kept[-1] - kept[-2]) / np.hypot(*(kept[-1] - kept[-2]))
+    else:
+        direction = np.array([np.cos(states[-1, 2]), np.sin(states[-1, 2])])
+    kept.append(end + (beyond_m * direction).astype(states.dtype))
+    return resample(np.stack(kept), 1.0)
+
+
+def boxes_overlap(
+    states: Shaped[np.ndarray, "*batch n"],
+    sizes: Shaped[np.ndarray, "*batch 2"],
+    other_states: Shaped[np.ndarray, "*batch n"],
+    other_sizes: Shaped[np.ndarray, "*batch 2"],
+) -> Bool[np.ndarray, "*batch"]:
+    """Whether two oriented boxes intersect (separating axis theorem); touching is no overlap."""
+    corners = box_corners(states, sizes)
+    other_corners = box_corners(other_states, other_sizes)
+    overlap = np.ones(corners.shape[:-2], dtype=bool)
+    for frame, size, seen in (
+        (states, sizes, other_corners),
+        (other_states, other_sizes, corners),
+    ):
+        local = to_frame(seen, frame[..., None, :])
+        half = 0.5 * size
+        overlap &= (local.min(axis=-2) < half).all(axis=-1)
+        overlap &= (local.max(axis=-2) > -half).all(axis=-1)
+    return overlap

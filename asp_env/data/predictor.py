@@ -1,0 +1,54 @@
+"""The socket for predictors, and how one is named: `name` or `name:RUN_DIR`."""
+
+from typing import Protocol
+
+from asp_env import registry
+from asp_env.data.forecast import Forecast
+from asp_env.data.scene import Scene
+from asp_env.data.snippets import Future
+
+
+class Predictor(Protocol):
+    """Anything that forecasts the targets of a scene."""
+
+    name: str
+    privileged: bool
+    """Whether it is handed the recorded future; tables name such a predictor as an oracle."""
+    dt_s: float
+    history: int
+    """Past ticks that it needs to see of a target."""
+    horizon: int
+    """Ticks that it forecasts."""
+
+    def predict(self, scene: Scene, future: Future | None = None) -> Forecast:
+        """Forecasts the scene's targets; only privileged predictors get a future."""
+        ...
+
+
+class PredictorPlug(Protocol):
+    """What the registry holds under a predictor's name."""
+
+    def from_name(self, argument: str, *, horizon: int, dt_s: float) -> Predictor:
+        """The predictor for what stands behind the colon of its name, possibly nothing.
+
+        Raises:
+            AspEnvError: the argument is missing, superfluous, or cannot be loaded.
+        """
+        ...
+
+
+def load_predictor(name: str, *, horizon: int, dt_s: float) -> Predictor:
+    """The predictor of a name such as `constant-velocity` or `ffw-asp:runs/1`.
+
+    Args:
+        name: the registered name, and behind a colon its folder if it is a trained one.
+        horizon: ticks to forecast, for predictors that can forecast any number; a trained one
+            keeps its own.
+        dt_s: the time step of the scenes to come.
+
+    Raises:
+        AspEnvError: the name is unknown, or the predictor cannot be made for it.
+    """
+    kind, _, argument = name.partition(":")
+    plug: PredictorPlug = registry.find("predictors", kind)
+    return plug.from_name(argument, horizon=horizon, dt_s=dt_s)

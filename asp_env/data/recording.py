@@ -1,0 +1,121 @@
+"""What was measured at one place: a ragged table of tracks with an index by frame."""
+
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+
+import numpy as np
+from jaxtyping import Bool, Float, Int
+
+from asp_env.data.classes import PREDICTED
+from asp_env.data.road_map import RoadMap
+from asp_env.errors import DataError
+
+PARKED_WITHIN_M = 1.0
+"""A track of the whole recording that stays within this distance of its start is parked."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Background:
+    """A picture of the place from above, for people."""
+
+    path: Path
+    metres_per_pixel: float
+    """Pixel (column, row) shows the point (column, -row) times this."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Recording:
+    """Tracks of road users at one place. Arrays may be memory-mapped; nobody writes to them.
+
+    A track has a row for every frame from its first to its last, so that row = start + frame -
+    first frame. Rows are sorted by track, then frame.
+    """
+
+    name: str
+    """The recording's id in its files, such as `00`."""
+    location: str
+    frame_rate_hz: float
+    num_frames: int
+    speed_limit_mps: float | None
+    track_ids: Int[np.ndarray, " tracks"]
+    classes: Int[np.ndarray, " tracks"]
+    """`AgentClass` of each track."""
+    sizes: Float[np.ndarray, "tracks 2"]
+    """Length and width, metres, never zero."""
+    first_frames: Int[np.ndarray, " tracks"]
+    starts: Int[np.ndarray, " tracks+1"]
+    """Track i has the rows `starts[i]:starts[i + 1]`."""
+    states: Float[np.ndarray, "rows 4"]
+    """[x m, y m, heading rad, speed m/s signed along the heading]."""
+    road_map: RoadMap
+    background: Background | None = None
+    repairs: tuple[str, ...] = ()
+    """What the reader had to mend, one line each."""
+
+    def __post_init__(self) -> None:
+        """Checks that the parts fit together.
+
+        Raises:
+            DataError: a count does not match.
+        """
+        tracks = len(self.track_ids)
+        if not (
+            len(self.classes) == len(self.sizes) == len(self.first_frames) == tracks
+            and len(self.starts) == tracks + 1
+            and self.starts[-1] == len(self.states)
+        ):
+            raise DataError(f"recording {self.name}: the track table's columns differ in length")
+
+    def __len__(self) -> int:
+        """How many tracks there are."""
+        return len(self.track_ids)
+
+    @property
+    def duration_s(self) -> float:
+        """From the first frame to the last."""
+        return self.num_frames / self.frame_rate_hz
+
+    @cached_property
+    def last_frames(self) -> Int[np.ndarray, " tracks"]:
+        """The last frame of each track."""
+        return self.first_frames + np.diff(self.starts).astype(self.first_frames.dtype) - 1
+
+    @cached_property
+    def parked(self) -> Bool[np.ndarray, " tracks"]:
+        """Present in the whole recording and never 1 m from where it was first."""
+        whole = (self.first_frames == 0) & (self.last_frames == self.num_frames - 1)
+        still = [
+            bool(
+                whole[i]
+                and np.hypot(*(self.track(i)[:, :2] - self.track(i)[0, :2]).T).max()
+                < PARKED_WITHIN_M
+            )
+            for i in range(len(self))
+        ]
+        return np.array(still, dtype=bool)
+
+    @cached_property
+    def predicted(self) -> Bool[np.ndarray, " tracks"]:
+        """Which tracks may be targets of prediction: class is one that is, and not parked."""
+        return np.isin(self.classes, [int(kind) for kind in PREDICTED]) & ~self.parked
+
+    @cached_property
+    def frame_index(self) -> tuple[Int[np.ndarray, " frames+1"], Int[np.ndarray, " rows"]]:
+        """(starts, tracks): frame f shows `tracks[starts[f]:starts[f + 1]]`, in file order."""
+        lengths = np.diff(self.starts)
+        tracks = np.repeat(np.arange(len(self), dtype=np.int32), lengths)
+        within = np.arange(len(tracks)) - np.repeat(self.starts[:-1], lengths)
+        frames = np.repeat(self.first_frames, lengths) + within
+        order = np.argsort(frames, kind="stable")
+        counts = np.bincount(frames, minlength=self.num_frames)
+        return np.concatenate([[0], np.cumsum(counts)]), tracks[order]
+
+    def track(self, index: int) -> Float[np.ndarray, "frames 4"]:
+        """The states of track number `index` at all of its frames."""
+        return self.states[self.starts[index] : self.starts[index + 1]]
+
+    def tracks_between(self, first_frame: int, last_frame: int) -> Int[np.ndarray, " found"]:
+        """Indices of the tracks seen in [first_frame, last_frame], by first frame, then id."""
+        seen = np.flatnonzero((self.first_frames <= last_frame) & (self.last_frames >= first_frame))
+        return seen[np.lexsort((self.track_ids[seen], self.first_frames[seen]))]

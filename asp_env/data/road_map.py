@@ -1,0 +1,93 @@
+"""What the road looks like at one place, in its recording's metric frame."""
+
+from dataclasses import dataclass
+from enum import IntEnum
+
+import numpy as np
+from jaxtyping import Float, Int
+
+from asp_env.errors import DataError
+
+
+class LineType(IntEnum):
+    """What a polyline of the map marks."""
+
+    CURB = 0
+    SOLID = 1
+    DASHED = 2
+    VIRTUAL = 3
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Ragged:
+    """Sequences of points of different lengths, stored back to back."""
+
+    points: Float[np.ndarray, "points 2"]
+    """All points, metres."""
+    starts: Int[np.ndarray, " sequences+1"]
+    """Sequence i is `points[starts[i]:starts[i + 1]]`."""
+
+    def __len__(self) -> int:
+        """How many sequences there are."""
+        return len(self.starts) - 1
+
+    def __getitem__(self, index: int) -> np.ndarray:
+        """The points (n, 2) of one sequence."""
+        if not -len(self) <= index < len(self):
+            raise IndexError(index)
+        index %= len(self)
+        return self.points[self.starts[index] : self.starts[index + 1]]
+
+    @classmethod
+    def pack(cls, sequences: "list[np.ndarray]") -> "Ragged":
+        """Stores arrays (n_i, 2) back to back."""
+        lengths = [len(sequence) for sequence in sequences]
+        points = np.concatenate(sequences) if sequences else np.zeros((0, 2))
+        return cls(
+            points=points.astype(np.float64),
+            starts=np.concatenate([[0], np.cumsum(lengths, dtype=np.int64)]).astype(np.int64),
+        )
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class RoadMap:
+    """Boundary and lane lines, drivable area, and lane centre lines with their successors."""
+
+    name: str
+    lines: Ragged
+    """Polylines of boundaries and lane markings."""
+    line_types: Int[np.ndarray, " lines"]
+    """`LineType` of each polyline."""
+    drivable: Ragged
+    """Rings, not closed, whose union is what vehicles may drive on."""
+    lanes: Ragged
+    """Centre lines of the lanes for vehicles, in the direction of travel."""
+    successors: Int[np.ndarray, "edges 2"]
+    """(lane, next lane) as indices into `lanes`."""
+    repairs: tuple[str, ...] = ()
+    """What the reader had to mend, one line each."""
+
+    def __post_init__(self) -> None:
+        """Checks that the parts fit together.
+
+        Raises:
+            DataError: a count does not match.
+        """
+        if len(self.line_types) != len(self.lines):
+            raise DataError(
+                f"map {self.name}: {len(self.lines)} lines but {len(self.line_types)} line types"
+            )
+        if self.successors.size and self.successors.max() >= len(self.lanes):
+            raise DataError(
+                f"map {self.name}: a successor names lane {self.successors.max()} "
+                f"of {len(self.lanes)}"
+            )
+
+    @property
+    def extent_m(self) -> tuple[float, float, float, float]:
+        """Smallest x, smallest y, largest x, largest y over lines and drivable area."""
+        points = np.concatenate([self.lines.points, self.drivable.points])
+        if not len(points):
+            return (0.0, 0.0, 1.0, 1.0)
+        low, high = points.min(axis=0), points.max(axis=0)
+        return (float(low[0]), float(low[1]), float(high[0]), float(high[1]))

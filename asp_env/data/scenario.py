@@ -1,0 +1,108 @@
+"""Where, when and who: the table of episodes that can be driven."""
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from asp_env.data.clock import frames_per_tick, ticks
+from asp_env.data.geometry import path_length
+from asp_env.data.recording import Recording
+from asp_env.dynamics import wrap_angle
+
+MAX_LENGTH_S = 15.0
+MIN_LENGTH_S = 4.0
+MIN_DISTANCE_M = 10.0
+TURN_RAD = np.pi / 6
+STANDING_MPS = 0.5
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Scenario:
+    """One episode: an ego in a stretch of a recording."""
+
+    source: str
+    """DATA as the user named it."""
+    recording: int
+    """Index of the recording in its source."""
+    recording_name: str
+    start_tick: int
+    """The tick of the first observation; its history lies before it."""
+    length: int
+    """How many steps the recording provides after `start_tick`."""
+    ego_id: int
+    seed: int = 0
+    """Seeds the generator of this episode, for drivers that draw."""
+    tags: tuple[str, ...] = ()
+
+    @property
+    def name(self) -> str:
+        """A readable name, unique within the source."""
+        return f"{self.recording_name}-{self.ego_id}-{self.start_tick}"
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class ScenarioSet:
+    """Scenarios that can be counted, indexed and filtered by tag."""
+
+    scenarios: tuple[Scenario, ...]
+
+    def __len__(self) -> int:
+        """How many there are."""
+        return len(self.scenarios)
+
+    def __getitem__(self, index: int) -> Scenario:
+        """One of them."""
+        return self.scenarios[index]
+
+    def __iter__(self) -> Iterator[Scenario]:
+        """All of them in order."""
+        return iter(self.scenarios)
+
+    def tagged(self, tag: str) -> "ScenarioSet":
+        """Those that carry a tag."""
+        return ScenarioSet(scenarios=tuple(s for s in self.scenarios if tag in s.tags))
+
+
+def find_scenarios(
+    recordings: Sequence[Recording], *, source: str, dt_s: float, history: int
+) -> ScenarioSet:
+    """Every stretch of a vehicle's track that is worth driving.
+
+    A track of a predicted class is cut, from the first tick with `history` ticks behind it, into
+    windows of at most 15 s without overlap; those of at least 4 s in which the vehicle covers at
+    least 10 m are kept. Tags: `left`, `right` or `straight` (30° of total turn), and
+    `standing-start`.
+    """
+    longest, shortest = ticks(MAX_LENGTH_S, dt_s), ticks(MIN_LENGTH_S, dt_s)
+    found: list[Scenario] = []
+    for number, recording in enumerate(recordings):
+        stride = frames_per_tick(recording.frame_rate_hz, dt_s)
+        for track in np.flatnonzero(recording.predicted):
+            first = -(-int(recording.first_frames[track]) // stride) + history
+            last = int(recording.last_frames[track]) // stride
+            for start in range(first, last - shortest + 1, longest):
+                length = min(longest, last - start)
+                rows = (start + np.arange(length + 1)) * stride - recording.first_frames[track]
+                states = recording.track(int(track))[rows]
+                if path_length(states[:, :2]) < MIN_DISTANCE_M:
+                    continue
+                found.append(
+                    Scenario(
+                        source=source,
+                        recording=number,
+                        recording_name=recording.name,
+                        start_tick=start,
+                        length=length,
+                        ego_id=int(recording.track_ids[track]),
+                        seed=len(found),
+                        tags=_tags(states),
+                    )
+                )
+    return ScenarioSet(scenarios=tuple(found))
+
+
+def _tags(states: np.ndarray) -> tuple[str, ...]:
+    turned = float(wrap_angle(np.diff(states[:, 2])).sum())
+    turn = "left" if turned > TURN_RAD else "right" if turned < -TURN_RAD else "straight"
+    return (turn, "standing-start") if abs(states[0, 3]) < STANDING_MPS else (turn,)

@@ -1,0 +1,140 @@
+"""Kinematic bicycle model with the reference point at the centre of the vehicle's box.
+
+State `[x, y, heading, speed]` (m, m, rad counter-clockwise from +x, m/s, signed along the
+heading); action `[acceleration, steering]` (m/s², rad, left positive). Both axles lie 0.3 times
+the length from the centre. Equations (bicycle) and (inv_bicycle) of Janjoš et al. 2021, with the
+missing time step restored and the slip angle's denominator read as l_f + l_r. Every function takes
+NumPy arrays or torch tensors, float32 or float64, with any leading batch axes.
+"""
+
+import math
+from typing import Any, Literal
+
+import numpy as np
+from jaxtyping import Float
+
+from asp_env.dynamics.limits import MAX_STEERING_RAD, namespace
+
+Integrator = Literal["heun", "euler"]
+
+AXLE_SHARE_OF_LENGTH = 0.3
+"""Distance from the centre of the box to either axle, as a share of the vehicle's length."""
+
+STANDSTILL_MPS = 0.5
+"""Below this mean speed a change of heading says nothing of the steering, which is then 0."""
+
+_MAX_SIN_SLIP = math.sin(math.atan(0.5 * math.tan(MAX_STEERING_RAD)))
+
+
+def wrap_angle(angle_rad: Any) -> Any:
+    """The same angle in [-π, π)."""
+    return (angle_rad + math.pi) % (2 * math.pi) - math.pi
+
+
+def forward(
+    states: Float[Any, "*batch 4"],
+    actions: Float[Any, "*batch 2"],
+    lengths_m: Float[Any, "*batch"],
+    dt_s: float,
+    *,
+    integrator: Integrator = "heun",
+    reverse: bool = False,
+) -> Float[Any, "*batch 4"]:
+    """The states one step later.
+
+    Args:
+        states: states now.
+        actions: actions held during the step.
+        lengths_m: vehicle lengths; must be positive.
+        dt_s: duration of the step.
+        integrator: `heun` (second order, default) or `euler` (the paper's, and highway-env's).
+        reverse: whether speed may become negative. Otherwise braking ends at speed 0.
+
+    Returns:
+        States after the step; the heading is wrapped to [-π, π).
+    """
+    return _integrate(states, actions[..., None, :], lengths_m, dt_s, integrator, reverse)[
+        ..., 0, :
+    ]
+
+
+def rollout(
+    states: Float[Any, "*batch 4"],
+    actions: Float[Any, "*batch steps 2"],
+    lengths_m: Float[Any, "*batch"],
+    dt_s: float,
+    *,
+    integrator: Integrator = "heun",
+    reverse: bool = False,
+) -> Float[Any, "*batch steps 4"]:
+    """The states after each of several steps, without a loop over them.
+
+    Arguments as in `forward`, which this equals step by step up to rounding. The model is
+    sequential only in sums (speed, then heading, then position) and in the running minimum that
+    keeps the speed from becoming negative.
+    """
+    return _integrate(states, actions, lengths_m, dt_s, integrator, reverse)
+
+
+def _integrate(
+    states: Any, actions: Any, lengths_m: Any, dt_s: float, integrator: Integrator, reverse: bool
+) -> Any:
+    xp = namespace(states)
+    rear_m = (AXLE_SHARE_OF_LENGTH * lengths_m)[..., None]
+    slip = xp.arctan(0.5 * xp.tan(actions[..., 1]))
+    speed_0 = states[..., 3:4]
+    speed_after = speed_0 + xp.cumsum(actions[..., 0] * dt_s, axis=-1)
+    if not reverse:
+        speed_after = speed_after - xp.clip(_running_minimum(speed_after), None, 0.0)
+    speed_before = xp.concatenate([speed_0, speed_after[..., :-1]], axis=-1)
+
+    turn = xp.sin(slip) / rear_m * dt_s  # heading change per unit of speed
+    mean = speed_before if integrator == "euler" else 0.5 * (speed_before + speed_after)
+    heading_0 = states[..., 2:3]
+    heading_after = heading_0 + xp.cumsum(mean * turn, axis=-1)
+    heading_before = xp.concatenate([heading_0, heading_after[..., :-1]], axis=-1)
+
+    course = heading_before + slip
+    step_x = speed_before * xp.cos(course)
+    step_y = speed_before * xp.sin(course)
+    if integrator == "heun":
+        end_course = course + speed_before * turn
+        step_x = 0.5 * (step_x + speed_after * xp.cos(end_course))
+        step_y = 0.5 * (step_y + speed_after * xp.sin(end_course))
+    x = states[..., 0:1] + xp.cumsum(step_x * dt_s, axis=-1)
+    y = states[..., 1:2] + xp.cumsum(step_y * dt_s, axis=-1)
+    return xp.stack([x, y, wrap_angle(heading_after), speed_after], axis=-1)
+
+
+def _running_minimum(values: Any) -> Any:
+    xp = namespace(values)
+    if xp is np:
+        return np.minimum.accumulate(values, axis=-1)
+    return xp.cummin(values, dim=-1).values
+
+
+def inverse(
+    states: Float[Any, "*batch 4"],
+    next_states: Float[Any, "*batch 4"],
+    lengths_m: Float[Any, "*batch"],
+    dt_s: float,
+    *,
+    integrator: Integrator = "heun",
+) -> Float[Any, "*batch 2"]:
+    """The actions that lead from `states` to the headings and speeds of `next_states`.
+
+    Exact for what `forward` made with the same integrator and steering within ±π/4, away from
+    standstill. Positions are not read: the problem is overdetermined, and like the paper we trust
+    heading and speed. Below a mean speed of 0.5 m/s the steering is 0; never NaN.
+    """
+    xp = namespace(states)
+    rear_m = AXLE_SHARE_OF_LENGTH * lengths_m
+    speed, next_speed = states[..., 3], next_states[..., 3]
+    acceleration = (next_speed - speed) / dt_s
+    mean = speed if integrator == "euler" else 0.5 * (speed + next_speed)
+    moves = xp.abs(mean) >= STANDSTILL_MPS
+    safe_mean = xp.where(moves, mean, xp.ones_like(mean))
+    turned = wrap_angle(next_states[..., 2] - states[..., 2])
+    sin_slip = xp.clip(rear_m * turned / (safe_mean * dt_s), -_MAX_SIN_SLIP, _MAX_SIN_SLIP)
+    steering = xp.arctan(2.0 * sin_slip / xp.sqrt(1.0 - sin_slip * sin_slip))
+    return xp.stack([acceleration, xp.where(moves, steering, xp.zeros_like(steering))], axis=-1)

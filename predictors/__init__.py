@@ -1,0 +1,1 @@
+"""Forecasters, learned and physical, and how they are trained."""
