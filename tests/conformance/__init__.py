@@ -1,0 +1,1 @@
+"""One suite per socket, over everything that its registry knows."""
