@@ -98,7 +98,7 @@ def make_recording(
     tracks, first_frames = [], []
     for drive in drives:
         first = round(drive.appears_s * frame_rate_hz)
-        last = min(frames - 1, math.floor(drive.leaves_s * frame_rate_hz))
+        last = round(min(duration_s, drive.leaves_s) * frame_rate_hz)
         first_frames.append(first)
         tracks.append(_drive(drive, num_frames=last - first + 1, rate_hz=frame_rate_hz, rng=rng))
     classes = np.array([drive.kind for drive in drives], dtype=np.int32)
