@@ -101,7 +101,7 @@ class Recording:
         return np.isin(self.classes, [int(kind) for kind in PREDICTED]) & ~self.parked
 
     @cached_property
-    def frame_index(self) -> tuple[Int[np.ndarray, " frames+1"], Int[np.ndarray, " rows"]]:
+    def frame_index(self) -> tuple[Int[np.ndarray, " bounds"], Int[np.ndarray, " rows"]]:
         """(starts, tracks): frame f shows `tracks[starts[f]:starts[f + 1]]`, in file order."""
         lengths = np.diff(self.starts)
         tracks = np.repeat(np.arange(len(self), dtype=np.int32), lengths)

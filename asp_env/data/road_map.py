@@ -24,7 +24,7 @@ class Ragged:
 
     points: Float[np.ndarray, "points 2"]
     """All points, metres."""
-    starts: Int[np.ndarray, " sequences+1"]
+    starts: Int[np.ndarray, " bounds"]
     """Sequence i is `points[starts[i]:starts[i + 1]]`."""
 
     def __len__(self) -> int:

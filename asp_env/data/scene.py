@@ -19,11 +19,11 @@ class Scene:
     Slots of absent agents are zeros with id -1 and `valid` false. Slot 0 is the ego.
     """
 
-    states: Float[np.ndarray, "b a n+1 4"]
+    states: Float[np.ndarray, "b a ticks 4"]
     """[x m, y m, heading rad, speed m/s]; the last tick is now."""
-    actions: Float[np.ndarray, "b a n 2"]
+    actions: Float[np.ndarray, "b a ticks-1 2"]
     """[acceleration m/s², steering rad], inferred from the states; the last one ends now."""
-    valid: Bool[np.ndarray, "b a n+1"]
+    valid: Bool[np.ndarray, "b a ticks"]
     sizes: Float[np.ndarray, "b a 2"]
     """Length and width, metres."""
     classes: Int[np.ndarray, "b a"]
@@ -73,11 +73,11 @@ class Scene:
 
 
 def infer_actions(
-    states: Float[np.ndarray, "*batch n+1 4"],
-    valid: Bool[np.ndarray, "*batch n+1"],
+    states: Float[np.ndarray, "*batch ticks 4"],
+    valid: Bool[np.ndarray, "*batch ticks"],
     lengths_m: Float[np.ndarray, "*batch"],
     dt_s: float,
-) -> Float[np.ndarray, "*batch n 2"]:
+) -> Float[np.ndarray, "*batch ticks-1 2"]:
     """The actions between consecutive states; zero where either state is not valid."""
     both = valid[..., 1:] & valid[..., :-1]
     lengths = np.where(valid.any(axis=-1), lengths_m, 1).astype(states.dtype)[..., None]
