@@ -1,0 +1,218 @@
+"""The ChauffeurNet view: road, ego and the other agents' past as 12 binary channels.
+
+After Bansal et al., ChauffeurNet (2018), as Janjoš et al. (2021) use it. One picture for each
+target of a scene, which is the *ego* of its picture, in its frame now: heading up, by default
+360x240 pixels of 0.2 m with the ego's centre at row 288 (80 % from the top) and column 120, so
+57.6 m ahead, 14.4 m behind and 24 m to either side are seen. Values are 0 and 255.
+
+| channel | shows |
+|---|---|
+| `road_boundary` | curbs and solid lines of the map, 0.3 m wide; no dashed, no virtual lines |
+| `ego_box` | the ego's box now |
+| `ego_trail` | the way of the ego's centre over the last 15 ticks, 0.4 m wide |
+| `agents_0` … `agents_8` | the boxes of all other agents at the states 0, 2, 4, 6, 8, 9, 11, 13 \
+and 15 of those 15 ticks: oldest first, the last is now |
+
+The ego is not among the agents: it has channels of its own. Agents of every class are drawn with
+their footprint. What is not valid is not drawn; a target that is not valid now has an empty
+picture. Lines are at least 1.5 pixels wide and boxes at least one, so nothing vanishes at coarse
+scales. The picture does not depend on the order of slots, nor on the other targets of the scene.
+"""
+
+import math
+from dataclasses import dataclass, field
+from typing import Any, ClassVar, final, no_type_check
+
+import numpy as np
+from jaxtyping import UInt8
+from numba import njit
+
+from asp_env.data.scene import Scene
+from asp_env.errors import AspEnvError
+from asp_env.views.draw import fill_box, fill_segment
+from asp_env.views.map_raster import BoundaryCache
+from asp_env.views.view import View
+
+SNAPSHOTS = (0, 2, 4, 6, 8, 9, 11, 13, 15)
+"""States of the history at which the other agents are drawn; 15 is now."""
+
+BOUNDARY_WIDTH_M = 0.3
+TRAIL_WIDTH_M = 0.4
+MIN_LINE_WIDTH_PX = 1.5
+"""Narrower lines would have gaps."""
+
+_BOUNDARY, _BOX, _TRAIL, _AGENTS = range(4)
+_HISTORY = SNAPSHOTS[-1]
+
+
+@final
+@dataclass(frozen=True, slots=True)
+class ChauffeurNet:
+    """Draws scenes as the module's documentation says. Equal when the configurations are."""
+
+    view: View = field(default_factory=View)
+    _boundaries: BoundaryCache = field(
+        default_factory=BoundaryCache, init=False, repr=False, compare=False
+    )
+
+    name: ClassVar[str] = "chauffeurnet"
+    channels: ClassVar[tuple[str, ...]] = (
+        "road_boundary",
+        "ego_box",
+        "ego_trail",
+        *(f"agents_{i}" for i in range(len(SNAPSHOTS))),
+    )
+    history: ClassVar[int] = _HISTORY
+    """Past ticks that a scene must have."""
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        """Copies and pickles carry the configuration, not the drawn maps."""
+        return (ChauffeurNet, (self.view,))
+
+    @property
+    def shape(self) -> tuple[int, int, int]:
+        """Of one picture: channels, height, width."""
+        return (len(self.channels), self.view.height_px, self.view.width_px)
+
+    def config(self) -> dict[str, Any]:
+        """Everything that decides the picture, ready for JSON."""
+        return {"name": self.name, **self.view.config()}
+
+    @classmethod
+    def from_config(cls, config: dict[str, Any]) -> "ChauffeurNet":
+        """The view that `config()` described.
+
+        Raises:
+            AspEnvError: the configuration is of another view, or a field is wrong.
+        """
+        fields = dict(config)
+        name = fields.pop("name", None)
+        if name != cls.name:
+            raise AspEnvError(f"configuration of the view {name!r}, expected {cls.name!r}")
+        return cls(View.from_config(fields))
+
+    def draw(self, scene: Scene, out: np.ndarray | None = None) -> UInt8[np.ndarray, "t 12 h w"]:
+        """One picture per target, in the order of `scene.targets`.
+
+        Args:
+            scene: with at least 15 past ticks.
+            out: memory to draw into, (targets, 12, height, width) uint8, C-contiguous; its former
+                content does not matter. Fresh memory where it is not given.
+
+        Returns:
+            `out`, or the fresh memory: 0 or 255.
+
+        Raises:
+            AspEnvError: the history is too short, or `out` does not fit.
+        """
+        if scene.history < self.history:
+            raise AspEnvError(
+                f"view {self.name!r} needs {self.history} past ticks, the scene has "
+                f"{scene.history}: take a longer history"
+            )
+        shape = (len(scene.targets), *self.shape)
+        if out is None:
+            out = np.empty(shape, dtype=np.uint8)
+        elif out.shape != shape or out.dtype != np.uint8 or not out.flags.c_contiguous:
+            raise AspEnvError(
+                f"cannot draw into {out.dtype} {out.shape}: give C-contiguous uint8 {shape}"
+            )
+        states = np.ascontiguousarray(scene.states[:, :, -self.history - 1 :], dtype=np.float32)
+        valid = np.ascontiguousarray(scene.valid[:, :, -self.history - 1 :])
+        sizes = np.ascontiguousarray(scene.sizes, dtype=np.float32)
+        targets = np.ascontiguousarray(scene.targets, dtype=np.int64)
+        situation, slot = targets[:, 0], targets[:, 1]
+        # What is not valid may hold anything, so no pose is made of it.
+        known = valid[situation, slot, -1]
+        poses = np.where(known[:, None], states[situation, slot, -1], 0)
+        matrices = self.view.pixels_from_world(poses)
+        scale = 1 / self.view.metres_per_pixel
+        map_of_target = np.where(known, scene.map_index[situation], -1)
+        out[:, _BOUNDARY] = 0
+        half_width = 0.5 * max(BOUNDARY_WIDTH_M * scale, MIN_LINE_WIDTH_PX)
+        for index in np.unique(map_of_target[known]):
+            rows = np.flatnonzero(map_of_target == index)
+            segments = self._boundaries(scene.maps[index])
+            _draw_boundaries(segments, rows, matrices, half_width, out)
+        half_width = 0.5 * max(TRAIL_WIDTH_M * scale, MIN_LINE_WIDTH_PX)
+        _draw_agents(states, valid, sizes, targets, matrices, scale, half_width, out)
+        return out
+
+
+@njit(cache=True, nogil=True)
+@no_type_check
+def _draw_boundaries(segments, rows, pixels_from_world, half_width, out):
+    """Segments [x, y, x, y] of one map into the pictures of the targets `rows`."""
+    width = out.shape[3]
+    for t in rows:
+        canvas = out[t, _BOUNDARY]
+        m = pixels_from_world[t]
+        for s in range(len(segments)):
+            x_0, y_0, x_1, y_1 = segments[s]
+            column_0 = m[0, 0] * x_0 + m[0, 1] * y_0 + m[0, 2]
+            column_1 = m[0, 0] * x_1 + m[0, 1] * y_1 + m[0, 2]
+            if max(column_0, column_1) < -half_width:
+                continue
+            if min(column_0, column_1) > width + half_width:
+                continue
+            row_0 = m[1, 0] * x_0 + m[1, 1] * y_0 + m[1, 2]
+            row_1 = m[1, 0] * x_1 + m[1, 1] * y_1 + m[1, 2]
+            fill_segment(canvas, column_0, row_0, column_1, row_1, half_width)
+
+
+@njit(cache=True, nogil=True)
+@no_type_check
+def _draw_agents(states, valid, sizes, targets, pixels_from_world, scale, trail_half_width, out):
+    """All channels but the map's, for all targets."""
+    agents = states.shape[1]
+    directions = np.empty((len(SNAPSHOTS), agents, 2))
+    drawn = -1
+    for t in range(len(targets)):
+        b, ego = targets[t]
+        out[t, _BOX:] = 0
+        if not valid[b, ego, _HISTORY]:
+            continue
+        if b != drawn:  # all targets of one situation see the same boxes
+            drawn = b
+            for k in range(len(SNAPSHOTS)):
+                for a in range(agents):
+                    if valid[b, a, SNAPSHOTS[k]]:
+                        heading = states[b, a, SNAPSHOTS[k], 2]
+                        directions[k, a, 0] = math.cos(heading)
+                        directions[k, a, 1] = math.sin(heading)
+        m = pixels_from_world[t]
+        _draw_trail(out[t, _TRAIL], states[b, ego], valid[b, ego], m, trail_half_width)
+        for k in range(len(SNAPSHOTS)):
+            tick = SNAPSHOTS[k]
+            for a in range(agents):
+                if (a == ego and tick != _HISTORY) or not valid[b, a, tick]:
+                    continue
+                canvas = out[t, _BOX] if a == ego else out[t, _AGENTS + k]
+                x, y = states[b, a, tick, 0], states[b, a, tick, 1]
+                cos, sin = directions[k, a, 0], directions[k, a, 1]
+                fill_box(
+                    canvas,
+                    m[0, 0] * x + m[0, 1] * y + m[0, 2],
+                    m[1, 0] * x + m[1, 1] * y + m[1, 2],
+                    (m[0, 0] * cos + m[0, 1] * sin) / scale,
+                    (m[1, 0] * cos + m[1, 1] * sin) / scale,
+                    0.5 * sizes[b, a, 0] * scale,
+                    0.5 * sizes[b, a, 1] * scale,
+                )
+
+
+@njit(cache=True, nogil=True)
+@no_type_check
+def _draw_trail(canvas, states, valid, m, half_width):
+    """The way through the valid states of one agent; a gap stays a gap."""
+    for k in range(_HISTORY):
+        if valid[k] and valid[k + 1]:
+            x_0, y_0, x_1, y_1 = states[k, 0], states[k, 1], states[k + 1, 0], states[k + 1, 1]
+            fill_segment(
+                canvas,
+                m[0, 0] * x_0 + m[0, 1] * y_0 + m[0, 2],
+                m[1, 0] * x_0 + m[1, 1] * y_0 + m[1, 2],
+                m[0, 0] * x_1 + m[0, 1] * y_1 + m[0, 2],
+                m[1, 0] * x_1 + m[1, 1] * y_1 + m[1, 2],
+                half_width,
+            )

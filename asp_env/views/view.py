@@ -1,0 +1,110 @@
+"""Where a picture of a scene lies: its pixels, their size, and the vehicle it is drawn around."""
+
+import dataclasses
+import math
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from jaxtyping import Float, Shaped
+
+from asp_env.errors import AspEnvError
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class View:
+    """A rectangle of square pixels around a vehicle that heads up.
+
+    Pixel coordinates are (column, row), continuous: the pixel in row r and column c of the array
+    covers [r, r + 1) by [c, c + 1), so its centre lies at (c + 0.5, r + 0.5). Row 0 is the top,
+    which is far ahead; what is left of the vehicle is left in the picture.
+    """
+
+    height_px: int = 360
+    width_px: int = 240
+    metres_per_pixel: float = 0.2
+    anchor_row_px: float = 288.0
+    """Row coordinate of the vehicle's centre, from the top."""
+    anchor_column_px: float = 120.0
+    """Column coordinate of the vehicle's centre, from the left."""
+
+    def __post_init__(self) -> None:
+        """Checks sizes, scale and anchor.
+
+        Raises:
+            AspEnvError: a value is not possible.
+        """
+        if self.height_px < 1 or self.width_px < 1:
+            raise AspEnvError(
+                f"a view of {self.height_px}x{self.width_px} pixels: both must be at least 1"
+            )
+        if not (math.isfinite(self.metres_per_pixel) and self.metres_per_pixel > 0):
+            raise AspEnvError(
+                f"a view of {self.metres_per_pixel} m per pixel: give a positive number"
+            )
+        inside = 0 <= self.anchor_row_px <= self.height_px
+        if not (inside and 0 <= self.anchor_column_px <= self.width_px):
+            raise AspEnvError(
+                f"a view anchored at row {self.anchor_row_px}, column {self.anchor_column_px}: "
+                f"the anchor must lie within its {self.height_px}x{self.width_px} pixels"
+            )
+
+    @classmethod
+    def scaled(cls, height_px: int, width_px: int) -> "View":
+        """The default 72 m by 48 m with its anchor, in another number of pixels.
+
+        Raises:
+            AspEnvError: the pixels would not be square.
+        """
+        whole = cls()
+        if height_px < 1 or height_px * whole.width_px != width_px * whole.height_px:
+            raise AspEnvError(
+                f"a view of {height_px}x{width_px} pixels does not show 72 m x 48 m in square "
+                "pixels: give a height of 3/2 the width, such as 360x240, 180x120 or 90x60"
+            )
+        scale = height_px / whole.height_px
+        return cls(
+            height_px=height_px,
+            width_px=width_px,
+            metres_per_pixel=whole.metres_per_pixel / scale,
+            anchor_row_px=whole.anchor_row_px * scale,
+            anchor_column_px=whole.anchor_column_px * scale,
+        )
+
+    @classmethod
+    def from_config(cls, config: dict[str, Any]) -> "View":
+        """The view that `config` describes, as `config()` wrote it.
+
+        Raises:
+            AspEnvError: a field is unknown, or its value is not possible.
+        """
+        known = [field.name for field in dataclasses.fields(cls)]
+        unknown = sorted(set(config) - set(known))
+        if unknown:
+            raise AspEnvError(
+                f"view configuration with {', '.join(unknown)}: known are {', '.join(known)}"
+            )
+        return cls(**config)
+
+    def config(self) -> dict[str, Any]:
+        """The fields, ready for JSON."""
+        return dataclasses.asdict(self)
+
+    def pixels_from_world(
+        self, poses: Shaped[np.ndarray, "*batch n"]
+    ) -> Float[np.ndarray, "*batch 2 3"]:
+        """Affine maps from world coordinates to pixel coordinates, around poses [x, y, heading, …].
+
+        Returns:
+            float64 matrices M such that M @ [x, y, 1] is (column, row).
+        """
+        x, y, heading = (poses[..., i].astype(np.float64) for i in range(3))
+        scale = 1 / self.metres_per_pixel
+        cos, sin = np.cos(heading) * scale, np.sin(heading) * scale
+        matrices = np.empty((*heading.shape, 2, 3))
+        # left = -sin·dx + cos·dy and ahead = cos·dx + sin·dy; columns grow to the right, rows back
+        matrices[..., 0, 0], matrices[..., 0, 1] = sin, -cos
+        matrices[..., 1, 0], matrices[..., 1, 1] = -cos, -sin
+        matrices[..., 0, 2] = self.anchor_column_px - sin * x + cos * y
+        matrices[..., 1, 2] = self.anchor_row_px + cos * x + sin * y
+        return matrices
