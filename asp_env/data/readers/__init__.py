@@ -1,0 +1,1 @@
+"""Files of others into recordings and maps."""

@@ -1,0 +1,332 @@
+"""Lanelet2 maps (`.osm`): lenient, and every repair is told.
+
+A lanelet's direction follows from its roles, as in Lanelet2 itself: seen along it, left is on the
+left. How its ways happen to be drawn says nothing, since neighbours that share them may run the
+other way. A lanelet that meets its neighbours crosswise (head-on or tail to tail) more often than
+in line has left and right swapped and is turned around.
+"""
+
+import math
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from jaxtyping import Bool, Float, Int
+from pyproj import Transformer
+
+from asp_env.data.readers.osm import Osm, Relation, Way, read_osm, shorten
+from asp_env.data.road_map import LineType, Ragged, RoadMap
+from asp_env.errors import DataError
+
+VEHICLE_SUBTYPES = frozenset(
+    {"", "road", "highway", "bus_lane", "play_street", "emergency_lane", "exit", "entry"}
+)
+"""Lanelets that vehicles drive along; those without a subtype count as roads. Bicycle lanes,
+walkways and rails are not among them."""
+
+CROSSED_SUBTYPES = frozenset({"crosswalk"})
+"""Lanelets that vehicles may drive over, but not along."""
+
+DRIVABLE_AREAS = frozenset({"freespace", "parking"})
+
+CURB_TYPES = frozenset(
+    {"curbstone", "road_border", "guard_rail", "fence", "wall", "jersey_barrier", "rail"}
+)
+
+MEETS_WITHIN_M = 0.5
+"""Ends of lanelets that do not share nodes meet if both their corners are this near."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Origin:
+    """Where a recording's metric frame lies: local = UTM(lat, lon) - (x, y)."""
+
+    x_m: float
+    y_m: float
+    longitude_deg: float
+    """Somewhere at the place: it tells the zone."""
+    latitude_deg: float
+
+    @property
+    def epsg(self) -> int:
+        """The code of the UTM zone."""
+        zone = int((self.longitude_deg + 180.0) // 6.0) % 60 + 1
+        return (32600 if self.latitude_deg >= 0 else 32700) + zone
+
+
+@dataclass(slots=True, kw_only=True)
+class _Lanelet:
+    """Bounds in the direction of travel, left on the left."""
+
+    id: str
+    subtype: str
+    left: Float[np.ndarray, "n 2"]
+    right: Float[np.ndarray, "m 2"]
+    centre: Float[np.ndarray, "k 2"] | None
+    way_ids: tuple[str, ...]
+
+    def turn_around(self) -> None:
+        """Exchanges left and right, and with them the direction."""
+        self.left, self.right = self.right[::-1], self.left[::-1]
+        self.centre = None if self.centre is None else self.centre[::-1]
+
+    @property
+    def start(self) -> Float[np.ndarray, "2 2"]:
+        """Left and right corner where the lanelet begins."""
+        return np.stack([self.left[0], self.right[0]])
+
+    @property
+    def end(self) -> Float[np.ndarray, "2 2"]:
+        """Left and right corner where the lanelet ends."""
+        return np.stack([self.left[-1], self.right[-1]])
+
+    @property
+    def ring(self) -> Float[np.ndarray, "n 2"]:
+        """The lanelet's outline."""
+        return np.concatenate([self.left, self.right[::-1]])
+
+
+def project(
+    latitudes_deg: Float[np.ndarray, " n"], longitudes_deg: Float[np.ndarray, " n"], origin: Origin
+) -> Float[np.ndarray, "n 2"]:
+    """Points in the frame that `origin` describes, metres."""
+    utm = Transformer.from_crs(4326, origin.epsg, always_xy=True)
+    x_m, y_m = utm.transform(longitudes_deg, latitudes_deg)
+    return np.stack([np.asarray(x_m) - origin.x_m, np.asarray(y_m) - origin.y_m], axis=-1)
+
+
+def read_lanelet2(path: Path, origin: Origin) -> RoadMap:
+    """Reads a map into a recording's frame.
+
+    `lines` are the boundaries of what vehicles drive on or over, and whatever else is typed as a
+    curb or barrier. A boundary without a type is dashed if two vehicle lanelets share it, since
+    both are the road's, and virtual otherwise. `drivable` are vehicle lanelets, crosswalks, and
+    the outer rings of freespace and parking; holes in these are not cut out.
+
+    Raises:
+        DataError: the file is no map, or a map without lanelets.
+    """
+    osm = read_osm(path)
+    if not any(relation.tags.get("type") == "lanelet" for relation in osm.relations):
+        raise DataError(
+            f"{path}: has no lanelets among {len(osm.relations)} relations; "
+            "expected a lanelet2 map: put the right file in its place"
+        )
+    repairs = list(osm.repairs)
+    points = _points(osm, origin)
+    lanelets = _lanelets(osm, points, repairs)
+    vehicle = [lanelet for lanelet in lanelets if lanelet.subtype in VEHICLE_SUBTYPES]
+    _untwist(vehicle, repairs)
+    crossed = [lanelet for lanelet in lanelets if lanelet.subtype in CROSSED_SUBTYPES]
+    rings = [lanelet.ring for lanelet in vehicle + crossed] + _areas(osm, points)
+    lines, line_types = _lines(osm, points, vehicle, crossed)
+    if not vehicle:
+        raise DataError(
+            f"{path}: none of its {len(lanelets)} lanelets is for vehicles; "
+            "expected some of subtype 'road': put the right file in its place"
+        )
+    return RoadMap(
+        name=path.stem,
+        lines=Ragged.pack(lines),
+        line_types=np.array(line_types, dtype=np.int64),
+        drivable=Ragged.pack(rings),
+        lanes=Ragged.pack([_centre_line(lanelet) for lanelet in vehicle]),
+        successors=_successors(vehicle),
+        repairs=tuple(repairs),
+    )
+
+
+def _points(osm: Osm, origin: Origin) -> dict[str, np.ndarray]:
+    degrees = np.array(list(osm.nodes.values()), dtype=np.float64).reshape(-1, 2)
+    local = project(degrees[:, 0], degrees[:, 1], origin)
+    return dict(zip(osm.nodes, local, strict=True))
+
+
+def _polyline(way: Way, points: Mapping[str, np.ndarray]) -> Float[np.ndarray, "n 2"]:
+    return np.stack([points[node] for node in way.nodes])
+
+
+def _chain(lines: Sequence[np.ndarray]) -> Float[np.ndarray, "n 2"]:
+    """Several polylines joined end to end, each turned and taken where it fits best."""
+    rest = list(lines)
+    chain = rest.pop(0)
+    while rest:
+        fits = [
+            (math.dist(chain[-1], line[0]), math.dist(chain[0], line[-1]), number, turned)
+            for number, given in enumerate(rest)
+            for turned, line in ((False, given), (True, given[::-1]))
+        ]
+        behind, before, number, turned = min(fits, key=lambda fit: min(fit[:2]))
+        line = rest.pop(number)[:: -1 if turned else 1]
+        chain = np.concatenate([chain, line] if behind <= before else [line, chain])
+    keep = np.concatenate([[True], np.hypot(*np.diff(chain, axis=0).T) > 0])
+    chain = chain[keep]
+    return chain
+
+
+def _lanelets(osm: Osm, points: Mapping[str, np.ndarray], repairs: list[str]) -> list[_Lanelet]:
+    found: list[_Lanelet] = []
+    broken: list[str] = []
+    for relation in osm.relations:
+        if relation.tags.get("type") != "lanelet":
+            continue
+        sides = {
+            role: [way for name, way in relation.members if name == role]
+            for role in ("left", "right", "centerline")
+        }
+        kept = {
+            role: [osm.ways[way] for way in ways if way in osm.ways] for role, ways in sides.items()
+        }
+        if not (kept["left"] and kept["right"]):
+            broken.append(relation.id)
+            continue
+        found.append(_lanelet(relation, kept, points))
+    if broken:
+        repairs.append(f"{len(broken)} lanelets left out, a bound is missing: {shorten(broken)}")
+    return found
+
+
+def _lanelet(
+    relation: Relation, sides: Mapping[str, Sequence[Way]], points: Mapping[str, np.ndarray]
+) -> _Lanelet:
+    left, right = (
+        _chain([_polyline(way, points) for way in sides[role]]) for role in ("left", "right")
+    )
+    if _ends_apart(left, right[::-1]) < _ends_apart(left, right):
+        right = right[::-1]
+    if _area(np.concatenate([right, left[::-1]])) < 0:
+        left, right = left[::-1], right[::-1]
+    centre = None
+    if sides["centerline"]:
+        centre = _chain([_polyline(way, points) for way in sides["centerline"]])
+        if _ends_apart(centre, left[::-1]) < _ends_apart(centre, left):
+            centre = centre[::-1]
+    return _Lanelet(
+        id=relation.id,
+        subtype=relation.tags.get("subtype", "").lower(),
+        left=left,
+        right=right,
+        centre=centre,
+        way_ids=tuple(way.id for role in ("left", "right") for way in sides[role]),
+    )
+
+
+def _ends_apart(line: np.ndarray, other: np.ndarray) -> float:
+    return math.dist(line[0], other[0]) + math.dist(line[-1], other[-1])
+
+
+def _area(ring: Float[np.ndarray, "n 2"]) -> float:
+    """Signed: positive for a ring that runs counter-clockwise."""
+    following = np.roll(ring, -1, axis=0)
+    return 0.5 * float((ring[:, 0] * following[:, 1] - ring[:, 1] * following[:, 0]).sum())
+
+
+def _meets(edge: np.ndarray, edges: Float[np.ndarray, "n 2 2"]) -> np.ndarray:
+    """Which of the edges have their left corner at `edge`'s left one, and right at right."""
+    return (np.hypot(*np.moveaxis(edges - edge, -1, 0)) <= MEETS_WITHIN_M).all(axis=-1)
+
+
+def _untwist(lanelets: Sequence[_Lanelet], repairs: list[str]) -> None:
+    """Turns lanelets around that are more at odds with their neighbours than these with theirs."""
+    turned: list[str] = []
+    while len(turned) < len(lanelets):
+        odds, at_odds = _odds(lanelets)
+        wrong = np.flatnonzero((odds > 0) & (odds > np.where(at_odds, odds, -1).max(axis=1)))
+        wrong = [number for number in wrong.tolist() if lanelets[number].id not in turned]
+        if not wrong:
+            break
+        worst = max(wrong, key=lambda number: int(odds[number]))
+        lanelets[worst].turn_around()
+        turned.append(lanelets[worst].id)
+    if turned:
+        repairs.append(
+            f"{len(turned)} lanelets with left and right swapped turned around: {shorten(turned)}"
+        )
+
+
+def _odds(lanelets: Sequence[_Lanelet]) -> tuple[Int[np.ndarray, " n"], Bool[np.ndarray, "n n"]]:
+    """By how many neighbours each lanelet meets crosswise more than in line, and with which."""
+    starts = np.array([lanelet.start for lanelet in lanelets]).reshape(-1, 2, 2)
+    ends = np.array([lanelet.end for lanelet in lanelets]).reshape(-1, 2, 2)
+    in_line, at_odds = (np.zeros((len(lanelets), len(lanelets)), dtype=bool) for _ in range(2))
+    for number, lanelet in enumerate(lanelets):
+        in_line[number] = _meets(lanelet.start, ends) | _meets(lanelet.end, starts)
+        at_odds[number] = _meets(lanelet.start[::-1], starts) | _meets(lanelet.end[::-1], ends)
+    return at_odds.sum(axis=1) - in_line.sum(axis=1), at_odds
+
+
+def _centre_line(lanelet: _Lanelet) -> Float[np.ndarray, "n 2"]:
+    if lanelet.centre is not None:
+        return lanelet.centre
+    left_at, right_at = _arc_shares(lanelet.left), _arc_shares(lanelet.right)
+    at = np.unique(np.concatenate([left_at, right_at]).round(6))
+    sides = [
+        np.stack([np.interp(at, shares, line[:, axis]) for axis in (0, 1)], axis=-1)
+        for shares, line in ((left_at, lanelet.left), (right_at, lanelet.right))
+    ]
+    return 0.5 * (sides[0] + sides[1])
+
+
+def _arc_shares(line: Float[np.ndarray, "n 2"]) -> Float[np.ndarray, " n"]:
+    arc = np.concatenate([[0.0], np.cumsum(np.hypot(*np.diff(line, axis=0).T))])
+    return arc / arc[-1] if arc[-1] > 0 else np.linspace(0.0, 1.0, len(line))
+
+
+def _successors(lanelets: Sequence[_Lanelet]) -> Int[np.ndarray, "edges 2"]:
+    starts = np.array([lanelet.start for lanelet in lanelets]).reshape(-1, 2, 2)
+    edges = [
+        (number, int(follower))
+        for number, lanelet in enumerate(lanelets)
+        for follower in np.flatnonzero(_meets(lanelet.end, starts))
+        if follower != number
+    ]
+    return np.array(edges, dtype=np.int64).reshape(-1, 2)
+
+
+def _areas(osm: Osm, points: Mapping[str, np.ndarray]) -> list[np.ndarray]:
+    rings = []
+    for relation in osm.relations:
+        if relation.tags.get("type") != "multipolygon":
+            continue
+        if relation.tags.get("subtype", "").lower() not in DRIVABLE_AREAS:
+            continue
+        outer = [
+            osm.ways[way] for role, way in relation.members if role == "outer" and way in osm.ways
+        ]
+        if outer:
+            rings.append(_chain([_polyline(way, points) for way in outer]))
+    return rings
+
+
+def _lines(
+    osm: Osm,
+    points: Mapping[str, np.ndarray],
+    vehicle: Iterable[_Lanelet],
+    crossed: Iterable[_Lanelet],
+) -> tuple[list[np.ndarray], list[int]]:
+    uses: dict[str, int] = {}
+    for lanelet in vehicle:
+        for way in lanelet.way_ids:
+            uses[way] = uses.get(way, 0) + 1
+    bounds = set(uses) | {way for lanelet in crossed for way in lanelet.way_ids}
+    lines, types = [], []
+    for way in osm.ways.values():
+        if way.id in bounds or way.tags.get("type") in CURB_TYPES:
+            lines.append(_polyline(way, points))
+            types.append(int(_line_type(way, uses.get(way.id, 0))))
+    return lines, types
+
+
+def _line_type(way: Way, vehicle_uses: int) -> LineType:
+    kind = way.tags.get("type", "").lower()
+    if kind in CURB_TYPES:
+        return LineType.CURB
+    if kind.startswith("line_"):
+        subtype = way.tags.get("subtype", "").lower()
+        return LineType.DASHED if subtype.startswith("dashed") else LineType.SOLID
+    if kind in ("pedestrian_marking", "zebra_marking", "bike_marking"):
+        return LineType.DASHED
+    if not kind and vehicle_uses > 1:
+        return LineType.DASHED
+    return LineType.VIRTUAL

@@ -1,0 +1,261 @@
+"""The inD/rounD layout: which files make a recording, and which map and scale belong to it.
+
+Per recording `XX`: `XX_recordingMeta.csv`, `XX_tracksMeta.csv`, `XX_tracks.csv` (or `.csv.gz`) and
+perhaps `XX_background.png`, together in any folder below the one given. Metadata are read per
+recording, never per location: the origin differs between recordings of one site.
+"""
+
+import math
+import os
+import re
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from asp_env.data.readers.lanelet2 import Origin, project
+from asp_env.data.readers.osm import read_osm
+from asp_env.data.readers.tables import read_table
+from asp_env.errors import DataError
+
+CONSTRUCTION_RECORDINGS = frozenset(range(11, 18))
+"""Recordings of inD's location 1 made while its site was under construction."""
+
+NEAR_M = 1_000.0
+"""A map that does not name its location belongs to a recording this near."""
+
+DOWNSCALE = {"ind": 12, "round": 10, "exid": 6, "unid": 2}
+"""By how much the published background images are smaller than `orthoPxToMeter` says."""
+
+SCALES = (1, 2, 6, 10, 12)
+
+_PART = re.compile(r"^(.+)_(recordingMeta\.csv|tracksMeta\.csv|tracks\.csv(?:\.gz)?)$")
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class RecordingFiles:
+    """Where one recording's files lie. Those that are missing are named as they should be."""
+
+    name: str
+    root: Path
+    """The folder that was given as DATA: maps are searched from the recording up to it."""
+    recording_meta: Path
+    tracks_meta: Path
+    tracks: Path
+    background: Path | None
+
+    @property
+    def tables(self) -> tuple[Path, Path, Path]:
+        """The three files that every recording has."""
+        return (self.recording_meta, self.tracks_meta, self.tracks)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class RecordingMeta:
+    """What `XX_recordingMeta.csv` says."""
+
+    number: int
+    location: int
+    frame_rate_hz: float
+    speed_limit_mps: float | None
+    metres_per_ortho_pixel: float | None
+    origin: Origin
+
+
+def find_recordings(root: Path) -> tuple[RecordingFiles, ...]:
+    """The recordings below a folder, by name; incomplete ones too, so that they can be reported.
+
+    Where one id occurs in several folders, names carry the folder: `rounD/00`.
+    """
+    parts: dict[tuple[Path, str], dict[str, Path]] = {}
+    for folder, names in _walk(root):
+        for name in names:
+            if match := _PART.match(name):
+                kind = match[2].split(".")[0]
+                parts.setdefault((folder, match[1]), {})[kind] = folder / name
+    ids = [prefix for _, prefix in parts]
+    found = []
+    for (folder, prefix), files in parts.items():
+        background = folder / f"{prefix}_background.png"
+        place = folder.parent if folder.name == "data" else folder
+        inside = place.relative_to(root) if place.is_relative_to(root) else Path()
+        found.append(
+            RecordingFiles(
+                name=prefix if ids.count(prefix) == 1 else (inside / prefix).as_posix(),
+                root=root,
+                recording_meta=files.get("recordingMeta", folder / f"{prefix}_recordingMeta.csv"),
+                tracks_meta=files.get("tracksMeta", folder / f"{prefix}_tracksMeta.csv"),
+                tracks=files.get("tracks", folder / f"{prefix}_tracks.csv"),
+                background=background if background.is_file() else None,
+            )
+        )
+    return tuple(sorted(found, key=lambda files: _natural(files.name)))
+
+
+def read_recording_meta(path: Path) -> RecordingMeta:
+    """Reads `XX_recordingMeta.csv`.
+
+    Raises:
+        DataError: it is absent, damaged, or its frame rate is no positive number.
+    """
+    if not path.is_file():
+        raise DataError(
+            f"{path}: no such file, but the recording's tracks are there; "
+            "copy the metadata beside them or remove the recording"
+        )
+    needed = ("recordingId", "locationId", "frameRate", "xUtmOrigin", "yUtmOrigin")
+    table = read_table(
+        path,
+        {
+            **dict.fromkeys(needed[:2], "whole"),
+            **dict.fromkeys(needed[2:], "number"),
+            **dict.fromkeys(("latLocation", "lonLocation"), "number"),
+        },
+    )
+    rate = float(table["frameRate"][0])
+    if rate <= 0:
+        raise DataError(f"{path}, line 2: frameRate is {rate:g}, expected a positive number of Hz")
+    return RecordingMeta(
+        number=int(table["recordingId"][0]),
+        location=int(table["locationId"][0]),
+        frame_rate_hz=rate,
+        speed_limit_mps=_positive(path, "speedLimit"),
+        metres_per_ortho_pixel=_positive(path, "orthoPxToMeter"),
+        origin=Origin(
+            x_m=float(table["xUtmOrigin"][0]),
+            y_m=float(table["yUtmOrigin"][0]),
+            longitude_deg=float(table["lonLocation"][0]),
+            latitude_deg=float(table["latLocation"][0]),
+        ),
+    )
+
+
+def find_map(files: RecordingFiles, meta: RecordingMeta) -> Path:
+    """The lanelet2 map of a recording: the nearest, going up from it, that fits its location.
+
+    A map fits if its own name ends in the location's id (`location1.osm`), or its folder's name
+    begins with it (`01_bendplatz`). Of several, inD's construction map serves the recordings made
+    then and no others. Without a name that fits, the map within 1 km of the recording serves.
+
+    Raises:
+        DataError: there is none.
+    """
+    for folder in _upwards(files):
+        maps = [place / name for place, names in _walk(folder) for name in names]
+        maps = sorted(path for path in maps if path.suffix == ".osm")
+        fitting = [path for path in maps if _names_location(path, meta.location)]
+        under_construction = meta.location == 1 and meta.number in CONSTRUCTION_RECORDINGS
+        preferred = [path for path in fitting if _is_construction(path) == under_construction]
+        chosen = preferred or fitting or _near(maps, meta.origin)
+        if chosen:
+            return chosen[0]
+    raise DataError(
+        f"{files.root}: no map for location {meta.location} of recording {files.name}; "
+        f"expected a lanelet2 file location{meta.location}.osm in it or below"
+    )
+
+
+def metres_per_pixel(
+    files: RecordingFiles, meta: RecordingMeta, size_px: tuple[int, int], xy: np.ndarray
+) -> float | None:
+    """The scale of a background image.
+
+    `orthoPxToMeter` is that of the original image; the published one is smaller by a factor that
+    no file tells. It is the dataset's where a folder carries its name (inD 12, rounD 10, exiD 6,
+    uniD 2), else the smallest of 1, 2, 6, 10, 12 with which 99 % of the positions lie in the image.
+
+    Args:
+        files: the recording's files.
+        meta: its metadata.
+        size_px: width and height of the image.
+        xy: positions (n, 2) of the recording's road users, metres.
+
+    Returns:
+        Metres per pixel; None without `orthoPxToMeter`, or if no factor fits.
+    """
+    if meta.metres_per_ortho_pixel is None:
+        return None
+    folders = [part.lower() for part in files.recording_meta.resolve().parts[:-1]]
+    for name, factor in DOWNSCALE.items():
+        if any(re.match(rf"{name}(?![a-z])", folder) for folder in folders):
+            return factor * meta.metres_per_ortho_pixel
+    if not len(xy):
+        return None
+    low_x, high_x = np.quantile(xy[:, 0], (0.01, 0.99))
+    low_y, high_y = np.quantile(xy[:, 1], (0.01, 0.99))
+    for factor in SCALES:
+        scale = factor * meta.metres_per_ortho_pixel
+        if (
+            min(low_x, -high_y) > -10
+            and high_x < size_px[0] * scale
+            and -low_y < size_px[1] * scale
+        ):
+            return scale
+    return None
+
+
+def _walk(root: Path) -> list[tuple[Path, list[str]]]:
+    """Every folder below `root` with its files, hidden ones left out, linked ones followed."""
+    seen: set[str] = set()
+    found = []
+    for folder, folders, names in os.walk(root, followlinks=True):
+        real = os.path.realpath(folder)
+        if real in seen:
+            folders.clear()
+            continue
+        seen.add(real)
+        folders[:] = sorted(name for name in folders if not name.startswith("."))
+        found.append((Path(folder), sorted(names)))
+    return found
+
+
+def _upwards(files: RecordingFiles) -> list[Path]:
+    top = files.root.parent if files.root.name == "data" else files.root
+    folder = files.recording_meta.parent
+    found = [folder]
+    while folder != top and folder.is_relative_to(top):
+        folder = folder.parent
+        found.append(folder)
+    return found
+
+
+def _names_location(path: Path, location: int) -> bool:
+    own = re.search(r"location[_-]?0*(\d+)$", path.stem, re.IGNORECASE)
+    if own:
+        return int(own[1]) == location
+    folder = re.match(r"0*(\d+)[_-]", path.parent.name)
+    return bool(folder) and int(folder[1]) == location
+
+
+def _is_construction(path: Path) -> bool:
+    return "const" in f"{path.parent.name}/{path.stem}".lower()
+
+
+def _near(maps: list[Path], origin: Origin) -> list[Path]:
+    found = []
+    for path in maps:
+        try:
+            degrees = np.array(list(read_osm(path).nodes.values())).reshape(-1, 2)
+        except DataError:
+            continue
+        if not len(degrees):
+            continue
+        xy = np.median(project(degrees[:, 0], degrees[:, 1], origin), axis=0)
+        distance = math.hypot(*xy)
+        if distance < NEAR_M:
+            found.append((distance, path))
+    return [path for _, path in sorted(found)]
+
+
+def _natural(name: str) -> list[tuple[int, int, str]]:
+    parts = re.split(r"(\d+)", name)
+    return [(1, int(part), "") if part.isdigit() else (0, 0, part) for part in parts]
+
+
+def _positive(path: Path, column: str) -> float | None:
+    """An optional cell; files write nothing, 0, -1 or NaN for what is not known."""
+    try:
+        value = float(read_table(path, {column: "number"})[column][0])
+    except DataError:
+        return None
+    return value if value > 0 else None

@@ -1,0 +1,169 @@
+"""From a recording's files to a `Recording`, through the cache."""
+
+import hashlib
+import struct
+import warnings
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from asp_env.data import cache
+from asp_env.data.readers.lanelet2 import Origin, read_lanelet2
+from asp_env.data.readers.levelx import (
+    RecordingFiles,
+    RecordingMeta,
+    find_map,
+    metres_per_pixel,
+    read_recording_meta,
+)
+from asp_env.data.readers.tracks import read_tracks
+from asp_env.data.recording import Background, Recording
+from asp_env.data.road_map import Ragged, RoadMap
+from asp_env.errors import DataError
+
+Entry = tuple[dict[str, Any], dict[str, np.ndarray]]
+"""Facts and arrays, as the cache keeps them."""
+
+_TRACK_COLUMNS = ("track_ids", "classes", "sizes", "first_frames", "starts", "states")
+_MAP_PARTS = ("lines", "drivable", "lanes")
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Opened:
+    """What is open already, so that recordings of one place share one map."""
+
+    recordings: dict[str, Recording]
+    maps: dict[tuple[Path, Origin], RoadMap]
+
+
+def open_recording(files: RecordingFiles, opened: Opened) -> Recording:
+    """The recording, read now unless it is open, and kept in `opened`.
+
+    Raises:
+        DataError: its files are damaged.
+    """
+    if files.name not in opened.recordings:
+        meta = read_recording_meta(files.recording_meta)
+        place = (find_map(files, meta), meta.origin)
+        recording = _recording(files, meta, opened.maps.get(place) or _road_map(*place))
+        opened.maps[place] = recording.road_map
+        opened.recordings[files.name] = recording
+    return opened.recordings[files.name]
+
+
+def content_hash(files: RecordingFiles) -> str:
+    """A hash of the content of a recording's tables and map; the picture does not count.
+
+    Raises:
+        DataError: a file is missing.
+    """
+    map_path = find_map(files, read_recording_meta(files.recording_meta))
+    sources = (*files.tables, map_path)
+
+    def make() -> Entry:
+        digests = "".join(cache.digest(path) for path in sources)
+        return {"hash": hashlib.sha256(digests.encode()).hexdigest()}, {}
+
+    return str(_cached(files.tracks, sources, make, "hash")[0]["hash"])
+
+
+def _recording(files: RecordingFiles, meta: RecordingMeta, road_map: RoadMap) -> Recording:
+    sources = [*files.tables, *([files.background] if files.background else [])]
+    facts, arrays = _cached(files.tracks, sources, lambda: _track_entry(files, meta), "tracks")
+    scale = facts["metres_per_pixel"]
+    background = None
+    if files.background is not None and scale is not None:
+        background = Background(path=files.background, metres_per_pixel=scale)
+    return Recording(
+        name=files.name,
+        location=str(meta.location),
+        frame_rate_hz=meta.frame_rate_hz,
+        num_frames=facts["num_frames"],
+        speed_limit_mps=meta.speed_limit_mps,
+        road_map=road_map,
+        background=background,
+        repairs=tuple(facts["repairs"]),
+        **arrays,
+    )
+
+
+def _track_entry(files: RecordingFiles, meta: RecordingMeta) -> Entry:
+    table = read_tracks(files)
+    scale = None
+    repairs = list(table.repairs)
+    if files.background is not None:
+        size = _png_size(files.background)
+        scale = metres_per_pixel(files, meta, size, table.states[:, :2]) if size else None
+        if scale is None:
+            repairs.append(f"{files.background.name} left out: its scale cannot be told")
+    last_frames = table.first_frames + np.diff(table.starts) - 1
+    facts = {
+        "num_frames": int(last_frames.max()) + 1,
+        "metres_per_pixel": scale,
+        "repairs": repairs,
+    }
+    return facts, {name: getattr(table, name) for name in _TRACK_COLUMNS}
+
+
+def _road_map(path: Path, origin: Origin) -> RoadMap:
+    facts, arrays = _cached(path, [path], lambda: _map_entry(path, origin), origin)
+    parts = {
+        name: Ragged(points=arrays[f"{name}_points"], starts=arrays[f"{name}_starts"])
+        for name in _MAP_PARTS
+    }
+    return RoadMap(
+        name=path.stem,
+        line_types=arrays["line_types"],
+        successors=arrays["successors"],
+        repairs=tuple(facts["repairs"]),
+        **parts,
+    )
+
+
+def _map_entry(path: Path, origin: Origin) -> Entry:
+    road_map = read_lanelet2(path, origin)
+    arrays = {"line_types": road_map.line_types, "successors": road_map.successors}
+    for name in _MAP_PARTS:
+        ragged = getattr(road_map, name)
+        arrays |= {f"{name}_points": ragged.points, f"{name}_starts": ragged.starts}
+    return {"repairs": list(road_map.repairs)}, arrays
+
+
+def _cached(path: Path, sources: Sequence[Path], make: Callable[[], Entry], salt: object) -> Entry:
+    """What `make` returns, from the cache if the sources are as they were.
+
+    Where the cache cannot be written to, files are read anew each time, and a warning says so.
+    """
+    current = cache.stamp(sources)
+    try:
+        kept = cache.entry(cache.cache_folder(), path, salt)
+    except DataError as error:
+        warnings.warn(f"nothing is kept for next time: {error}", stacklevel=2)
+        return _read_only(make())
+    if (found := cache.load(kept, current)) is not None:
+        return found
+    made = make()
+    try:
+        cache.save(kept, current, *made)
+    except OSError as error:
+        warnings.warn(f"nothing is kept for next time: {kept}: {error.strerror}", stacklevel=2)
+    return cache.load(kept, current) or _read_only(made)
+
+
+def _read_only(made: Entry) -> Entry:
+    for array in made[1].values():
+        array.flags.writeable = False
+    return made
+
+
+def _png_size(path: Path) -> tuple[int, int] | None:
+    """Width and height from the file's header; None if it is no PNG."""
+    with path.open("rb") as file:
+        head = file.read(24)
+    if head[:8] != b"\x89PNG\r\n\x1a\n" or len(head) < 24:
+        return None
+    width, height = struct.unpack(">II", head[16:24])
+    return int(width), int(height)

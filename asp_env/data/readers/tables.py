@@ -1,0 +1,208 @@
+"""Columns of a CSV file by name, and the exact line of whatever is wrong with it."""
+
+import csv
+import gzip
+import math
+import zlib
+from collections.abc import Iterator, Mapping
+from pathlib import Path
+from typing import IO, Literal, cast
+
+import numpy as np
+import pandas as pd
+
+from asp_env.errors import DataError
+
+Kind = Literal["whole", "number", "text"]
+"""What the cells of a column must be: whole numbers, finite numbers, or anything."""
+
+ROWS_PER_CHUNK = 250_000
+"""Bounds the memory that parsing takes, whatever the length of the file."""
+
+_BLOCK_BYTES = 1 << 22
+_DTYPES = {"whole": np.dtype(np.int64), "number": np.dtype(np.float64), "text": np.dtype(object)}
+
+
+def read_columns(
+    path: Path, columns: Mapping[str, Kind], *, optional: frozenset[str] = frozenset()
+) -> Iterator[dict[str, np.ndarray]]:
+    """The named columns of a CSV file (plain or `.gz`), a chunk of rows at a time.
+
+    Args:
+        path: the file; its first line names the columns, in any order.
+        columns: what the cells of each wanted column must be.
+        optional: those of `columns` that may be absent.
+
+    Yields:
+        Arrays (rows,) by name: int64, float64 (finite) or str objects.
+
+    Raises:
+        DataError: the file is absent, empty or damaged; the line is named.
+    """
+    try:
+        header = _header(path)
+        wanted = _wanted(path, header, columns, optional)
+        if not _evenly_filled(path, len(header)):
+            _diagnose(path, header, wanted)
+        yield from _chunks(path, wanted)
+    except (pd.errors.ParserError, ValueError) as error:
+        if isinstance(error, DataError):
+            raise
+        _diagnose(path, _header(path), columns)
+        raise DataError(f"{path}: cannot be read as a table: {_one_line(error)}") from error
+    except (OSError, EOFError, zlib.error) as error:
+        raise DataError(f"{path}: cannot be read: {_one_line(error)}; copy it again") from error
+
+
+def read_table(path: Path, columns: Mapping[str, Kind]) -> dict[str, np.ndarray]:
+    """All rows of `read_columns` at once, for small files.
+
+    Raises:
+        DataError: as `read_columns`, or there are no rows.
+    """
+    chunks = list(read_columns(path, columns))
+    if not chunks:
+        raise no_rows(path)
+    return {name: np.concatenate([chunk[name] for chunk in chunks]) for name in columns}
+
+
+def no_rows(path: Path) -> DataError:
+    """The error for a file that has a header and nothing else."""
+    return DataError(f"{path}: has a header but no rows; copy it again or remove the recording")
+
+
+def find_line(path: Path, cells: Mapping[str, object], *, occurrence: int = 1) -> int:
+    """The number of the line whose named cells read as given, numbers compared as numbers.
+
+    Args:
+        path: the file.
+        cells: what the line's cells hold, by column.
+        occurrence: which of several such lines.
+
+    Returns:
+        The line's number from 1; 0 if there is none.
+    """
+    columns = {name: at for at, name in enumerate(_header(path))}
+    for number, row in _lines(path):
+        if number > 1 and all(_same(row[columns[name]], cells[name]) for name in cells):
+            occurrence -= 1
+            if not occurrence:
+                return number
+    return 0
+
+
+def _open(path: Path) -> IO[bytes]:
+    return cast(IO[bytes], gzip.open(path)) if path.suffix == ".gz" else path.open("rb")
+
+
+def _header(path: Path) -> list[str]:
+    if not path.is_file():
+        raise DataError(f"{path}: no such file; expected it beside the recording's other files")
+    for _, row in _lines(path):
+        return [name.strip() for name in row]
+    raise DataError(f"{path}: is empty; expected a table with a header; copy it again")
+
+
+def _wanted(
+    path: Path, header: list[str], columns: Mapping[str, Kind], optional: frozenset[str]
+) -> dict[str, Kind]:
+    missing = [name for name in columns if name not in header and name not in optional]
+    if missing:
+        raise DataError(
+            f"{path}: lacks the column {', '.join(map(repr, missing))}; "
+            f"expected it among those found: {', '.join(header)[:200]}"
+        )
+    return {name: kind for name, kind in columns.items() if name in header}
+
+
+def _evenly_filled(path: Path, num_columns: int) -> bool:
+    """Whether there are as many commas as the lines call for: a pass at memory speed."""
+    commas = lines = 0
+    last = b"\n"
+    with _open(path) as file:
+        while block := file.read(_BLOCK_BYTES):
+            commas += block.count(b",")
+            lines += block.count(b"\n")
+            last = block[-1:]
+    return commas == (lines + (last != b"\n")) * (num_columns - 1)
+
+
+def _chunks(path: Path, wanted: Mapping[str, Kind]) -> Iterator[dict[str, np.ndarray]]:
+    texts = [name for name, kind in wanted.items() if kind == "text"]
+    reader = pd.read_csv(
+        path,
+        usecols=lambda name: name.strip() in wanted,
+        dtype={name: str if kind == "text" else np.float64 for name, kind in wanted.items()},
+        chunksize=ROWS_PER_CHUNK,
+        index_col=False,
+        encoding="utf-8-sig",
+        encoding_errors="replace",
+        keep_default_na=not texts,
+    )
+    with reader:
+        for frame in reader:
+            frame.columns = frame.columns.str.strip()
+            yield {name: _checked(frame[name], kind) for name, kind in wanted.items()}
+
+
+def _checked(column: pd.Series, kind: Kind) -> np.ndarray:
+    if kind == "text":
+        return column.to_numpy(dtype=object)
+    cells = column.to_numpy()
+    if not np.isfinite(cells).all():
+        raise ValueError("a cell is no number")
+    if kind == "whole" and not (cells == np.floor(cells)).all():
+        raise ValueError("a cell is no whole number")
+    return cells.astype(_DTYPES[kind])
+
+
+def _diagnose(path: Path, header: list[str], columns: Mapping[str, Kind]) -> None:
+    """Names the first line that is wrong, if any: slow, and only for files that are."""
+    kinds: list[tuple[int, str, Kind]] = [
+        (header.index(name), name, kind) for name, kind in columns.items() if name in header
+    ]
+    for number, row in _lines(path):
+        if number == 1:
+            continue
+        if len(row) != len(header):
+            raise DataError(
+                f"{path}, line {number}: has {len(row)} fields, expected {len(header)} as in the "
+                "header; the line is cut or damaged: copy the file again"
+            )
+        for at, name, kind in kinds:
+            if fault := _fault(row[at], kind):
+                raise DataError(
+                    f"{path}, line {number}: {name} is {row[at]!r}, expected {fault}; "
+                    "mend the line or remove it"
+                )
+
+
+def _fault(cell: str, kind: Kind) -> str:
+    if kind == "text":
+        return ""
+    try:
+        value = float(cell)
+    except ValueError:
+        return "a number"
+    if not math.isfinite(value):
+        return "a finite number"
+    return "a whole number" if kind == "whole" and value != math.floor(value) else ""
+
+
+def _lines(path: Path) -> Iterator[tuple[int, list[str]]]:
+    """(line number from 1, cells) of every line that is not blank."""
+    with _open(path) as file:
+        text = (line.decode("utf-8-sig", "replace").replace("\0", "?") for line in file)
+        for number, row in enumerate(csv.reader(text), start=1):
+            if row:
+                yield number, row
+
+
+def _same(cell: str, value: object) -> bool:
+    if isinstance(value, str):
+        return cell == value
+    return float(cell) == value
+
+
+def _one_line(error: BaseException) -> str:
+    return " ".join(str(error).split()) or type(error).__name__

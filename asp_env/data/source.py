@@ -1,0 +1,139 @@
+"""DATA: from the name that a user gives to recordings that are opened when they are asked for."""
+
+import hashlib
+import re
+from collections.abc import Iterable, Sequence
+from importlib import resources
+from pathlib import Path
+from typing import SupportsIndex, overload
+
+from asp_env import registry
+from asp_env.data.readers.levelx import RecordingFiles, find_recordings
+from asp_env.data.readers.opening import Opened, content_hash, open_recording
+from asp_env.data.recording import Recording
+from asp_env.errors import DataError, unknown_name
+
+_SCHEME = re.compile(r"^([a-z][a-z0-9-]+):(.*)$", re.DOTALL)
+
+
+class Recordings(Sequence[Recording]):
+    """The recordings of one DATA, each read when it is first asked for and kept from then on.
+
+    Attributes:
+        source: DATA as the user named it.
+        names: the recordings' ids, such as `00`.
+    """
+
+    def __init__(
+        self,
+        source: str,
+        files: Sequence[RecordingFiles],
+        *,
+        opened: Opened | None = None,
+    ) -> None:
+        """Lists recordings; reads none.
+
+        Args:
+            source: DATA as the user named it.
+            files: where each recording lies.
+            opened: those that are open already.
+        """
+        self.source = source
+        self.names = tuple(each.name for each in files)
+        self._files = tuple(files)
+        self._opened = Opened(recordings={}, maps={}) if opened is None else opened
+
+    def __len__(self) -> int:
+        """How many there are."""
+        return len(self._files)
+
+    @overload
+    def __getitem__(self, index: SupportsIndex) -> Recording: ...
+    @overload
+    def __getitem__(self, index: slice) -> "Recordings": ...
+    def __getitem__(self, index: SupportsIndex | slice) -> "Recording | Recordings":
+        """One recording, or some of them still unopened.
+
+        Raises:
+            DataError: its files are damaged.
+        """
+        if isinstance(index, slice):
+            return self.subset(range(len(self))[index])
+        return open_recording(self._files[index], self._opened)
+
+    def subset(self, indices: Iterable[SupportsIndex]) -> "Recordings":
+        """Some of the recordings, sharing those that are open."""
+        chosen = [self._files[index] for index in indices]
+        return Recordings(self.source, chosen, opened=self._opened)
+
+    def hashes(self) -> tuple[str, ...]:
+        """Of each recording, a hash of the content of its files and its map.
+
+        Raises:
+            DataError: a file is missing.
+        """
+        return tuple(content_hash(files) for files in self._files)
+
+    def data_hash(self) -> str:
+        """A hash of the content of all recordings, whatever their folder is called.
+
+        Raises:
+            DataError: a file is missing.
+        """
+        return hashlib.sha256("".join(self.hashes()).encode()).hexdigest()
+
+
+def open_data(data: str | Path) -> Recordings:
+    """The recordings of DATA.
+
+    Args:
+        data: a folder in the inD/rounD layout, `sample:intersection`, `sample:roundabout`, or
+            `scheme:argument` of a source that a package registers.
+
+    Raises:
+        AspEnvError: no such source.
+        DataError: no such folder, or no recordings in it.
+    """
+    source = str(data)
+    folder = _resolve(source)
+    if not folder.is_dir():
+        what = "is a file" if folder.exists() else "does not exist"
+        raise DataError(f"data {source!r}: {folder} {what}; expected a folder with recordings")
+    files = find_recordings(folder)
+    if not files:
+        if next(folder.rglob("vehicle_tracks_*.csv"), None):
+            raise DataError(
+                f"data {source!r}: is in the INTERACTION layout, expected the inD/rounD layout "
+                "(XX_recordingMeta.csv, XX_tracksMeta.csv, XX_tracks.csv): convert it first"
+            )
+        raise DataError(
+            f"data {source!r}: no recordings found; expected XX_recordingMeta.csv, "
+            "XX_tracksMeta.csv and XX_tracks.csv in the folder or below"
+        )
+    return Recordings(source, files)
+
+
+def load(path: str | Path) -> Recordings:
+    """The recordings in a folder, lazily: the same as `open_data`."""
+    return open_data(path)
+
+
+def _resolve(source: str) -> Path:
+    match = _SCHEME.match(source)
+    if match is None or Path(source).exists():
+        return Path(source).expanduser()
+    scheme, argument = match.groups()
+    if scheme == "sample":
+        return _sample(argument)
+    known = registry.names("sources")
+    if scheme not in known:
+        raise unknown_name("source", scheme, ["sample", *known])
+    return Path(registry.find("sources", scheme)(argument))
+
+
+def _sample(site: str) -> Path:
+    samples = Path(str(resources.files("asp_env"))) / "samples"
+    sites = [path.name for path in samples.glob("*") if path.is_dir() and path.name[0] not in "._"]
+    if site not in sites:
+        raise unknown_name("sample", site, sites)
+    return samples / site
