@@ -1,0 +1,261 @@
+/* Drives, played on a canvas: poses between ticks are interpolated, forecasts are as said. */
+const TRAIL_S = 3, FLASH_S = 1.2;
+
+class Replay {
+  constructor() {
+    const get = (name) => document.getElementById("replay-" + name);
+    for (const name of ["canvas", "strip", "clock", "event", "driver", "drive", "play", "scrub",
+      "speed", "follow", "forecasts", "ghost"]) this[name] = get(name);
+    this.tick = 0;
+    this.playing = false;
+    this.zoom = 1;
+    this.offset = [0, 0];
+    this.legend();
+    this.fillDrivers();
+    this.listen();
+    this.choose();
+  }
+
+  legend() {
+    legend(document.getElementById("replay-legend"), [
+      ["ego", "ego"], ["ghost", "recorded ego", "dashed"], ["plan", "plan", "stroke"],
+      ["forecast", "forecasts", "stroke"], ["car", "cars"], ["heavy", "vans, trucks, buses"],
+      ["two-wheeler", "motorcycles"], ["vulnerable", "cyclists and pedestrians"],
+      ["alarm", "collision"], ["warning", "other events"],
+    ]);
+  }
+
+  fillDrivers() {
+    const drivers = [...new Set(DATA.drives.map((drive) => drive.driver))];
+    document.getElementById("replay-driver-label").hidden = drivers.length < 2;
+    this.driver.replaceChildren(...drivers.map((name) => new Option(name)));
+    this.fillDrives();
+  }
+
+  fillDrives() {
+    const before = this.drive.selectedOptions[0]?.dataset.name;
+    this.drive.replaceChildren(...DATA.drives.flatMap((drive, number) => {
+      if (drive.driver !== this.driver.value) return [];
+      const option = new Option([drive.name, drive.tags].filter(Boolean).join(" · "), number);
+      option.dataset.name = drive.name;
+      return [option];
+    }));
+    const same = [...this.drive.options].find((option) => option.dataset.name === before);
+    if (same) same.selected = true;
+  }
+
+  listen() {
+    this.driver.addEventListener("change", () => {
+      const tick = this.tick;
+      this.fillDrives();
+      this.choose();
+      this.seek(Math.min(tick, this.log.ticks - 1));
+    });
+    this.drive.addEventListener("change", () => this.choose());
+    this.play.addEventListener("click", () => this.toggle());
+    this.scrub.addEventListener("input", () => this.seek(Number(this.scrub.value)));
+    for (const box of [this.follow, this.forecasts, this.ghost]) {
+      box.addEventListener("change", () => this.draw());
+    }
+    this.strip.addEventListener("pointerdown", (event) => {
+      const share = event.offsetX / this.strip.clientWidth;
+      this.seek(Math.round(share * (this.log.ticks - 1)));
+    });
+    this.canvas.addEventListener("keydown", (event) => {
+      const step = { ArrowLeft: -1, ArrowRight: 1 }[event.key];
+      if (event.key !== " " && !step) return;
+      event.preventDefault();
+      if (step) this.seek(Math.floor(this.tick) + step); else this.toggle();
+    });
+    this.canvas.addEventListener("wheel", (event) => {
+      event.preventDefault();
+      this.zoom = Math.min(8, Math.max(0.25, this.zoom * Math.exp(-event.deltaY / 500)));
+      this.draw();
+    }, { passive: false });
+    this.canvas.addEventListener("pointermove", (event) => {
+      if (!event.buttons) return;
+      this.offset[0] -= event.movementX / this.scale;
+      this.offset[1] += event.movementY / this.scale;
+      this.draw();
+    });
+    new ResizeObserver(() => this.draw()).observe(this.canvas);
+    dark.addEventListener("change", () => this.draw());
+  }
+
+  choose() {
+    this.log = DATA.drives[Number(this.drive.value)];
+    this.scrub.max = this.log.ticks - 1;
+    this.zoom = 1;
+    this.offset = [0, 0];
+    this.seek(0);
+  }
+
+  seek(tick) {
+    this.tick = Math.min(Math.max(tick, 0), this.log.ticks - 1);
+    this.draw();
+  }
+
+  toggle() {
+    this.playing = !this.playing;
+    this.play.textContent = this.playing ? "❚❚" : "▶";
+    this.play.setAttribute("aria-label", this.playing ? "Pause" : "Play");
+    if (!this.playing) return;
+    if (this.tick >= this.log.ticks - 1) this.tick = 0;
+    let before = performance.now();
+    const frame = (now) => {
+      if (!this.playing) return;
+      this.seek(this.tick + (now - before) / 1000 * Number(this.speed.value) / this.log.dt);
+      before = now;
+      if (this.tick >= this.log.ticks - 1) this.toggle(); else requestAnimationFrame(frame);
+    };
+    requestAnimationFrame(frame);
+  }
+
+  /* The pose of an agent between ticks, or null. */
+  pose(poses, first) {
+    const at = this.tick - first, low = Math.floor(at), share = at - low;
+    const a = poses[low], b = poses[low + 1];
+    if (!a) return null;
+    if (!b || share === 0) return [a[0] / 100, a[1] / 100, a[2] / 1000];
+    const turn = Math.atan2(Math.sin((b[2] - a[2]) / 1000), Math.cos((b[2] - a[2]) / 1000));
+    return [(a[0] + share * (b[0] - a[0])) / 100, (a[1] + share * (b[1] - a[1])) / 100,
+      a[2] / 1000 + share * turn];
+  }
+
+  trail(ctx, poses, first, stroke, pose) {
+    const last = Math.floor(this.tick), ticks = Math.round(TRAIL_S / this.log.dt);
+    let [x, y] = pose;
+    for (let tick = last; tick >= Math.max(first, last - ticks); tick--) {
+      const at = poses[tick - first];
+      if (!at) break;
+      const fade = 0.5 * (1 - (this.tick - tick) / (ticks + 1));
+      drawPath(ctx, [x, y, at[0] / 100, at[1] / 100], stroke, 2.2, Math.max(fade, 0), this.scale);
+      [x, y] = [at[0] / 100, at[1] / 100];
+    }
+  }
+
+  centre(ego) {
+    if (this.follow.checked && ego) return [ego[0], ego[1]];
+    const [left, low, right, high] = DATA.maps[this.log.map].extent;
+    return [(left + right) / 2, (low + high) / 2];
+  }
+
+  draw() {
+    const { width, height } = fit(this.canvas);
+    if (!width) return;
+    const log = this.log, tick = Math.floor(this.tick);
+    const poses = log.agents.map((agent) => this.pose(agent.poses, agent.first));
+    const [left, low, right, high] = DATA.maps[log.map].extent;
+    const whole = Math.min(width / (right - left), height / (high - low)) * 0.95;
+    this.scale = this.zoom * (this.follow.checked ? Math.max(whole, width / 130) : whole);
+    const [x, y] = this.centre(poses[0]);
+    const ctx = begin(this.canvas, x + this.offset[0], y + this.offset[1], this.scale);
+    drawMap(ctx, log.map, this.scale);
+    drawPath(ctx, points(log.route), colour("plan"), 5, 0.14, this.scale);
+    if (this.forecasts.checked) this.drawForecasts(ctx, tick, poses);
+    log.agents.forEach((agent, slot) => {
+      const stroke = colour(slot ? CLASSES[agent.class] : "ego");
+      if (poses[slot]) this.trail(ctx, agent.poses, agent.first, stroke, poses[slot]);
+    });
+    this.drawPlan(ctx, tick, poses[0]);
+    for (let slot = log.agents.length - 1; slot >= 0; slot--) {
+      if (poses[slot]) this.drawAgent(ctx, slot, poses[slot]);
+    }
+    this.drawEvents(ctx, poses[0]);
+    drawScale(ctx, this.canvas, this.scale);
+    this.drawStrip();
+    const speed = log.speed[tick] === null ? "" : ` · ${(3.6 * log.speed[tick]).toFixed(0)} km/h`;
+    this.clock.textContent = `${(this.tick * log.dt).toFixed(1)} s${speed}`;
+    this.scrub.value = tick;
+  }
+
+  drawForecasts(ctx, tick, poses) {
+    for (const [slot, modes] of this.log.forecasts[tick]) {
+      const agent = this.log.agents[slot];
+      const start = agent.poses[tick - agent.first] || poses[slot];
+      if (!start) continue;
+      drawModes(ctx, modes, [start[0] / 100, start[1] / 100], colour("forecast"), this.scale);
+    }
+  }
+
+  drawPlan(ctx, tick, ego) {
+    const plan = this.log.plans[tick];
+    if (!plan || !plan.length || !ego) return;
+    const xy = points(plan);
+    drawPath(ctx, [ego[0], ego[1], ...xy], colour("plan"), 4, 0.9, this.scale);
+  }
+
+  drawAgent(ctx, slot, pose) {
+    const agent = this.log.agents[slot];
+    const size = [agent.size[0] / 100, agent.size[1] / 100];
+    if (slot) {
+      drawBox(ctx, pose, size, colour(CLASSES[agent.class]), colour("box-edge"), this.scale);
+      return;
+    }
+    const recorded = this.ghost.checked && this.pose(this.log.log, 0);
+    drawBox(ctx, pose, size, colour("ego"), colour("box-edge"), this.scale);
+    if (recorded) drawGhost(ctx, recorded, size, this.scale);
+  }
+
+  drawEvents(ctx, ego) {
+    const log = this.log;
+    const recent = log.events.filter(([tick]) => tick <= this.tick
+      && (this.tick - tick) * log.dt < FLASH_S).at(-1);
+    this.event.style.opacity = recent ? 1 : 0;
+    if (!recent) return;
+    const stroke = this.eventColour(recent[1]);
+    this.event.textContent = recent[1].replaceAll("_", " ");
+    this.event.style.background = stroke;
+    if (!ego) return;
+    const age = (this.tick - recent[0]) * log.dt / FLASH_S;
+    ctx.save();
+    ctx.globalAlpha = 1 - age;
+    ctx.strokeStyle = stroke;
+    ctx.lineWidth = 4 / this.scale;
+    ctx.beginPath();
+    ctx.arc(ego[0], ego[1], 3 + 5 * age, 0, 2 * Math.PI);
+    ctx.stroke();
+    ctx.restore();
+  }
+
+  eventColour(name) {
+    return colour(/collision|hit|overlap/i.test(name) ? "alarm" : "warning");
+  }
+
+  /* Speed over time: the ego's line and the recorded one, events as marks, now as a bar. */
+  drawStrip() {
+    const { width, height, ratio } = fit(this.strip);
+    const ctx = this.strip.getContext("2d"), log = this.log;
+    ctx.setTransform(ratio, 0, 0, ratio, 0, 0);
+    ctx.clearRect(0, 0, width, height);
+    const top = Math.max(5, ...log.speed.filter(Number.isFinite), ...log.log_speed
+      .filter(Number.isFinite)) * 1.1;
+    const px = (tick) => tick / Math.max(1, log.ticks - 1) * width;
+    const py = (speed) => height - 4 - speed / top * (height - 10);
+    const line = (speeds, stroke, dash) => {
+      ctx.strokeStyle = stroke;
+      ctx.lineWidth = 1.8;
+      ctx.setLineDash(dash);
+      ctx.beginPath();
+      let pen = false;
+      speeds.forEach((speed, tick) => {
+        if (speed !== null && pen) ctx.lineTo(px(tick), py(speed));
+        if (speed !== null && !pen) ctx.moveTo(px(tick), py(speed));
+        pen = speed !== null;
+      });
+      ctx.stroke();
+      ctx.setLineDash([]);
+    };
+    ctx.fillStyle = colour("muted");
+    ctx.font = "11px system-ui, sans-serif";
+    ctx.fillText("speed", 4, 12);
+    line(log.log_speed, colour("muted"), [4, 3]);
+    line(log.speed, colour("ego"), []);
+    for (const [tick, name] of log.events) {
+      ctx.fillStyle = this.eventColour(name);
+      ctx.fillRect(px(tick) - 1, 0, 2, height);
+    }
+    ctx.fillStyle = colour("text");
+    ctx.fillRect(px(this.tick) - 1, 0, 2, height);
+  }
+}

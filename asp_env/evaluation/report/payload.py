@@ -1,0 +1,280 @@
+"""Maps, forecasts and drives as plain numbers for the page to draw.
+
+Points are centimetres: the first one, then the steps from point to point, so that the text stays
+short. Headings are thousandths of a radian.
+"""
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from jaxtyping import Float
+
+from asp_env.data.classes import AgentClass
+from asp_env.data.forecast import Forecast
+from asp_env.data.road_map import LineType, Ragged, RoadMap
+from asp_env.data.rollout import Rollout
+from asp_env.data.scene import Scene
+from asp_env.data.snippets import Future
+from asp_env.errors import AspEnvError, DataError
+
+FORECAST_POINT_S = 0.4
+"""Forecasts keep a point this often, and always the last one."""
+MIN_PICTURE_M = 50.0
+MAX_PICTURE_M = 110.0
+MARGIN_M = 10.0
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class ForecastExamples:
+    """Situations with what predictors said of them, to be shown as pictures over the map."""
+
+    scene: Scene
+    """Each situation becomes a row of pictures."""
+    future: Future
+    """What the scene's targets went on to do."""
+    forecasts: Mapping[str, Forecast]
+    """By predictor, of this very scene; each becomes a column of pictures."""
+    captions: tuple[str, ...]
+    """One for each situation."""
+
+    def __post_init__(self) -> None:
+        """Checks that the parts speak of the same scene.
+
+        Raises:
+            AspEnvError: a count does not match.
+        """
+        situations, targets = len(self.scene.tick), len(self.scene.targets)
+        if len(self.captions) != situations:
+            raise AspEnvError(f"{len(self.captions)} captions for {situations} situations")
+        counts = {"the future": len(self.future.states)}
+        counts |= {name: len(forecast.ids) for name, forecast in self.forecasts.items()}
+        for name, count in counts.items():
+            if count != targets:
+                raise AspEnvError(f"{name} has {count} targets, the scene has {targets}")
+
+
+class MapTable:
+    """Maps by the order in which they were asked for, each one kept once."""
+
+    def __init__(self) -> None:
+        """An empty table."""
+        self._numbers: dict[int, int] = {}
+        self.payloads: list[dict[str, Any]] = []
+
+    def number(self, road_map: RoadMap) -> int:
+        """The place of a map in the table."""
+        key = id(road_map)
+        if key not in self._numbers:
+            self._numbers[key] = len(self.payloads)
+            self.payloads.append(_map_payload(road_map))
+        return self._numbers[key]
+
+
+def _steps(points: Float[np.ndarray, "n 2"]) -> list[int]:
+    cm = np.rint(100 * points).astype(np.int64)
+    return np.diff(cm, axis=0, prepend=0).reshape(-1).tolist()
+
+
+def _map_payload(road_map: RoadMap) -> dict[str, Any]:
+    lines = [
+        [int(kind), _steps(road_map.lines[number])]
+        for number, kind in enumerate(road_map.line_types)
+        if kind != LineType.VIRTUAL
+    ]
+    return {
+        "name": road_map.name,
+        "extent": [round(side, 1) for side in road_map.extent_m],
+        "drivable": [_steps(ring) for ring in _anticlockwise(road_map.drivable)],
+        "lines": lines,
+    }
+
+
+def _anticlockwise(rings: Ragged) -> list[np.ndarray]:
+    """Rings of one orientation, so that filling them together leaves no holes."""
+    turned = []
+    for number in range(len(rings)):
+        x, y = rings[number].T
+        area = np.sum(x * np.roll(y, -1) - np.roll(x, -1) * y)
+        turned.append(rings[number] if area >= 0 else rings[number][::-1])
+    return turned
+
+
+def _poses(states: Float[np.ndarray, "... 4"]) -> np.ndarray:
+    return np.rint(states[..., :3] * np.array([100, 100, 1000])).astype(np.int64)
+
+
+def _thinned(states: Float[np.ndarray, "... steps n"], dt_s: float) -> np.ndarray:
+    stride = max(1, round(FORECAST_POINT_S / dt_s))
+    return states[..., ::-1, :2][..., ::stride, :][..., ::-1, :]
+
+
+def _modes(
+    states: Float[np.ndarray, "m steps n"], log_probs: Float[np.ndarray, " m"], dt_s: float
+) -> list:
+    return [
+        [round(float(np.exp(log_prob)), 3), _steps(mode)]
+        for log_prob, mode in zip(log_probs, _thinned(states, dt_s), strict=True)
+    ]
+
+
+def pictures_payload(examples: ForecastExamples, maps: MapTable) -> list[dict[str, Any]]:
+    """A row of pictures for each situation."""
+    return [_picture_row(examples, number, maps) for number in range(len(examples.captions))]
+
+
+def _picture_row(examples: ForecastExamples, number: int, maps: MapTable) -> dict[str, Any]:
+    scene, future = examples.scene, examples.future
+    targets = np.flatnonzero(scene.targets[:, 0] == number)
+    seen = np.flatnonzero(scene.valid[number, :, -1])
+    states = scene.states[number]
+    centre, extent_m = _picture_window(scene, future, targets)
+    return {
+        "caption": examples.captions[number],
+        "map": maps.number(scene.maps[int(scene.map_index[number])]),
+        "window": [round(value, 1) for value in (*centre, extent_m)],
+        "agents": [
+            [
+                int(scene.classes[number, slot]),
+                *_box(scene.sizes[number, slot]),
+                *_poses(states[slot, -1]).tolist(),
+                _steps(states[slot, scene.valid[number, slot], :2]),
+            ]
+            for slot in seen
+        ],
+        "targets": [int(np.flatnonzero(seen == scene.targets[t, 1])[0]) for t in targets],
+        "truth": [
+            _steps(
+                np.concatenate(
+                    [states[scene.targets[t, 1], -1:, :2], future.states[t, future.valid[t], :2]]
+                )
+            )
+            for t in targets
+        ],
+        "forecasts": {
+            name: {
+                "modes": [
+                    _modes(forecast.states[t], forecast.log_probs[t], forecast.dt_s)
+                    if forecast.valid[t]
+                    else []
+                    for t in targets
+                ],
+                **_final_errors(forecast, future, targets),
+            }
+            for name, forecast in examples.forecasts.items()
+        },
+    }
+
+
+def _picture_window(
+    scene: Scene, future: Future, targets: np.ndarray
+) -> tuple[tuple[float, float], float]:
+    """Centre and width of the square that shows the targets and their ways."""
+    points = np.concatenate(
+        [scene.target_states[targets, :2], future.states[targets][future.valid[targets]][:, :2]]
+    )
+    low, high = points.min(axis=0), points.max(axis=0)
+    extent_m = float(np.clip((high - low).max() + 2 * MARGIN_M, MIN_PICTURE_M, MAX_PICTURE_M))
+    x, y = (low + high) / 2
+    return (float(x), float(y)), extent_m
+
+
+def _final_errors(
+    forecast: Forecast, future: Future, targets: np.ndarray
+) -> dict[str, float | None]:
+    """Mean FDE of the most probable mode, and of the nearest one, over the targets shown."""
+    steps = min(forecast.states.shape[2], future.states.shape[1])
+    rows = targets[forecast.valid[targets] & future.valid[targets, steps - 1]]
+    if not len(rows):
+        return {"fde": None, "best": None}
+    miss = forecast.states[rows, :, steps - 1, :2] - future.states[rows, None, steps - 1, :2]
+    distance_m = np.hypot(miss[..., 0], miss[..., 1])
+    probable = distance_m[np.arange(len(rows)), forecast.most_probable[rows]]
+    return {
+        "fde": round(float(probable.mean()), 2),
+        "best": round(float(distance_m.min(axis=1).mean()), 2),
+    }
+
+
+def _box(size: Float[np.ndarray, " 2"]) -> list[int]:
+    return np.rint(100 * size).astype(np.int64).tolist()
+
+
+def drives_payload(
+    folder: Path, road_maps: Mapping[str, RoadMap], maps: MapTable
+) -> list[dict[str, Any]]:
+    """All rollouts below a folder, in the order of their paths.
+
+    Raises:
+        DataError: a rollout cannot be read, or its recording's map was not handed over.
+    """
+    drives = []
+    for path in sorted(folder.rglob("*.npz")):
+        rollout = Rollout.load(path)
+        name = rollout.scenario.recording_name
+        if name not in road_maps:
+            known = ", ".join(sorted(road_maps)) or "none"
+            raise DataError(f"{path}: no map of recording {name!r} was given; given were {known}")
+        drive = _drive(rollout, maps.number(road_maps[name]))
+        group = path.parent.relative_to(folder).as_posix()
+        drives.append({"driver": "" if group == "." else group, "name": path.stem} | drive)
+    return drives
+
+
+def _drive(rollout: Rollout, map_number: int) -> dict[str, Any]:
+    return {
+        "map": map_number,
+        "tags": " · ".join(rollout.scenario.tags),
+        "start_s": round(rollout.scenario.start_tick * rollout.dt_s, 3),
+        "dt": round(rollout.dt_s, 4),
+        "ticks": len(rollout.states),
+        "agents": [_track(rollout, slot) for slot in range(len(rollout.ids))],
+        "log": [
+            pose if valid else None
+            for pose, valid in zip(
+                _poses(rollout.log_states[:, 0]).tolist(), rollout.log_valid[:, 0], strict=True
+            )
+        ],
+        "speed": _speeds(rollout.states[:, 0, 3], rollout.valid[:, 0]),
+        "log_speed": _speeds(rollout.log_states[:, 0, 3], rollout.log_valid[:, 0]),
+        "route": _steps(rollout.route),
+        "plans": [_steps(plan) for plan in rollout.plans],
+        "forecasts": _forecasts(rollout),
+        "events": [
+            [int(tick), rollout.event_names[kind]] for tick, kind in np.argwhere(rollout.events)
+        ],
+    }
+
+
+def _track(rollout: Rollout, slot: int) -> dict[str, Any]:
+    """An agent's poses at the ticks from its first to its last one, null where it is not seen."""
+    seen = np.flatnonzero(rollout.valid[:, slot])
+    kind = AgentClass(int(rollout.classes[slot]))
+    head = {"class": int(kind), "size": _box(rollout.sizes[slot])}
+    if not len(seen):
+        return head | {"first": 0, "poses": []}
+    first, last = int(seen[0]), int(seen[-1])
+    poses = _poses(rollout.states[first : last + 1, slot]).tolist()
+    valid = rollout.valid[first : last + 1, slot]
+    return head | {
+        "first": first,
+        "poses": [pose if there else None for pose, there in zip(poses, valid, strict=True)],
+    }
+
+
+def _speeds(speeds_mps: Float[np.ndarray, " ticks"], valid: np.ndarray) -> list[float | None]:
+    return [
+        round(float(speed), 2) if there else None
+        for speed, there in zip(speeds_mps, valid, strict=True)
+    ]
+
+
+def _forecasts(rollout: Rollout) -> list[list]:
+    """For each tick its rows [slot, [[probability, points], …]]."""
+    told: list[list] = [[] for _ in range(len(rollout.states))]
+    for row, tick in enumerate(rollout.forecast_ticks):
+        modes = _modes(rollout.forecast_states[row], rollout.forecast_log_probs[row], rollout.dt_s)
+        told[int(tick)].append([int(rollout.forecast_slots[row]), modes])
+    return told
