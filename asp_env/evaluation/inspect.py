@@ -1,0 +1,253 @@
+"""`asp-env inspect`: what DATA holds, and every fault found in it."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import numpy as np
+import tyro
+from jaxtyping import Bool, Float
+from rich.console import Console
+from rich.progress import track
+from rich.table import Table
+
+from asp_env.data.classes import AgentClass
+from asp_env.data.clock import DEFAULT_DT_S, frames_per_tick, ticks
+from asp_env.data.recording import Recording
+from asp_env.data.road_map import RoadMap
+from asp_env.data.snippets import EVERY_S, HISTORY_S, find_snippets
+from asp_env.data.source import Recordings, open_data
+from asp_env.errors import DataError
+from asp_env.evaluation.drift import drift_m
+from asp_env.metrics.drivable import CELL_M, drivable_field
+
+HORIZONS_S = (3.0, 6.0)
+PERCENTILES = (50, 90, 99)
+PIPED_WIDTH = 160
+"""Columns of text where the output is no terminal."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Drifts:
+    """How far the actions of one or more recordings' snippets drift, per horizon."""
+
+    metres: Mapping[float, Float[np.ndarray, " n"]]
+    moving: Mapping[float, Bool[np.ndarray, " n"]]
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Findings:
+    """One recording that could be read."""
+
+    recording: Recording
+    on_road: float
+    """Share of the vehicles' positions inside the drivable area."""
+    drifts: Drifts
+
+
+@dataclass(frozen=True, kw_only=True)
+class Inspect:
+    """Show recordings, tracks, classes, maps, snippet counts, drift floor, and every fault."""
+
+    data: tyro.conf.Positional[str]
+    """A folder in the inD/rounD layout, `sample:SITE` or `synthetic:SITE`."""
+    dt: float = DEFAULT_DT_S
+    """Time step in seconds; it must divide the recordings' frame rate."""
+
+    def run(self) -> None:
+        """Prints the tables.
+
+        Raises:
+            AspEnvError: the data are not there, some of them cannot be read, or the time step
+                does not divide them. What can be read is shown first.
+        """
+        recordings = open_data(self.data)
+        console = Console()
+        if not console.is_terminal:
+            console = Console(width=PIPED_WIDTH)
+        found, faults = self._examine(recordings, console)
+        if found:
+            maps = {id(each.recording.road_map): each.recording.road_map for each in found}
+            console.print(_recording_table(self.data, found))
+            console.print(_map_table(list(maps.values())))
+            console.print(_drift_table(found, self.dt))
+            _print_lines(console, "Repairs", _repairs(found, list(maps.values())))
+        _print_lines(console, "Faults", list(faults.values()))
+        if faults:
+            raise DataError(_summary(recordings, faults))
+
+    def _examine(
+        self, recordings: Recordings, console: Console
+    ) -> tuple[list[Findings], dict[str, str]]:
+        found: list[Findings] = []
+        faults: dict[str, str] = {}
+        numbers = track(
+            range(len(recordings)),
+            description="Reading",
+            console=console,
+            transient=True,
+            disable=not console.is_terminal,
+        )
+        for number in numbers:
+            try:
+                recording = recordings[number]
+            except DataError as error:
+                faults[recordings.names[number]] = str(error)
+                continue
+            frames_per_tick(recording.frame_rate_hz, self.dt)
+            found.append(
+                Findings(
+                    recording=recording,
+                    on_road=_on_road(recording),
+                    drifts=_drifts(recording, self.dt),
+                )
+            )
+        return found, faults
+
+
+def _drifts(recording: Recording, dt_s: float) -> Drifts:
+    metres, moves = {}, {}
+    for horizon_s in HORIZONS_S:
+        horizon = ticks(horizon_s, dt_s)
+        index = find_snippets(
+            recording,
+            dt_s=dt_s,
+            history=ticks(HISTORY_S, dt_s),
+            horizon=horizon,
+            every=ticks(EVERY_S, dt_s),
+        )
+        metres[horizon_s], moves[horizon_s] = drift_m(recording, *index, dt_s=dt_s, horizon=horizon)
+    return Drifts(metres=metres, moving=moves)
+
+
+def _on_road(recording: Recording) -> float:
+    vehicles = np.flatnonzero(recording.predicted)
+    if not len(vehicles):
+        return float("nan")
+    points = np.concatenate([recording.track(int(i))[::5, :2] for i in vehicles])
+    field = drivable_field(recording.road_map)
+    return float((field.distance_m(points) <= 0).mean())
+
+
+def _recording_table(data: str, found: list[Findings]) -> Table:
+    table = Table(title=f"Recordings of {data}", title_justify="left")
+    for name in ("name", "location"):
+        table.add_column(name)
+    for name in ("Hz", "duration s", "rows", "tracks"):
+        table.add_column(name, justify="right")
+    table.add_column("classes", overflow="fold")
+    for name in ("parked", "on road %", "3+3 s", "3+6 s"):
+        table.add_column(name, justify="right")
+    table.add_column("picture")
+    for each in found:
+        recording = each.recording
+        table.add_row(
+            recording.name,
+            recording.location,
+            f"{recording.frame_rate_hz:g}",
+            f"{recording.duration_s:.1f}",
+            f"{len(recording.states):,}",
+            str(len(recording)),
+            _class_counts(recording),
+            str(int(recording.parked.sum())),
+            "-" if np.isnan(each.on_road) else f"{100 * each.on_road:.0f}",
+            *(f"{len(each.drifts.metres[horizon_s]):,}" for horizon_s in HORIZONS_S),
+            "yes" if recording.background else "no",
+        )
+    if len(found) > 1:
+        table.add_section()
+        sums = [
+            sum(len(each.drifts.metres[horizon_s]) for each in found) for horizon_s in HORIZONS_S
+        ]
+        table.add_row(
+            f"{len(found)} in all",
+            "",
+            "",
+            f"{sum(each.recording.duration_s for each in found):.1f}",
+            f"{sum(len(each.recording.states) for each in found):,}",
+            str(sum(len(each.recording) for each in found)),
+            "",
+            str(sum(int(each.recording.parked.sum()) for each in found)),
+            "",
+            *(f"{count:,}" for count in sums),
+            "",
+        )
+    return table
+
+
+def _class_counts(recording: Recording) -> str:
+    counts = np.bincount(recording.classes, minlength=len(AgentClass))
+    return ", ".join(f"{counts[kind]} {kind.name.lower()}" for kind in AgentClass if counts[kind])
+
+
+def _map_table(maps: list[RoadMap]) -> Table:
+    table = Table(title="Maps", title_justify="left")
+    table.add_column("name")
+    for name in ("lanes", "successors", "lines", "drivable m²", "repairs"):
+        table.add_column(name, justify="right")
+    for road_map in maps:
+        area_m2 = float((drivable_field(road_map).outside_m <= 0).sum()) * CELL_M**2
+        table.add_row(
+            road_map.name,
+            str(len(road_map.lanes)),
+            str(len(road_map.successors)),
+            str(len(road_map.lines)),
+            f"{area_m2:,.0f}",
+            str(len(road_map.repairs)),
+        )
+    return table
+
+
+def _drift_table(found: list[Findings], dt_s: float) -> Table:
+    title = f"Drift of inferred actions (Heun, {dt_s:g} s): median / 90 % / 99 %, metres"
+    table = Table(title=title, title_justify="left")
+    table.add_column("name")
+    for horizon_s in HORIZONS_S:
+        for name in (f"n {horizon_s:g} s", "all", "n moving", "moving"):
+            table.add_column(name, justify="right")
+    with_snippets = [each for each in found if len(each.drifts.metres[HORIZONS_S[0]])]
+    for each in with_snippets:
+        table.add_row(each.recording.name, *_drift_cells([each.drifts]))
+    if len(with_snippets) != 1:
+        table.add_section()
+        table.add_row("all", *_drift_cells([each.drifts for each in found]))
+    return table
+
+
+def _drift_cells(drifts: list[Drifts]) -> list[str]:
+    cells = []
+    for horizon_s in HORIZONS_S:
+        metres = np.concatenate([each.metres[horizon_s] for each in drifts])
+        moves = np.concatenate([each.moving[horizon_s] for each in drifts])
+        for chosen in (metres, metres[moves]):
+            cells += [f"{len(chosen):,}", _quantiles(chosen)]
+    return cells
+
+
+def _quantiles(metres: Float[np.ndarray, " n"]) -> str:
+    if not len(metres):
+        return "-"
+    return " / ".join(f"{value:.2f}" for value in np.percentile(metres, PERCENTILES))
+
+
+def _repairs(found: list[Findings], maps: list[RoadMap]) -> list[str]:
+    of_maps = [f"map {road_map.name}: {line}" for road_map in maps for line in road_map.repairs]
+    return of_maps + [
+        f"recording {each.recording.name}: {line}"
+        for each in found
+        for line in each.recording.repairs
+    ]
+
+
+def _print_lines(console: Console, title: str, lines: list[str]) -> None:
+    console.print(f"{title}: {len(lines) or 'none'}", highlight=False)
+    for line in lines:
+        console.print(f"  {line}", soft_wrap=True, highlight=False, markup=False)
+
+
+def _summary(recordings: Recordings, faults: Mapping[str, str]) -> str:
+    if len(faults) == 1:
+        return next(iter(faults.values()))
+    return (
+        f"data {recordings.source!r}: {len(faults)} of {len(recordings)} recordings cannot be "
+        f"read ({', '.join(faults)}); mend or remove the files named above"
+    )
