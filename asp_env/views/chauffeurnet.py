@@ -19,17 +19,15 @@ picture. Lines are at least 1.5 pixels wide and boxes at least one, so nothing v
 scales. The picture does not depend on the order of slots, nor on the other targets of the scene.
 """
 
-import math
 from dataclasses import dataclass, field
-from typing import Any, ClassVar, final, no_type_check
+from typing import Any, ClassVar, final
 
 import numpy as np
 from jaxtyping import UInt8
-from numba import njit
 
 from asp_env.data.scene import Scene
 from asp_env.errors import AspEnvError
-from asp_env.views.draw import fill_box, fill_segment
+from asp_env.views.draw import draw_agents, draw_pieces
 from asp_env.views.map_raster import BoundaryCache
 from asp_env.views.view import View
 
@@ -40,9 +38,6 @@ BOUNDARY_WIDTH_M = 0.3
 TRAIL_WIDTH_M = 0.4
 MIN_LINE_WIDTH_PX = 1.5
 """Narrower lines would have gaps."""
-
-_BOUNDARY, _BOX, _TRAIL, _AGENTS = range(4)
-_HISTORY = SNAPSHOTS[-1]
 
 
 @final
@@ -62,7 +57,7 @@ class ChauffeurNet:
         "ego_trail",
         *(f"agents_{i}" for i in range(len(SNAPSHOTS))),
     )
-    history: ClassVar[int] = _HISTORY
+    history: ClassVar[int] = SNAPSHOTS[-1]
     """Past ticks that a scene must have."""
 
     def __reduce__(self) -> tuple[Any, ...]:
@@ -126,93 +121,16 @@ class ChauffeurNet:
         known = valid[situation, slot, -1]
         poses = np.where(known[:, None], states[situation, slot, -1], 0)
         matrices = self.view.pixels_from_world(poses)
-        scale = 1 / self.view.metres_per_pixel
+        pixels_per_metre = 1 / self.view.metres_per_pixel
         map_of_target = np.where(known, scene.map_index[situation], -1)
-        out[:, _BOUNDARY] = 0
-        half_width = 0.5 * max(BOUNDARY_WIDTH_M * scale, MIN_LINE_WIDTH_PX)
-        for index in np.unique(map_of_target[known]):
-            rows = np.flatnonzero(map_of_target == index)
-            segments = self._boundaries(scene.maps[index])
-            _draw_boundaries(segments, rows, matrices, half_width, out)
-        half_width = 0.5 * max(TRAIL_WIDTH_M * scale, MIN_LINE_WIDTH_PX)
-        _draw_agents(states, valid, sizes, targets, matrices, scale, half_width, out)
+        half_width = 0.5 * max(BOUNDARY_WIDTH_M * pixels_per_metre, MIN_LINE_WIDTH_PX)
+        out[:, 0] = 0
+        for index, road_map in enumerate(scene.maps):
+            pieces = self._boundaries(road_map)
+            on_map = map_of_target == index
+            draw_pieces(pieces, on_map, matrices, pixels_per_metre, half_width, out)
+        half_width = 0.5 * max(TRAIL_WIDTH_M * pixels_per_metre, MIN_LINE_WIDTH_PX)
+        draw_agents(
+            states, valid, sizes, targets, SNAPSHOTS, matrices, pixels_per_metre, half_width, out
+        )
         return out
-
-
-@njit(cache=True, nogil=True)
-@no_type_check
-def _draw_boundaries(segments, rows, pixels_from_world, half_width, out):
-    """Segments [x, y, x, y] of one map into the pictures of the targets `rows`."""
-    width = out.shape[3]
-    for t in rows:
-        canvas = out[t, _BOUNDARY]
-        m = pixels_from_world[t]
-        for s in range(len(segments)):
-            x_0, y_0, x_1, y_1 = segments[s]
-            column_0 = m[0, 0] * x_0 + m[0, 1] * y_0 + m[0, 2]
-            column_1 = m[0, 0] * x_1 + m[0, 1] * y_1 + m[0, 2]
-            if max(column_0, column_1) < -half_width:
-                continue
-            if min(column_0, column_1) > width + half_width:
-                continue
-            row_0 = m[1, 0] * x_0 + m[1, 1] * y_0 + m[1, 2]
-            row_1 = m[1, 0] * x_1 + m[1, 1] * y_1 + m[1, 2]
-            fill_segment(canvas, column_0, row_0, column_1, row_1, half_width)
-
-
-@njit(cache=True, nogil=True)
-@no_type_check
-def _draw_agents(states, valid, sizes, targets, pixels_from_world, scale, trail_half_width, out):
-    """All channels but the map's, for all targets."""
-    agents = states.shape[1]
-    directions = np.empty((len(SNAPSHOTS), agents, 2))
-    drawn = -1
-    for t in range(len(targets)):
-        b, ego = targets[t]
-        out[t, _BOX:] = 0
-        if not valid[b, ego, _HISTORY]:
-            continue
-        if b != drawn:  # all targets of one situation see the same boxes
-            drawn = b
-            for k in range(len(SNAPSHOTS)):
-                for a in range(agents):
-                    if valid[b, a, SNAPSHOTS[k]]:
-                        heading = states[b, a, SNAPSHOTS[k], 2]
-                        directions[k, a, 0] = math.cos(heading)
-                        directions[k, a, 1] = math.sin(heading)
-        m = pixels_from_world[t]
-        _draw_trail(out[t, _TRAIL], states[b, ego], valid[b, ego], m, trail_half_width)
-        for k in range(len(SNAPSHOTS)):
-            tick = SNAPSHOTS[k]
-            for a in range(agents):
-                if (a == ego and tick != _HISTORY) or not valid[b, a, tick]:
-                    continue
-                canvas = out[t, _BOX] if a == ego else out[t, _AGENTS + k]
-                x, y = states[b, a, tick, 0], states[b, a, tick, 1]
-                cos, sin = directions[k, a, 0], directions[k, a, 1]
-                fill_box(
-                    canvas,
-                    m[0, 0] * x + m[0, 1] * y + m[0, 2],
-                    m[1, 0] * x + m[1, 1] * y + m[1, 2],
-                    (m[0, 0] * cos + m[0, 1] * sin) / scale,
-                    (m[1, 0] * cos + m[1, 1] * sin) / scale,
-                    0.5 * sizes[b, a, 0] * scale,
-                    0.5 * sizes[b, a, 1] * scale,
-                )
-
-
-@njit(cache=True, nogil=True)
-@no_type_check
-def _draw_trail(canvas, states, valid, m, half_width):
-    """The way through the valid states of one agent; a gap stays a gap."""
-    for k in range(_HISTORY):
-        if valid[k] and valid[k + 1]:
-            x_0, y_0, x_1, y_1 = states[k, 0], states[k, 1], states[k + 1, 0], states[k + 1, 1]
-            fill_segment(
-                canvas,
-                m[0, 0] * x_0 + m[0, 1] * y_0 + m[0, 2],
-                m[1, 0] * x_0 + m[1, 1] * y_0 + m[1, 2],
-                m[0, 0] * x_1 + m[0, 1] * y_1 + m[0, 2],
-                m[1, 0] * x_1 + m[1, 1] * y_1 + m[1, 2],
-                half_width,
-            )
