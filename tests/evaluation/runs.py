@@ -40,28 +40,25 @@ def metric_rows() -> list[dict[str, object]]:
             for selection, share in (("most-probable", 1.0), ("best-of-3", 0.6)):
                 fde = error * hard * (share if predictor.startswith("ffw") else 1.0)
                 values = {"MAE": fde * 0.2, "MSE": fde**2 * 0.1, "FDE": fde, "ADE": fde * 0.4}
-                values["miss-rate"] = min(fde / 5, 1)
+                values["miss"] = min(fde / 5, 1)
+                values["FDE / constant velocity"] = fde / (3.8 * hard)
                 values |= {f"L2@{s}s": fde * (s / 3) ** 1.8 for s in (0.6, 1.0, 2.0, 3.0)}
                 head = {"predictor": predictor, "horizon_s": "3", "selection": selection}
                 rows += [
                     {**head, "subset": subset, "metric": name, **interval(value)}
                     for name, value in values.items()
                 ]
-        rows.append(
-            {"predictor": predictor, "horizon_s": "3", "subset": "all", "metric": "ECE"}
-            | interval(error * 0.03)
-        )
     for (planner, predictor), score in SCORES.items():
         head = {"planner": planner, "predictor": predictor, "traffic": "idm", "latency_ticks": 0}
         values = {
             "score": score,
+            "no collision": score**0.4,
+            "no at-fault collision": score**0.3,
+            "on road": score**0.2,
             "progress": score**0.5,
-            "collision": (1 - score) * 0.3,
-            "off-road": (1 - score) * 0.1,
-            "comfort": 0.6 + 0.3 * score,
             "TTC": score,
-            "log-divergence": 9 * (1 - score),
-            "route-deviation": 1.0 - score,
+            "log divergence": 9 * (1 - score),
+            "comfort": 0.6 + 0.3 * score,
         }
         rows += [
             {**head, "subset": subset, "metric": name, **interval(value * share)}
@@ -164,7 +161,7 @@ def make_rollout(
         axis=-1,
     )
     events = np.zeros((length + 1, 2), dtype=bool)
-    events[length // 2, 1] = True
+    events[length // 2 : length // 2 + 4, 1] = True
     events[length * 3 // 4, 0] = True
     plan = np.stack([np.interp(np.arange(length)[:, None] + np.arange(15), np.arange(length + 1),
                                states[:, 0, axis]) for axis in (0, 1)], axis=-1)  # fmt: skip

@@ -115,7 +115,7 @@ def _sections(out: Path, results: Results, data: dict[str, Any]) -> dict[str, tu
             "How does the car drive with them?",
             tables(results.driving) + figures.get("driving-metrics", ""),
         ),
-        "replay": ("Watch the drives", replay if data["drives"] else ""),
+        "drives": ("Watch the drives", replay if data["drives"] else ""),
         "metrics": ("What the metrics say", _notes(results)),
         "run": ("What was run", manifest(_read_manifest(out / "manifest.json"))),
     }
@@ -136,8 +136,8 @@ def _notes(results: Results) -> str:
     return f"<dl class='notes'>{''.join(lines)}</dl>{INTERVALS}" if lines else ""
 
 
-INTERVALS = """<p class='hint'>Small figures and whiskers are intervals as the run computed them.
-Bold: the best of those who do not know the recorded future.</p>"""
+INTERVALS = """<p class='hint'>Small figures and whiskers are intervals; how they were
+computed stands in what was run. Bold is the best of those who do not know the recorded future.</p>"""
 
 
 def _read_manifest(path: Path) -> dict[str, Any]:

@@ -242,9 +242,7 @@ def _drive(rollout: Rollout, map_number: int) -> dict[str, Any]:
         "route": _steps(rollout.route),
         "plans": [_steps(plan) for plan in rollout.plans],
         "forecasts": _forecasts(rollout),
-        "events": [
-            [int(tick), rollout.event_names[kind]] for tick, kind in np.argwhere(rollout.events)
-        ],
+        "events": _spells(rollout),
     }
 
 
@@ -268,6 +266,18 @@ def _speeds(speeds_mps: Float[np.ndarray, " ticks"], valid: np.ndarray) -> list[
     return [
         round(float(speed), 2) if there else None
         for speed, there in zip(speeds_mps, valid, strict=True)
+    ]
+
+
+def _spells(rollout: Rollout) -> list[list]:
+    """[name, first tick, last tick] of every spell in which an event held."""
+    edges = np.diff(rollout.events.astype(np.int8), axis=0, prepend=0, append=0)
+    return [
+        [name, int(first), int(last) - 1]
+        for kind, name in enumerate(rollout.event_names)
+        for first, last in zip(
+            np.flatnonzero(edges[:, kind] == 1), np.flatnonzero(edges[:, kind] == -1), strict=True
+        )
     ]
 
 

@@ -22,7 +22,7 @@ def colours(predictors: Sequence[str]) -> dict[str, str]:
 
 def final_errors(results: Sequence[Result], colour: dict[str, str]) -> str | None:
     """Bars of FDE by subset and predictor with their intervals, a panel per selection."""
-    results = [r for r in results if r.metric.lower() == "fde" and r.at_s is None]
+    results = [r for r in results if r.metric == "FDE" and r.at_s is None]
     if not results:
         return None
     selections = distinct((r.selection for r in results), first=SELECTIONS)
@@ -42,7 +42,7 @@ def final_errors(results: Sequence[Result], colour: dict[str, str]) -> str | Non
                 hovertemplate="%{y:.2f} m",
             )
             figure.add_trace(bar, row=1, col=panel)
-    figure.update_layout(barmode="group", bargap=0.28, bargroupgap=0.08, height=380)
+    figure.update_layout(barmode="group", bargap=0.28, bargroupgap=0.08, height=400)
     figure.update_yaxes(title_text="FDE, m", col=1)
     return _finish(figure)
 
@@ -72,7 +72,7 @@ def errors_over_time(results: Sequence[Result], colour: dict[str, str]) -> str |
                 hovertemplate="%{y:.2f} m",
             )
             figure.add_trace(line, row=1, col=panel)
-    figure.update_layout(height=380, hovermode="x unified")
+    figure.update_layout(height=400, hovermode="x unified")
     figure.update_xaxes(title_text="seconds ahead", rangemode="tozero")
     figure.update_yaxes(rangemode="tozero")
     figure.update_yaxes(title_text="distance to the truth, m", col=1)
@@ -100,7 +100,8 @@ def driving_metrics(results: Sequence[Result], colour: dict[str, str]) -> str | 
     )
     for number, metric in enumerate(metrics):
         row, column = number // columns + 1, number % columns + 1
-        percent = note(metric).unit == "%"
+        told = note(metric)
+        percent = told.unit == "%"
         for entrant in who:
             mine = [r for r in results if (r.entrant, r.metric) == (entrant, metric)]
             scale = 100.0 if percent else 1.0
@@ -114,7 +115,7 @@ def driving_metrics(results: Sequence[Result], colour: dict[str, str]) -> str | 
                 showlegend=False,
             )
             figure.add_trace(point, row=row, col=column)
-        if percent:
+        if percent and told.better == "higher":
             figure.update_xaxes(range=[-4, 104], tickvals=[0, 50, 100], row=row, col=column)
         else:
             figure.update_xaxes(rangemode="tozero", nticks=5, row=row, col=column)
@@ -158,10 +159,10 @@ def _whiskers(results: Sequence[Result], scale: float = 1.0) -> dict:
     }
 
 
-def _finish(figure: go.Figure, *, top_px: int = 84) -> str:
+def _finish(figure: go.Figure, *, top_px: int = 72) -> str:
     figure.update_layout(
         template="none",
-        margin={"l": 60, "r": 14, "t": top_px, "b": 48},
+        margin={"l": 60, "r": 14, "t": top_px, "b": 54},
         legend={"orientation": "h", "yref": "container", "y": 0.99, "yanchor": "top", "x": 0},
         paper_bgcolor="rgba(0,0,0,0)",
         plot_bgcolor="rgba(0,0,0,0)",

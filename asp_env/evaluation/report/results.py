@@ -4,7 +4,7 @@ import csv
 import re
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
-from pathlib import Path
+from pathlib import Path, PurePath
 
 from asp_env.errors import DataError
 
@@ -111,8 +111,8 @@ def _results(path: Path, rows: Sequence[dict[str, str]]) -> tuple[Result, ...]:
 def _result(
     path: Path, row: dict[str, str], varying: Sequence[str], fixed: tuple[str, ...]
 ) -> Result:
-    folder = row["predictor"].partition(":")[2]
-    details = [folder] if folder else []
+    folder = PurePath(row["predictor"].partition(":")[2])
+    details = ["/".join(folder.parts[-2:])] if folder.name else []
     details += [_detail(name, row[name]) for name in varying if row[name]]
     metric = re.fullmatch(r"(.+)@([0-9.]+) ?s", row["metric"])
     try:

@@ -8,7 +8,11 @@ from asp_env.evaluation.report.notes import note
 from asp_env.evaluation.report.results import Result, Results, best, distinct
 
 BASELINE = "constant-velocity"
-DRIVING_METRICS = ("score", "nuplanscore", "pdms", "atfaultcollision", "collision", "progress")
+RATIO = "FDE / constant velocity"
+DRIVING_METRICS = ("score", "no at-fault collision")
+LONG_LIST = 12
+"""Longer lists of the manifest are folded."""
+
 SELECTIONS = ("most-probable", "best-of-3")
 
 
@@ -22,32 +26,39 @@ def _forecast_cards(results: Sequence[Result]) -> Iterator[str]:
     subset = _first_subset(results, "moving", "all")
     for selection in SELECTIONS:
         mine = [
-            r
-            for r in results
-            if (r.subset, r.selection, r.metric.lower()) == (subset, selection, "fde")
+            r for r in results if (r.subset, r.selection) == (subset, selection) and r.at_s is None
         ]
-        winner = best(mine, better="lower")
+        winner = best([r for r in mine if r.metric == "FDE"], better="lower")
         if winner is None:
             continue
         horizon = f" at {winner.horizon_s} s" if winner.horizon_s else ""
-        base = [
-            f"{r.value:.2f} m for constant velocity"
-            for r in mine
-            if r.entrant.predictor == BASELINE
-            and r.value is not None
-            and (r.data, r.horizon_s) == (winner.data, winner.horizon_s)
-        ]
         heading = f"FDE{horizon}, {selection.replace('-', ' ')}, {subset or 'all'} targets"
-        yield _card(heading, winner, "".join(base[:1]))
+        yield _card(heading, winner, _beside_baseline(winner, mine))
+
+
+def _beside_baseline(winner: Result, results: Sequence[Result]) -> str:
+    """What constant velocity does there, and the paired ratio to it if it was computed."""
+    where = (winner.data, winner.horizon_s)
+    here = [r for r in results if (r.data, r.horizon_s) == where and r.value is not None]
+    base = [r for r in here if r.metric == "FDE" and r.entrant.predictor == BASELINE]
+    ratio = [r for r in here if r.metric == RATIO and r.entrant == winner.entrant]
+    if not base or winner.entrant.predictor == BASELINE:
+        return ""
+    told = f"constant velocity: {base[0].value:.2f} m"
+    if not ratio:
+        return told
+    between = (
+        ""
+        if ratio[0].low is None or ratio[0].high is None
+        else f" ({ratio[0].low:.2f} to {ratio[0].high:.2f})"
+    )
+    return f"{told}; ratio {ratio[0].value:.2f}{between}"
 
 
 def _driving_cards(results: Sequence[Result]) -> Iterator[str]:
     subset = _first_subset(results, "all")
     mine = [result for result in results if result.subset == subset]
-    labels = [note(metric).label for metric in DRIVING_METRICS]
-    told = distinct(r.metric for r in mine if note(r.metric).label in labels)
-    told.sort(key=lambda metric: labels.index(note(metric).label))
-    for metric in told[:2]:
+    for metric in DRIVING_METRICS:
         column = [result for result in mine if result.metric == metric]
         winner = best(column, better=note(metric).better)
         if winner is None:
@@ -87,6 +98,9 @@ def _value(value: Any) -> str:
         inner = "".join(_entry(str(name), part) for name, part in value.items())
         many = "1 entry" if len(value) == 1 else f"{len(value)} entries"
         return f"<details><summary>{many}</summary><dl class='manifest'>{inner}</dl></details>"
+    if isinstance(value, list) and len(value) > LONG_LIST:
+        inner = ", ".join(_value(part) for part in value)
+        return f"<details><summary>{len(value)} entries</summary>{inner}</details>"
     if isinstance(value, list):
-        return ", ".join(_value(part) for part in value) or "-"
-    return "-" if value is None or value == "" else escape(str(value))
+        return ", ".join(_value(part) for part in value) or "&ndash;"
+    return "&ndash;" if value is None or value == "" else escape(str(value))

@@ -117,12 +117,13 @@ def _row_head(entrant: Entrant) -> str:
 
 def _cell(result: Result | None, bold: str | None, first: str) -> str:
     if result is None or result.value is None:
-        return f"<td{first}>-</td>"
+        return f"<td{first}>&ndash;</td>"
     told = note(result.metric)
     text = told.format(result.value)
     if text == bold and not result.entrant.privileged:
         text = f"<b>{text}</b>"
     if result.low is not None and result.high is not None:
-        text += f"<small>{told.format(result.low)} … {told.format(result.high)}</small>"
+        low, high = told.format(result.low), told.format(result.high)
+        text += f"<small>{low}&thinsp;&ndash;&thinsp;{high}</small>"
     count = "" if result.n is None else f" title='n = {result.n:.0f}'"
     return f"<td{first}{count}>{text}</td>"

@@ -24,12 +24,18 @@ function themed(layout) {
   return out;
 }
 
+/* Whiskers of bars stand out from the bars, those of points share their colour. */
+function themedTrace(trace) {
+  if (trace.type !== "bar") return trace;
+  return { ...trace, error_y: { ...trace.error_y, color: colour("text").trim() } };
+}
+
 function showPlots() {
   const draw = () => {
     for (const div of document.querySelectorAll("[data-figure]")) {
       const figure = DATA.figures[div.dataset.figure];
       div.style.height = `${figure.layout.height}px`;
-      Plotly.react(div, figure.data, themed(figure.layout),
+      Plotly.react(div, figure.data.map(themedTrace), themed(figure.layout),
         { displayModeBar: false, responsive: true });
     }
   };

@@ -60,20 +60,21 @@ function showPictures() {
       const caption = document.createElement("figcaption"), name = document.createElement("h3");
       const dot = document.createElement("i");
       dot.style.background = DATA.colours[predictor] || "var(--muted)";
-      name.append(dot, predictor);
+      name.append(dot, predictor.split(":")[0]);
+      name.title = predictor;
       caption.append(name, pictureCaption(row, predictor));
       figure.append(canvas, caption);
       figure.addEventListener("click", () => {
         dialog.showModal();
         drawPicture(large, row, predictor);
-        dialog.querySelector("p").textContent = `${predictor} · ${row.caption}`;
+        dialog.querySelector("p").textContent = `${predictor.split(":")[0]} · ${row.caption}`;
       });
       grid.append(figure);
       drawings.push(() => drawPicture(canvas, row, predictor));
     }
   }
   legend(document.getElementById("picture-legend"), [
-    ["ego", "forecast agents"], ["car", "cars and vans"], ["heavy", "trucks and buses"],
+    ["ego", "forecast agents"], ["car", "cars"], ["heavy", "vans, trucks, buses"],
     ["two-wheeler", "motorcycles"], ["vulnerable", "cyclists and pedestrians"],
     ["truth", "what happened", "stroke"],
   ]);

@@ -198,28 +198,31 @@ class Replay {
   }
 
   drawEvents(ctx, ego) {
-    const log = this.log;
-    const recent = log.events.filter(([tick]) => tick <= this.tick
-      && (this.tick - tick) * log.dt < FLASH_S).at(-1);
-    this.event.style.opacity = recent ? 1 : 0;
-    if (!recent) return;
-    const stroke = this.eventColour(recent[1]);
-    this.event.textContent = recent[1].replaceAll("_", " ");
-    this.event.style.background = stroke;
-    if (!ego) return;
-    const age = (this.tick - recent[0]) * log.dt / FLASH_S;
-    ctx.save();
-    ctx.globalAlpha = 1 - age;
-    ctx.strokeStyle = stroke;
-    ctx.lineWidth = 4 / this.scale;
-    ctx.beginPath();
-    ctx.arc(ego[0], ego[1], 3 + 5 * age, 0, 2 * Math.PI);
-    ctx.stroke();
-    ctx.restore();
+    const dt = this.log.dt;
+    const now = this.log.events.filter(([, first, last]) =>
+      first <= this.tick && (this.tick - last) * dt < FLASH_S);
+    this.event.replaceChildren(...now.map(([name]) => {
+      const badge = document.createElement("span");
+      badge.textContent = name;
+      badge.style.background = this.eventColour(name);
+      return badge;
+    }));
+    for (const [name, first] of now) {
+      const age = (this.tick - first) * dt / FLASH_S;
+      if (!ego || age > 1) continue;
+      ctx.save();
+      ctx.globalAlpha = 1 - age;
+      ctx.strokeStyle = this.eventColour(name);
+      ctx.lineWidth = 4 / this.scale;
+      ctx.beginPath();
+      ctx.arc(ego[0], ego[1], 3 + 5 * age, 0, 2 * Math.PI);
+      ctx.stroke();
+      ctx.restore();
+    }
   }
 
   eventColour(name) {
-    return colour(/collision|hit|overlap/i.test(name) ? "alarm" : "warning");
+    return colour(/collision/.test(name) ? "alarm" : "warning");
   }
 
   /* Speed over time: the ego's line and the recorded one, events as marks, now as a bar. */
@@ -251,9 +254,12 @@ class Replay {
     ctx.fillText("speed", 4, 12);
     line(log.log_speed, colour("muted"), [4, 3]);
     line(log.speed, colour("ego"), []);
-    for (const [tick, name] of log.events) {
+    for (const [name, first, last] of log.events) {
       ctx.fillStyle = this.eventColour(name);
-      ctx.fillRect(px(tick) - 1, 0, 2, height);
+      ctx.globalAlpha = 0.18;
+      ctx.fillRect(px(first), 0, Math.max(2, px(last) - px(first)), height);
+      ctx.globalAlpha = 1;
+      ctx.fillRect(px(first) - 1, 0, 2, height);
     }
     ctx.fillStyle = colour("text");
     ctx.fillRect(px(this.tick) - 1, 0, 2, height);
