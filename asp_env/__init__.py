@@ -1,1 +1,13 @@
-"""Does this trajectory predictor make the car drive better?"""
+"""Does this trajectory predictor make the car drive better?
+
+Importing this package registers the Gymnasium environment `asp_env/Replay-v0`.
+"""
+
+import gymnasium
+
+from asp_env.data.source import load
+from asp_env.errors import AspEnvError
+
+__all__ = ["AspEnvError", "load"]
+
+gymnasium.register(id="asp_env/Replay-v0", entry_point="asp_env.envs.replay:ReplayEnv")

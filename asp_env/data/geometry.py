@@ -1,7 +1,7 @@
 """Frames, boxes and paths: the only definitions, for arrays with any leading axes."""
 
 import numpy as np
-from jaxtyping import Bool, Float, Shaped
+from jaxtyping import Float, Shaped
 
 from asp_env.dynamics import wrap_angle
 
@@ -77,24 +77,3 @@ def route_along(states: Float[np.ndarray, "n 4"], *, beyond_m: float) -> Float[n
         direction = np.array([np.cos(states[-1, 2]), np.sin(states[-1, 2])])
     kept.append(end + (beyond_m * direction).astype(states.dtype))
     return resample(np.stack(kept), 1.0)
-
-
-def boxes_overlap(
-    states: Shaped[np.ndarray, "*batch n"],
-    sizes: Shaped[np.ndarray, "*batch 2"],
-    other_states: Shaped[np.ndarray, "*batch n"],
-    other_sizes: Shaped[np.ndarray, "*batch 2"],
-) -> Bool[np.ndarray, "*batch"]:
-    """Whether two oriented boxes intersect (separating axis theorem); touching is no overlap."""
-    corners = box_corners(states, sizes)
-    other_corners = box_corners(other_states, other_sizes)
-    overlap = np.ones(corners.shape[:-2], dtype=bool)
-    for frame, size, seen in (
-        (states, sizes, other_corners),
-        (other_states, other_sizes, corners),
-    ):
-        local = to_frame(seen, frame[..., None, :])
-        half = 0.5 * size
-        overlap &= (local.min(axis=-2) < half).all(axis=-1)
-        overlap &= (local.max(axis=-2) > -half).all(axis=-1)
-    return overlap

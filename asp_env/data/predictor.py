@@ -4,6 +4,7 @@ from typing import Protocol
 
 from asp_env import registry
 from asp_env.data.forecast import Forecast
+from asp_env.data.parts import TrainedOn
 from asp_env.data.scene import Scene
 from asp_env.data.snippets import Future
 
@@ -19,6 +20,8 @@ class Predictor(Protocol):
     """Past ticks that it needs to see of a target."""
     horizon: int
     """Ticks that it forecasts."""
+    trained_on: TrainedOn | None
+    """What it learned from; None for one that learns nothing."""
 
     def predict(self, scene: Scene, future: Future | None = None) -> Forecast:
         """Forecasts the scene's targets; only privileged predictors get a future."""

@@ -4,6 +4,7 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
 import numpy as np
+from jaxtyping import Bool
 
 from asp_env.data.clock import frames_per_tick, ticks
 from asp_env.data.geometry import path_length
@@ -65,24 +66,29 @@ class ScenarioSet:
 
 
 def find_scenarios(
-    recordings: Sequence[Recording], *, source: str, dt_s: float, history: int
+    recordings: Sequence[Recording],
+    *,
+    source: str,
+    dt_s: float,
+    history: int,
+    allowed: Sequence[Bool[np.ndarray, " ticks"]] | None = None,
 ) -> ScenarioSet:
     """Every stretch of a vehicle's track that is worth driving.
 
     A track of a predicted class is cut, from the first tick with `history` ticks behind it, into
     windows of at most 15 s without overlap; those of at least 4 s in which the vehicle covers at
     least 10 m are kept. Tags: `left`, `right` or `straight` (30° of total turn), and
-    `standing-start`.
+    `standing-start`. With `allowed`, scenarios and their histories keep to the ticks that are so
+    marked in each recording.
     """
-    longest, shortest = ticks(MAX_LENGTH_S, dt_s), ticks(MIN_LENGTH_S, dt_s)
     found: list[Scenario] = []
     for number, recording in enumerate(recordings):
         stride = frames_per_tick(recording.frame_rate_hz, dt_s)
+        ticks_allowed = None if allowed is None else allowed[number]
         for track in np.flatnonzero(recording.predicted):
-            first = -(-int(recording.first_frames[track]) // stride) + history
+            first = -(-int(recording.first_frames[track]) // stride)
             last = int(recording.last_frames[track]) // stride
-            for start in range(first, last - shortest + 1, longest):
-                length = min(longest, last - start)
+            for start, length in _windows(first, last, history, dt_s, ticks_allowed):
                 rows = (start + np.arange(length + 1)) * stride - recording.first_frames[track]
                 states = recording.track(int(track))[rows]
                 if path_length(states[:, :2]) < MIN_DISTANCE_M:
@@ -100,6 +106,18 @@ def find_scenarios(
                     )
                 )
     return ScenarioSet(scenarios=tuple(found))
+
+
+def _windows(
+    first: int, last: int, history: int, dt_s: float, allowed: Bool[np.ndarray, " ticks"] | None
+) -> Iterator[tuple[int, int]]:
+    """(start, length) of the windows in every allowed stretch of the ticks first to last."""
+    longest, shortest = ticks(MAX_LENGTH_S, dt_s), ticks(MIN_LENGTH_S, dt_s)
+    marked = np.ones(last - first + 1, dtype=bool) if allowed is None else allowed[first : last + 1]
+    edges = np.flatnonzero(np.diff(marked, prepend=False, append=False)) + first
+    for begin, end in edges.reshape(-1, 2).tolist():
+        for start in range(begin + history, end - shortest, longest):
+            yield start, min(longest, end - 1 - start)
 
 
 def _tags(states: np.ndarray) -> tuple[str, ...]:

@@ -1,0 +1,53 @@
+"""`asp-env COMMAND …`: the commands that this package and others register."""
+
+import sys
+from collections.abc import Sequence
+
+import tyro
+from rich.console import Console
+from rich.table import Table
+
+from asp_env import registry
+from asp_env.errors import AspEnvError
+
+BAD_INPUT = 2
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Runs one command; 0 on success, 2 with one line on stderr for bad input."""
+    given = list(sys.argv[1:] if argv is None else argv)
+    if not given or given[0] in ("-h", "--help"):
+        _list_commands()
+        return 0
+    name, rest = given[0], given[1:]
+    try:
+        command = registry.find("commands", name)
+        tyro.cli(command, prog=f"asp-env {name}", args=rest).run()
+    except AspEnvError as error:
+        return _refuse(str(error))
+    except OSError as error:
+        where = f"{error.filename}: " if error.filename else ""
+        return _refuse(f"{where}{error.strerror or error}")
+    except KeyboardInterrupt:
+        sys.stderr.write("asp-env: interrupted\n")
+        return 130
+    return 0
+
+
+def _refuse(message: str) -> int:
+    sys.stderr.write(f"asp-env: {' '.join(message.split())}\n")
+    return BAD_INPUT
+
+
+def _list_commands() -> None:
+    table = Table(box=None, show_header=False, padding=(0, 2))
+    for name in registry.names("commands"):
+        command = registry.find("commands", name)
+        table.add_row(name, (command.__doc__ or "").strip().partition("\n")[0])
+    console = Console()
+    console.print("usage: asp-env COMMAND …    (asp-env COMMAND --help tells its options)\n")
+    console.print(table)
+
+
+if __name__ == "__main__":
+    sys.exit(main())

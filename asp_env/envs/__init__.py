@@ -1,0 +1,1 @@
+"""The Gymnasium environments: thin shells that hold state, seeds and spaces."""

@@ -1,0 +1,194 @@
+"""`asp_env/Replay-v0`: drive one vehicle of a recording."""
+
+from collections.abc import Sequence
+from typing import Any
+
+import gymnasium
+import numpy as np
+from gymnasium import spaces
+from jaxtyping import Shaped
+
+from asp_env.data.clock import DEFAULT_DT_S, ticks
+from asp_env.data.scenario import find_scenarios
+from asp_env.data.scene import Scene
+from asp_env.data.snippets import HISTORY_S
+from asp_env.data.source import open_data
+from asp_env.dynamics import MAX_ACCELERATION_MPS2, MAX_STEERING_RAD
+from asp_env.errors import AspEnvError
+from asp_env.render.frames import draw_frame
+from asp_env.sim.drivers import make_driver
+from asp_env.sim.observation import Observer
+from asp_env.sim.reward import RewardWeights, reward_terms, weighted_sum
+from asp_env.sim.simulation import Simulation, ending
+from asp_env.sim.world import Ending
+from asp_env.views import make_view
+
+METADATA = {"render_modes": ["rgb_array"], "render_fps": 5}
+FAILURES = (Ending.COLLISION, Ending.OFF_ROAD)
+
+
+class ReplayEnv(gymnasium.Env[dict[str, Any], Shaped[np.ndarray, " 2"]]):
+    """Drive one vehicle of a drone recording; the traffic around it is replayed or reacts.
+
+    ## Action space
+    `Box(-1, 1, (2,), float32)`: acceleration (times 5 m/s²) and steering (times π/4 rad, left
+    positive), held for one tick of the kinematic bicycle model. Braking ends at speed 0.
+
+    ## Observation space
+    A `Dict` of the parts named in `observations`:
+
+    | part | space | what it is |
+    |---|---|---|
+    | `raster` | `Box(0, 255, (12, H, W), uint8)` | the view, heading up, see `asp_env.views` |
+    | `actions` | `Box(±[10, π/4], (15, 2), float32)` | acceleration m/s² and steering rad of the \
+last 3 s, oldest first, inferred from the motion |
+    | `state` | `Box(…, (9,), float32)` | fields and bounds in \
+`asp_env.sim.observation.STATE_FIELDS`: speed m/s, acceleration m/s², steering rad, offset to the \
+left of the route m, heading error rad, share of the route done, way to the goal m, length m, \
+width m |
+
+    ## Reward
+    The weighted sum of the terms in `info["reward_terms"]`: progress along the logged way,
+    comfort, collision at fault, off-road (`asp_env.sim.reward`).
+
+    ## Start and end of an episode
+    `reset` draws one of the scenarios (a vehicle that covers at least 10 m in 4 to 15 s) or takes
+    the one of `options={"scenario": number}`. Terminated: a collision that the ego answers for
+    (`COLLISION`), over 2 m off the road (`OFF_ROAD`), or the end of the logged way (`GOAL`).
+    Truncated: the recording has no more (`OUT_OF_DATA`). `info["ending"]` names it.
+
+    ## Arguments
+    `data`: a folder in the inD/rounD layout, `sample:intersection`, `sample:roundabout` or
+    `synthetic:…`. `observations`: which parts. `view` and `raster_px` (height, width): what the
+    raster shows, always 72 m by 48 m. `traffic`: `log`, `log-actions` or `idm`. `dt_s`: length of
+    a tick. `reward_weights`: weights by name, where they differ from the defaults.
+
+    ## Version history
+    v0: first.
+    """
+
+    metadata = METADATA
+
+    def __init__(
+        self,
+        data: str = "sample:intersection",
+        *,
+        observations: Sequence[str] = ("raster", "actions", "state"),
+        view: str = "chauffeurnet",
+        raster_px: tuple[int, int] = (360, 240),
+        traffic: str = "log",
+        dt_s: float = DEFAULT_DT_S,
+        reward_weights: dict[str, float] | None = None,
+        render_mode: str | None = None,
+    ) -> None:
+        """See the class documentation for the arguments.
+
+        Raises:
+            AspEnvError: an argument is not understood, or the data hold no scenario.
+        """
+        if render_mode is not None and render_mode not in self.metadata["render_modes"]:
+            raise AspEnvError(f"render mode {render_mode!r}: expected rgb_array or None")
+        self.render_mode = render_mode
+        history = ticks(HISTORY_S, dt_s)
+        self.recordings = open_data(data)
+        self.scenarios = find_scenarios(self.recordings, source=data, dt_s=dt_s, history=history)
+        if not len(self.scenarios):
+            raise AspEnvError(
+                f"{data}: no vehicle covers 10 m in 4 s after 3 s of history; use other recordings"
+            )
+        height_px, width_px = raster_px
+        self._observer = Observer(
+            observations, make_view(view, height_px=height_px, width_px=width_px), history
+        )
+        self._simulation = Simulation(
+            self.recordings, make_driver(traffic), num_episodes=1, dt_s=dt_s, history=history
+        )
+        self._weights = RewardWeights(**(reward_weights or {}))
+        self._running = False
+        self.observation_space = self._observer.space
+        self.action_space = spaces.Box(-1.0, 1.0, (2,), dtype=np.float32)
+
+    def reset(
+        self, *, seed: int | None = None, options: dict[str, Any] | None = None
+    ) -> tuple[dict[str, Any], dict[str, Any]]:
+        """Starts a scenario: the one of `options["scenario"]`, or one drawn with the seed.
+
+        Raises:
+            AspEnvError: an option is unknown or out of range.
+        """
+        super().reset(seed=seed)
+        unknown = set(options or {}) - {"scenario"}
+        if unknown:
+            raise AspEnvError(f"reset option {sorted(unknown)[0]!r}: expected 'scenario'")
+        drawn = int(self.np_random.integers(len(self.scenarios)))
+        number = (options or {}).get("scenario", drawn)
+        if not 0 <= number < len(self.scenarios):
+            raise AspEnvError(
+                f"scenario {number}: expected 0 to {len(self.scenarios) - 1} for this data"
+            )
+        rng = np.random.default_rng(self.np_random.integers(2**63))
+        self._simulation.reset([self.scenarios[int(number)]], [rng])
+        self._running = True
+        self._events = self._simulation.world.events()
+        scene = self.scene()
+        return self._observe(scene), self._info()
+
+    def step(
+        self, action: Shaped[np.ndarray, " 2"]
+    ) -> tuple[dict[str, Any], float, bool, bool, dict[str, Any]]:
+        """One tick.
+
+        Raises:
+            gymnasium.error.ResetNeeded: the episode is over, or none has begun.
+            AspEnvError: the action has another shape or is not finite.
+        """
+        if not self._running:
+            raise gymnasium.error.ResetNeeded("the episode is over: call reset before step")
+        given = np.asarray(action, dtype=np.float32)
+        if given.shape != (2,) or not np.isfinite(given).all():
+            raise AspEnvError(f"action {action!r}: expected two finite numbers in [-1, 1]")
+        limits = np.array([MAX_ACCELERATION_MPS2, MAX_STEERING_RAD], dtype=np.float32)
+        world = self._simulation.world
+        states_before, before = world.ego_states(), self._events
+        self._simulation.step(np.clip(given, -1, 1)[None] * limits, np.ones(1, dtype=bool))
+        self._events = world.events()
+        terms = reward_terms(before, self._events, states_before, world.ego_states(), world.dt_s)
+        why = Ending(int(ending(self._events)[0]))
+        terminated = why in (*FAILURES, Ending.GOAL)
+        truncated = why is Ending.OUT_OF_DATA
+        self._running = not (terminated or truncated)
+        info = self._info() | {
+            "reward_terms": {name: float(value[0]) for name, value in terms.items()},
+            "ending": why.name,
+        }
+        reward = float(weighted_sum(terms, self._weights)[0])
+        return self._observe(self.scene()), reward, terminated, truncated, info
+
+    def scene(self) -> Scene:
+        """All that may be known now, for a predictor in anybody's loop; the ego is slot 0."""
+        return self._simulation.world.scene()
+
+    def render(self) -> Shaped[np.ndarray, "h w 3"] | None:  # pyright: ignore
+        """An RGB picture of the scene from above, in mode `rgb_array`."""
+        if self.render_mode is None:
+            return None
+        recording = self.recordings[int(self._simulation.world.episodes.recording[0])]
+        return draw_frame(self.scene(), background=recording.background)
+
+    def _observe(self, scene: Scene) -> dict[str, Any]:
+        observed = self._observer.observe(scene, self._events)
+        return {name: value[0] for name, value in observed.items()}
+
+    def _info(self) -> dict[str, Any]:
+        scenario = self._simulation.world.scenarios[0]
+        assert scenario is not None
+        events = self._events
+        return {
+            "scenario": scenario.name,
+            "tags": scenario.tags,
+            "tick": int(events.elapsed[0]),
+            "progress": float(events.route_m[0] / max(float(events.goal_m[0]), 1.0)),
+            "collision": bool(events.collision[0]),
+            "at_fault": bool(events.at_fault[0]),
+            "off_road_m": float(events.off_road_m[0]),
+        }

@@ -1,0 +1,1 @@
+"""Judging predictors and planners: runs, intervals, tables and reports."""

@@ -1,0 +1,241 @@
+"""`asp-env drive`: a planner drives by what a predictor says, in many episodes at once."""
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated
+
+import numpy as np
+import tyro
+from rich.console import Console
+from rich.progress import Progress
+
+from asp_env.data.clock import DEFAULT_DT_S, ticks
+from asp_env.data.predictor import Predictor, load_predictor
+from asp_env.data.road_map import RoadMap
+from asp_env.data.rollout import Rollout
+from asp_env.data.scenario import Scenario, ScenarioSet, find_scenarios
+from asp_env.data.snippets import HISTORY_S
+from asp_env.data.source import Recordings, open_data
+from asp_env.errors import AspEnvError
+from asp_env.evaluation import intervals
+from asp_env.evaluation.episodes import drive_episodes
+from asp_env.evaluation.output import Row, output_folder, write_manifest, write_metrics
+from asp_env.evaluation.report import write_report
+from asp_env.evaluation.tables import driving_table
+from asp_env.evaluation.unseen import PartChoice, nothing_left, ticks_to_judge
+from asp_env.metrics.driving import driving_metrics
+from asp_env.metrics.masked import Masked
+from asp_env.planning.planner import Planner, load_planner
+from asp_env.sim.world import Ending
+
+EPISODES_AT_ONCE = 64
+
+SAVED_ROLLOUTS = 6
+"""So many scenarios' rollouts are kept to look at, of every driver."""
+
+EXPERT = "expert"
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Drive:
+    """Drive in closed loop: does the predictor make the planner drive better?"""
+
+    data: tyro.conf.Positional[str]
+    """A folder in the inD/rounD layout, `sample:…` or `synthetic:…`."""
+    out: Path
+    """Folder to write; must not exist."""
+    planner: str = "sampling"
+    """Who drives the ego."""
+    predictors: Annotated[tuple[str, ...], tyro.conf.arg(metavar="NAME[:RUN] …")] = (
+        "constant-velocity",
+    )
+    """Predictors by name, each in a run of its own."""
+    traffic: str = "log"
+    """Who drives everybody else: log, log-actions or idm."""
+    scenarios: int | None = None
+    """At most so many, spread evenly over those there are."""
+    horizon: float = 3.0
+    """Seconds to forecast and to plan."""
+    dt: float = DEFAULT_DT_S
+    """Seconds per tick."""
+    part: PartChoice = "auto"
+    """Which part of DATA; auto takes what no named predictor has seen."""
+
+    def run(self) -> None:
+        """Drives, writes the folder, prints the table; the expert stands first."""
+        with output_folder(self.out) as folder:
+            rows, maps = drive(self, folder)
+            write_report(folder, title=f"Driving on {self.data}", maps=maps)
+        console = Console()
+        console.print(driving_table(rows))
+        console.print(f"wrote {self.out}/report.html")
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class _Run:
+    """One driver's episodes."""
+
+    planner: str
+    predictor: str
+    metrics: Mapping[str, Masked]
+    endings: tuple[Ending, ...]
+    rollouts: tuple[Rollout, ...]
+
+    @property
+    def name(self) -> str:
+        """The driver, as reports call it."""
+        kind = self.predictor.partition(":")[0]
+        return f"{self.planner} + {kind}" if kind else self.planner
+
+
+def drive(config: Drive, folder: Path) -> tuple[list[Row], dict[str, RoadMap]]:
+    """Drives with every predictor, the expert first; writes everything but the report.
+
+    Returns:
+        The rows of `metrics.csv`, and the maps of the saved rollouts by recording.
+    """
+    recordings = open_data(config.data)
+    horizon, history = ticks(config.horizon, config.dt), ticks(HISTORY_S, config.dt)
+    predictors = [
+        load_predictor(name, horizon=horizon, dt_s=config.dt) for name in config.predictors
+    ]
+    allowed, part = ticks_to_judge(
+        recordings, predictors, config.part, dt_s=config.dt, horizon_s=config.horizon
+    )
+    found = find_scenarios(
+        recordings, source=config.data, dt_s=config.dt, history=history, allowed=allowed
+    )
+    if not len(found):
+        raise nothing_left("scenario")
+    scenarios = _spread(found, config.scenarios)
+    entrants: list[tuple[Planner, str, Predictor]] = [(load_planner(EXPERT), "", predictors[0])]
+    planner = load_planner(config.planner)
+    if planner.uses_forecasts:
+        entrants += [
+            (planner, name, predictor)
+            for name, predictor in zip(config.predictors, predictors, strict=True)
+        ]
+    elif not planner.privileged:
+        entrants.append((planner, "", predictors[0]))
+    with Progress(transient=True) as progress:
+        task = progress.add_task("driving", total=len(entrants) * len(scenarios))
+        runs = [
+            _drive_all(
+                config, recordings, scenarios, *entrant, horizon, history,
+                lambda count: progress.advance(task, count),
+            )
+            for entrant in entrants
+        ]  # fmt: skip
+    rows = [row for run in runs for row in _rows(config, run, scenarios)]
+    write_metrics(folder, rows)
+    write_manifest(
+        folder,
+        "drive",
+        data=config.data,
+        data_hash=recordings.data_hash(),
+        planner=config.planner,
+        predictors=list(config.predictors),
+        traffic=config.traffic,
+        horizon_s=config.horizon,
+        dt_s=config.dt,
+        part=part,
+        scenarios=[scenario.name for scenario in scenarios],
+        endings={run.name: [kind.name for kind in run.endings] for run in runs},
+        intervals="95 %, bootstrap over recordings",
+    )
+    return rows, _save_rollouts(folder, recordings, scenarios, runs)
+
+
+def _spread(scenarios: ScenarioSet, most: int | None) -> list[Scenario]:
+    if most is not None and most < 1:
+        raise AspEnvError(f"--scenarios {most}: expected at least 1")
+    count = len(scenarios) if most is None else min(most, len(scenarios))
+    at = np.linspace(0, len(scenarios) - 1, count).round().astype(int)
+    return [scenarios[i] for i in at.tolist()]
+
+
+def _drive_all(
+    config: Drive,
+    recordings: Recordings,
+    scenarios: Sequence[Scenario],
+    planner: Planner,
+    name: str,
+    predictor: Predictor,
+    horizon: int,
+    history: int,
+    advance: Callable[[int], None],
+) -> _Run:
+    metrics: dict[str, list[Masked]] = {}
+    endings: list[Ending] = []
+    rollouts: list[Rollout] = []
+    for start in range(0, len(scenarios), EPISODES_AT_ONCE):
+        some = scenarios[start : start + EPISODES_AT_ONCE]
+        driven = drive_episodes(
+            recordings,
+            some,
+            planner,
+            predictor,
+            traffic=config.traffic,
+            horizon=horizon,
+            history=history,
+            dt_s=config.dt,
+        )
+        for metric, found in driving_metrics(driven.drives).items():
+            metrics.setdefault(metric, []).append(found)
+        endings += [Ending(kind) for kind in driven.endings.tolist()]
+        rollouts += driven.rollouts
+        advance(len(some))
+    joined = {
+        metric: Masked(
+            value=np.concatenate([each.value for each in found]),
+            valid=np.concatenate([each.valid for each in found]),
+        )
+        for metric, found in metrics.items()
+    }
+    return _Run(
+        planner=planner.name,
+        predictor=name,
+        metrics=joined,
+        endings=tuple(endings),
+        rollouts=tuple(rollouts),
+    )
+
+
+def _rows(config: Drive, run: _Run, scenarios: Sequence[Scenario]) -> list[Row]:
+    groups = np.array([scenario.recording for scenario in scenarios])
+    rows = []
+    for metric, found in run.metrics.items():
+        if not found.valid.any():
+            continue
+        estimate = intervals.mean(found.value[found.valid], groups[found.valid])
+        rows.append(
+            Row(
+                data=config.data,
+                predictor=run.predictor,
+                planner=run.planner,
+                traffic=config.traffic,
+                latency_ticks=0,
+                horizon_s=config.horizon,
+                metric=metric,
+                value=estimate.value,
+                low=estimate.low,
+                high=estimate.high,
+                n=estimate.n,
+            )
+        )
+    return rows
+
+
+def _save_rollouts(
+    folder: Path, recordings: Recordings, scenarios: Sequence[Scenario], runs: Sequence[_Run]
+) -> dict[str, RoadMap]:
+    """The same scenarios of every driver: those with the lowest scores, the expert's left out."""
+    scores = np.mean([run.metrics["score"].value for run in runs[1:] or runs], axis=0)
+    kept = np.argsort(scores, kind="stable")[:SAVED_ROLLOUTS]
+    for run in runs:
+        into = folder / "rollouts" / run.name
+        into.mkdir(parents=True, exist_ok=True)
+        for i in kept:
+            run.rollouts[i].save(into / f"{scenarios[i].name}.npz")
+    return {scenarios[i].recording_name: recordings[scenarios[i].recording].road_map for i in kept}

@@ -1,0 +1,142 @@
+"""Oriented boxes against each other, compiled: contacts of the ego and time to collision."""
+
+import math
+from enum import IntEnum
+
+import numpy as np
+from jaxtyping import Bool, Float, Int
+from numba import njit
+
+STANDING_MPS = 0.05
+"""At or below this speed nuPlan calls a vehicle stopped."""
+
+TTC_STEP_S = 0.1
+TTC_HORIZON_S = 3.0
+
+
+class Contact(IntEnum):
+    """How the ego's box meets another one, in nuPlan's order of precedence."""
+
+    NONE = 0
+    EGO_STANDS = 1
+    OTHER_STANDS = 2
+    FRONT = 3
+    REAR = 4
+    SIDE = 5
+
+
+AT_FAULT = (Contact.OTHER_STANDS, Contact.FRONT, Contact.SIDE)
+"""Contacts the ego answers for. nuPlan counts a side contact only while the ego is in several
+lanes; here it always counts, which is stricter."""
+
+
+@njit(cache=True, inline="always")
+def _separated(
+    dx, dy, cos, sin, half_length, half_width, cos_o, sin_o, half_length_o, half_width_o
+):
+    """Whether an axis of the first box keeps the boxes apart; (dx, dy) leads to the second."""
+    ahead = abs(cos * dx + sin * dy)
+    left = abs(cos * dy - sin * dx)
+    along = abs(cos * cos_o + sin * sin_o)
+    across = abs(cos * sin_o - sin * cos_o)
+    if ahead >= half_length + along * half_length_o + across * half_width_o:
+        return True
+    return left >= half_width + across * half_length_o + along * half_width_o
+
+
+@njit(cache=True)
+def overlaps(x, y, heading, length, width, x_o, y_o, heading_o, length_o, width_o):
+    """Whether two oriented boxes intersect (separating axis theorem); touching is no overlap."""
+    dx, dy = x_o - x, y_o - y
+    reach = 0.5 * (math.hypot(length, width) + math.hypot(length_o, width_o))
+    if dx * dx + dy * dy >= reach * reach:
+        return False
+    c, s, co, so = math.cos(heading), math.sin(heading), math.cos(heading_o), math.sin(heading_o)
+    half, wide, half_o, wide_o = 0.5 * length, 0.5 * width, 0.5 * length_o, 0.5 * width_o
+    if _separated(dx, dy, c, s, half, wide, co, so, half_o, wide_o):
+        return False
+    return not _separated(-dx, -dy, co, so, half_o, wide_o, c, s, half, wide)
+
+
+@njit(cache=True)
+def _contact(ego, size, other, other_size):
+    x, y, heading, speed = ego[0], ego[1], ego[2], ego[3]
+    xo, yo, ho, lo, wo = other[0], other[1], other[2], other_size[0], other_size[1]
+    if not overlaps(x, y, heading, size[0], size[1], xo, yo, ho, lo, wo):
+        return Contact.NONE.value
+    if abs(speed) <= STANDING_MPS:
+        return Contact.EGO_STANDS.value
+    if abs(other[3]) <= STANDING_MPS:
+        return Contact.OTHER_STANDS.value
+    dx, dy = 0.5 * size[0] * math.cos(heading), 0.5 * size[0] * math.sin(heading)
+    # a bumper is a box without depth
+    if overlaps(x + dx, y + dy, heading, 0.0, size[1], xo, yo, ho, lo, wo):
+        return Contact.FRONT.value
+    if overlaps(x - dx, y - dy, heading, 0.0, size[1], xo, yo, ho, lo, wo):
+        return Contact.REAR.value
+    return Contact.SIDE.value
+
+
+@njit(cache=True)
+def _contacts(states, sizes, valid, out):
+    for b in range(states.shape[0]):
+        for a in range(1, states.shape[1]):
+            out[b, a] = 0
+            if valid[b, 0] and valid[b, a]:
+                out[b, a] = _contact(states[b, 0], sizes[b, 0], states[b, a], sizes[b, a])
+
+
+def ego_contacts(
+    states: Float[np.ndarray, "b a 4"],
+    sizes: Float[np.ndarray, "b a 2"],
+    valid: Bool[np.ndarray, "b a"],
+) -> Int[np.ndarray, "b a"]:
+    """`Contact` of the ego (slot 0) with every other agent; nuPlan's collision classes."""
+    out = np.zeros(valid.shape, dtype=np.int8)
+    _contacts(states, sizes, valid, out)
+    return out
+
+
+@njit(cache=True)
+def _ttc(states, sizes, valid, touching, out):
+    steps = round(TTC_HORIZON_S / TTC_STEP_S)
+    for b in range(states.shape[0]):
+        out[b] = np.inf
+        if not valid[b, 0] or abs(states[b, 0, 3]) <= STANDING_MPS:
+            continue
+        ego, size = states[b, 0], sizes[b, 0]
+        vx, vy = ego[3] * math.cos(ego[2]), ego[3] * math.sin(ego[2])
+        for a in range(1, states.shape[1]):
+            if not valid[b, a] or touching[b, a]:
+                continue
+            other, size_o = states[b, a], sizes[b, a]
+            dx, dy = other[0] - ego[0], other[1] - ego[1]
+            if dx * math.cos(ego[2]) + dy * math.sin(ego[2]) < -0.5 * size[0]:
+                continue
+            vxo, vyo = other[3] * math.cos(other[2]), other[3] * math.sin(other[2])
+            for k in range(1, steps + 1):
+                t = k * TTC_STEP_S
+                if t >= out[b]:
+                    break
+                if overlaps(
+                    ego[0] + t * vx, ego[1] + t * vy, ego[2], size[0], size[1],
+                    other[0] + t * vxo, other[1] + t * vyo, other[2], size_o[0], size_o[1],
+                ):  # fmt: skip
+                    out[b] = t
+                    break
+
+
+def time_to_collision(
+    states: Float[np.ndarray, "b a 4"],
+    sizes: Float[np.ndarray, "b a 2"],
+    valid: Bool[np.ndarray, "b a"],
+    touching: Bool[np.ndarray, "b a"],
+) -> Float[np.ndarray, " b"]:
+    """Seconds until the ego (slot 0) meets anybody if all keep heading and speed; else infinity.
+
+    nuPlan's rule: steps of 0.1 s up to 3 s; a standing ego has no time to collision. Agents that
+    the ego already touches, and those behind its rear bumper, are left out.
+    """
+    out = np.zeros(len(states), dtype=np.float64)
+    _ttc(states, sizes, valid, touching, out)
+    return out

@@ -1,0 +1,60 @@
+"""nuPlan's comfort bounds on the motion of one vehicle, from its states at the ticks."""
+
+import numpy as np
+from jaxtyping import Bool, Float
+
+from asp_env.metrics.masked import Masked
+
+MIN_LON_ACCELERATION_MPS2 = -4.05
+MAX_LON_ACCELERATION_MPS2 = 2.40
+MAX_LAT_ACCELERATION_MPS2 = 4.89
+MAX_YAW_RATE_RADPS = 0.95
+MAX_YAW_ACCELERATION_RADPS2 = 1.93
+MAX_LON_JERK_MPS3 = 4.13
+MAX_JERK_MPS3 = 8.37
+
+WINDOW_TICKS = 5
+"""Derivatives are slopes of a parabola fitted over this many ticks, 1 s at 0.2 s."""
+
+
+def slope(values: Float[np.ndarray, "*batch t"], dt_s: float) -> Float[np.ndarray, "*batch t"]:
+    """Derivative by a least-squares parabola over a sliding window; at the ends, that window's.
+
+    A Savitzky-Golay filter as nuPlan uses; exact for parabolas. Needs at least 5 ticks.
+    """
+    half = WINDOW_TICKS // 2
+    offsets = np.arange(WINDOW_TICKS) - half
+    powers = np.vander(offsets * dt_s, 3, increasing=True)
+    fit = np.linalg.pinv(powers)  # (3, window): constant, slope, curvature / 2 at the middle
+    windows = np.lib.stride_tricks.sliding_window_view(values, WINDOW_TICKS, axis=-1)
+    _, linear, square = np.moveaxis(windows @ fit.T, -1, 0)
+    lead = offsets[:half] * dt_s
+    head = linear[..., :1] + 2 * square[..., :1] * lead
+    tail = linear[..., -1:] - 2 * square[..., -1:] * lead[::-1]
+    return np.concatenate([head, linear, tail], axis=-1)
+
+
+def comfortable(
+    states: Float[np.ndarray, "*batch t 4"], dt_s: float, long_enough: Bool[np.ndarray, "*batch"]
+) -> Masked:
+    """1 where every bound holds at every tick, else 0; invalid for motions under 5 ticks."""
+    if states.shape[-2] < WINDOW_TICKS:
+        return Masked(
+            value=np.zeros(states.shape[:-2]), valid=np.zeros(states.shape[:-2], dtype=bool)
+        )
+    heading = np.unwrap(states[..., 2].astype(np.float64), axis=-1)
+    speed = states[..., 3].astype(np.float64)
+    yaw_rate = slope(heading, dt_s)
+    lon = slope(speed, dt_s)
+    lat = speed * yaw_rate
+    lon_jerk, lat_jerk = slope(lon, dt_s), slope(lat, dt_s)
+    fine = (
+        (lon >= MIN_LON_ACCELERATION_MPS2)
+        & (lon <= MAX_LON_ACCELERATION_MPS2)
+        & (np.abs(lat) <= MAX_LAT_ACCELERATION_MPS2)
+        & (np.abs(yaw_rate) <= MAX_YAW_RATE_RADPS)
+        & (np.abs(slope(yaw_rate, dt_s)) <= MAX_YAW_ACCELERATION_RADPS2)
+        & (np.abs(lon_jerk) <= MAX_LON_JERK_MPS3)
+        & (np.hypot(lon_jerk, lat_jerk) <= MAX_JERK_MPS3)
+    )
+    return Masked(value=np.asarray(fine.all(axis=-1), dtype=np.float64), valid=long_enough)

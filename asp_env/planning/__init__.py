@@ -1,0 +1,1 @@
+"""What the ego does about a forecast."""

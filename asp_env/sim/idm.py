@@ -1,0 +1,154 @@
+"""Following a path behind whoever is on it: the intelligent driver model and pure pursuit.
+
+Treiber, Hennecke and Helbing 2000, along a given path; what is ahead is found by sweeping the
+vehicle's own box along that path until it would touch another box as it stands now.
+"""
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Bool, Float, Int
+from numba import njit
+
+from asp_env.dynamics import MAX_ACCELERATION_MPS2, MAX_STEERING_RAD
+from asp_env.dynamics.bicycle import AXLE_SHARE_OF_LENGTH
+from asp_env.metrics.boxes import overlaps
+from asp_env.metrics.route import project
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class IDM:
+    """Parameters of the law; defaults are Treiber's for cities, with a firmer brake."""
+
+    max_acceleration_mps2: float = 1.5
+    comfortable_braking_mps2: float = 2.0
+    time_gap_s: float = 1.2
+    standstill_gap_m: float = 2.0
+    max_lateral_acceleration_mps2: float = 2.5
+    look_ahead_s: float = 5.0
+    min_look_ahead_m: float = 15.0
+
+    def as_row(self) -> Float[np.ndarray, " 6"]:
+        """What the compiled law reads, in its order."""
+        return np.array(
+            [
+                self.max_acceleration_mps2,
+                self.comfortable_braking_mps2,
+                self.time_gap_s,
+                self.standstill_gap_m,
+                self.look_ahead_s,
+                self.min_look_ahead_m,
+            ]
+        )
+
+
+def speed_limits(
+    path: Float[np.ndarray, "p 2"], desired_mps: float, idm: IDM
+) -> Float[np.ndarray, " p"]:
+    """Speed wanted at each point of a path (1 m apart): as desired, slower in and before bends."""
+    if len(path) < 5:
+        return np.full(len(path), desired_mps, dtype=np.float32)
+    step = path[4:] - path[:-4]
+    heading = np.unwrap(np.arctan2(step[:, 1], step[:, 0]))
+    curvature = np.abs(np.gradient(heading)) if len(heading) > 1 else np.zeros(len(heading))
+    curvature = np.pad(curvature, 2, mode="edge")
+    lateral = np.sqrt(idm.max_lateral_acceleration_mps2 / np.maximum(curvature, 1e-4))
+    limit = np.minimum(desired_mps, lateral)
+    for i in range(len(limit) - 2, -1, -1):
+        limit[i] = min(limit[i], math.sqrt(limit[i + 1] ** 2 + 2 * idm.comfortable_braking_mps2))
+    return limit.astype(np.float32)
+
+
+@njit(cache=True)
+def _gap(states, sizes, valid, me, path, count, arc, reach_m):
+    """(free metres ahead, speed along the path of what ends them); infinite if nothing does."""
+    first = int(arc) + 1
+    last = min(count - 1, int(arc + reach_m) + 1)
+    for j in range(first, last):
+        heading = math.atan2(path[j + 1, 1] - path[j, 1], path[j + 1, 0] - path[j, 0])
+        for o in range(states.shape[0]):
+            if o == me or not valid[o]:
+                continue
+            if overlaps(
+                path[j, 0], path[j, 1], heading, sizes[me, 0], sizes[me, 1] + 0.3,
+                states[o, 0], states[o, 1], states[o, 2], sizes[o, 0], sizes[o, 1],
+            ):  # fmt: skip
+                behind = (states[o, 0] - states[me, 0]) * math.cos(states[me, 2]) + (
+                    states[o, 1] - states[me, 1]
+                ) * math.sin(states[me, 2])
+                if behind < 0.0:
+                    continue
+                speed = states[o, 3] * math.cos(states[o, 2] - heading)
+                return max(j - arc - 1.0, 0.0), max(speed, 0.0)
+    return np.inf, 0.0
+
+
+@njit(cache=True)
+def idm_acceleration(speed, wanted, gap, leader_speed, law):
+    """m/s² of the intelligent driver model, within the limits of actions."""
+    free = 1.0 - (speed / max(wanted, 0.1)) ** 4
+    interaction = 0.0
+    if gap < np.inf:
+        closing = speed * (speed - leader_speed) / (2.0 * math.sqrt(law[0] * law[1]))
+        desired = law[3] + max(0.0, speed * law[2] + closing)
+        interaction = (desired / max(gap, 0.1)) ** 2
+    return min(max(law[0] * (free - interaction), -MAX_ACCELERATION_MPS2), law[0])
+
+
+@njit(cache=True)
+def pursuit_steering(x, y, heading, speed, length, path, count, arc, offset_m):
+    """Steering, rad, that leads the centre to a point of the path ahead (pure pursuit).
+
+    `offset_m` moves the followed line to the left of the path.
+    """
+    ahead = max(3.0, 0.7 * abs(speed))
+    at = min(arc + ahead, count - 1.000001)
+    i = max(0, min(int(at), count - 2))
+    dx, dy = path[i + 1, 0] - path[i, 0], path[i + 1, 1] - path[i, 1]
+    norm = max(math.hypot(dx, dy), 1e-6)
+    px = path[i, 0] + (at - i) * dx - offset_m * dy / norm - x
+    py = path[i, 1] + (at - i) * dy + offset_m * dx / norm - y
+    left = math.cos(heading) * py - math.sin(heading) * px
+    distance = max(px * px + py * py, 1.0)
+    sin_slip = AXLE_SHARE_OF_LENGTH * length * 2.0 * left / distance
+    sin_slip = min(max(sin_slip, -0.99), 0.99)
+    steering = math.atan(2.0 * sin_slip / math.sqrt(1.0 - sin_slip * sin_slip))
+    return min(max(steering, -MAX_STEERING_RAD), MAX_STEERING_RAD)
+
+
+@njit(cache=True)
+def _follow(states, sizes, valid, driven, paths, counts, limits, arcs, law, actions):
+    for b in range(states.shape[0]):
+        for a in range(states.shape[1]):
+            if not driven[b, a] or not valid[b, a] or counts[b, a] < 2:
+                continue
+            x, y = states[b, a, 0], states[b, a, 1]
+            heading, speed = states[b, a, 2], states[b, a, 3]
+            path, count = paths[b, a], counts[b, a]
+            arc, _, _ = project(path, count, x, y, arcs[b, a], 15.0)
+            arcs[b, a] = arc
+            reach = max(law[5], law[4] * speed)
+            gap, leader = _gap(states[b], sizes[b], valid[b], a, path, count, arc, reach)
+            wanted = limits[b, a, min(max(int(arc + 0.5), 0), count - 1)]
+            actions[b, a, 0] = idm_acceleration(speed, wanted, gap, leader, law)
+            actions[b, a, 1] = pursuit_steering(
+                x, y, heading, speed, sizes[b, a, 0], path, count, arc, 0.0
+            )
+
+
+def follow_paths(
+    states: Float[np.ndarray, "b a 4"],
+    sizes: Float[np.ndarray, "b a 2"],
+    valid: Bool[np.ndarray, "b a"],
+    driven: Bool[np.ndarray, "b a"],
+    paths: Float[np.ndarray, "b a p 2"],
+    counts: Int[np.ndarray, "b a"],
+    limits: Float[np.ndarray, "b a p"],
+    arcs: Float[np.ndarray, "b a"],
+    idm: IDM,
+) -> Float[np.ndarray, "b a 2"]:
+    """Actions of the driven agents along their paths; `arcs` (metres gone) is brought up to now."""
+    actions = np.zeros((*valid.shape, 2), dtype=np.float32)
+    _follow(states, sizes, valid, driven, paths, counts, limits, arcs, idm.as_row(), actions)
+    return actions

@@ -1,0 +1,68 @@
+"""A world and the drivers of its traffic, stepped together by what the egos do."""
+
+from collections.abc import Sequence
+
+import numpy as np
+from jaxtyping import Bool, Float, Int
+
+from asp_env.data.recording import Recording
+from asp_env.data.scenario import Scenario
+from asp_env.sim.drivers import Driver
+from asp_env.sim.replay import ReplayWorld
+from asp_env.sim.world import EGO, Ending, Events
+
+OFF_ROAD_END_M = 2.0
+"""An episode ends this far outside the drivable area; less may be a gap in the map."""
+
+GOAL_TOLERANCE_M = 0.01
+
+
+class Simulation:
+    """B episodes in which slot 0 is the caller's and everybody else has the same driver."""
+
+    def __init__(
+        self,
+        recordings: Sequence[Recording],
+        driver: Driver,
+        *,
+        num_episodes: int,
+        dt_s: float,
+        history: int,
+    ) -> None:
+        """Episodes begin with `reset`."""
+        self.world = ReplayWorld(recordings, num_episodes=num_episodes, dt_s=dt_s, history=history)
+        self.driver = driver
+
+    def reset(
+        self,
+        scenarios: Sequence[Scenario],
+        rngs: Sequence[np.random.Generator],
+        where: Bool[np.ndarray, " b"] | None = None,
+    ) -> None:
+        """Starts the episodes at `where`, by default all."""
+        chosen = np.ones(len(self.world), dtype=bool) if where is None else where
+        self.world.reset(scenarios, rngs, chosen)
+        self.driver.reset(self.world, chosen)
+
+    def step(
+        self, ego_actions: Float[np.ndarray, "b 2"], ego_driven: Bool[np.ndarray, " b"]
+    ) -> None:
+        """One tick. Egos that are not driven replay their log."""
+        control = self.driver.control(self.world)
+        actions, driven = control.actions.copy(), control.driven.copy()
+        actions[:, EGO], driven[:, EGO] = ego_actions, ego_driven
+        self.world.step(actions, driven, control.leaving)
+
+
+def ending(events: Events) -> Int[np.ndarray, " b"]:
+    """`Ending` of each episode; of several that hold, the first in the enumeration's order."""
+    out = np.full(len(events.elapsed), int(Ending.RUNNING), dtype=np.int64)
+    holds = (
+        (Ending.OUT_OF_DATA, events.elapsed >= events.length),
+        (Ending.GOAL, events.route_m >= events.goal_m - GOAL_TOLERANCE_M),
+        (Ending.OFF_ROAD, events.off_road_m > OFF_ROAD_END_M),
+        (Ending.COLLISION, events.at_fault),
+    )
+    for kind, where in holds:
+        out[where] = int(kind)
+    return out
