@@ -137,7 +137,8 @@ def _notes(results: Results) -> str:
 
 
 INTERVALS = """<p class='hint'>Small figures and whiskers are intervals; how they were
-computed stands in what was run. Bold is the best of those who do not know the recorded future.</p>"""
+computed stands in what was run. Bold is the best of those who do not
+know the recorded future.</p>"""
 
 
 def _read_manifest(path: Path) -> dict[str, Any]:

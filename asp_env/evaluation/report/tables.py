@@ -1,6 +1,6 @@
 """Metrics as HTML: one table per data set and horizon, a tab per subset."""
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from html import escape
 
 from asp_env.evaluation.report.notes import MetricNote, note
@@ -9,9 +9,6 @@ from asp_env.evaluation.report.results import Entrant, Result, best, distinct, e
 SUBSETS = ("all", "moving")
 SELECTIONS = ("most-probable", "best-of-3", "")
 """A metric without a selection speaks of all modes together."""
-
-Column = tuple[str, str]
-"""(selection, metric)."""
 
 
 def tables(results: Sequence[Result]) -> str:
@@ -50,53 +47,42 @@ def _tabs(results: Sequence[Result]) -> str:
 
 
 def _table(results: Sequence[Result]) -> str:
-    cells: dict[Column, dict[Entrant, Result]] = {}
+    parts = []
     for selection in distinct((result.selection for result in results), first=SELECTIONS):
-        for result in results:
-            if result.selection == selection:
-                cells.setdefault((selection, result.metric), {})[result.entrant] = result
-    columns = list(cells)
-    bold = {column: _bold(list(cells[column].values())) for column in columns}
+        mine = [result for result in results if result.selection == selection]
+        heading = selection.replace("-", " ") or ("all modes" if parts else "")
+        parts.append(_selection_table(heading, mine))
+    return "".join(parts)
+
+
+def _selection_table(heading: str, results: Sequence[Result]) -> str:
+    cells: dict[str, dict[Entrant, Result]] = {}
+    for result in results:
+        cells.setdefault(result.metric, {})[result.entrant] = result
+    bold = {metric: _bold(list(column.values())) for metric, column in cells.items()}
     body = []
     for entrant in entrants(results):
         values = "".join(
-            _cell(cells[column].get(entrant), bold[column], _first(columns, number))
-            for number, column in enumerate(columns)
+            _cell(column.get(entrant), bold[metric]) for metric, column in cells.items()
         )
         kind = " class='privileged'" if entrant.privileged else ""
         body.append(f"<tr{kind}>{_row_head(entrant)}{values}</tr>")
-    return (
-        "<div class='scroll'><table>"
-        f"<thead>{''.join(_head(columns))}</thead><tbody>{''.join(body)}</tbody></table></div>"
-    )
-
-
-def _head(columns: Sequence[Column]) -> Iterator[str]:
-    selections = distinct(selection for selection, _ in columns)
-    if selections != [""]:
-        spans = "".join(
-            f"<th class='first' colspan='{sum(s == selection for s, _ in columns)}'>"
-            f"{escape(selection.replace('-', ' ') or 'all modes')}</th>"
-            for selection in selections
-        )
-        yield f"<tr class='groups'><th></th>{spans}</tr>"
     names = "".join(
-        f"<th{_first(columns, number)} title='{escape(note(metric).text, quote=True)}'>"
+        f"<th title='{escape(note(metric).text, quote=True)}'>"
         f"{escape(note(metric).label)}{_unit(note(metric))}</th>"
-        for number, (_, metric) in enumerate(columns)
+        for metric in cells
     )
-    yield f"<tr><th></th>{names}</tr>"
+    return (
+        f"<div class='scroll'><table style='min-width: {14 + 6 * len(cells)}rem'>"
+        f"<thead><tr><th>{escape(heading)}</th>{names}</tr></thead>"
+        f"<tbody>{''.join(body)}</tbody></table></div>"
+    )
 
 
 def _unit(told: MetricNote) -> str:
     arrow = {"lower": "↓", "higher": "↑", "neither": ""}[told.better]
     unit = " ".join(part for part in (told.unit, arrow) if part)
     return f"<small>{unit}</small>" if unit else ""
-
-
-def _first(columns: Sequence[Column], number: int) -> str:
-    starts = number == 0 or columns[number - 1][0] != columns[number][0]
-    return " class='first'" if starts else ""
 
 
 def _bold(column: Sequence[Result]) -> str | None:
@@ -115,9 +101,9 @@ def _row_head(entrant: Entrant) -> str:
     return f"<th>{escape(entrant.name)}{mark}{details}</th>"
 
 
-def _cell(result: Result | None, bold: str | None, first: str) -> str:
+def _cell(result: Result | None, bold: str | None) -> str:
     if result is None or result.value is None:
-        return f"<td{first}>&ndash;</td>"
+        return "<td>&ndash;</td>"
     told = note(result.metric)
     text = told.format(result.value)
     if text == bold and not result.entrant.privileged:
@@ -126,4 +112,4 @@ def _cell(result: Result | None, bold: str | None, first: str) -> str:
         low, high = told.format(result.low), told.format(result.high)
         text += f"<small>{low}&thinsp;&ndash;&thinsp;{high}</small>"
     count = "" if result.n is None else f" title='n = {result.n:.0f}'"
-    return f"<td{first}{count}>{text}</td>"
+    return f"<td{count}>{text}</td>"
