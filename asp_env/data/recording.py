@@ -83,8 +83,9 @@ class Recording:
 
     @cached_property
     def parked(self) -> Bool[np.ndarray, " tracks"]:
-        """Present in the whole recording and never 1 m from where it was first."""
-        whole = (self.first_frames == 0) & (self.last_frames == self.num_frames - 1)
+        """Present from the first frame that shows anybody to the last, and never moved 1 m."""
+        begin, end = self.first_frames.min(initial=self.num_frames), self.last_frames.max(initial=0)
+        whole = (self.first_frames == begin) & (self.last_frames == end)
         still = [
             bool(
                 whole[i]
