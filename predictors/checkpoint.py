@@ -1,0 +1,163 @@
+"""A trained predictor's folder: `config.json` and `weights.safetensors`. Nothing is unpickled."""
+
+import dataclasses
+import json
+import os
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from safetensors import SafetensorError
+from safetensors.torch import load_file, save_file
+from torch import Tensor, nn
+
+from asp_env.errors import AspEnvError, CheckpointError
+from asp_env.views import PictureView, view_from_config
+from predictors.learned import Learned, LearnedPlug, NetworkShape
+
+CONFIG = "config.json"
+WEIGHTS = "weights.safetensors"
+FORMAT = 1
+
+
+def save_learned(
+    folder: Path,
+    *,
+    plug: LearnedPlug,
+    network_config: Any,
+    shape: NetworkShape,
+    view: PictureView,
+    weights: dict[str, Tensor],
+    provenance: dict[str, Any],
+) -> None:
+    """Writes a predictor that `load_learned` loads; the configuration last, so never half.
+
+    Args:
+        folder: an existing folder.
+        plug: of which predictor this is.
+        network_config: an instance of the plug's configuration.
+        shape: what the network was made for, with the normaliser.
+        view: what it looks at.
+        weights: the network's state.
+        provenance: what it was trained on and how; no times of day.
+    """
+    config = {
+        "format": FORMAT,
+        "predictor": plug.name,
+        "network": dataclasses.asdict(network_config),
+        "view": view.config(),
+        "dt_s": shape.dt_s,
+        "history": shape.history,
+        "horizon": shape.horizon,
+        "normaliser": {"action_range": list(shape.action_range)},
+        "provenance": provenance,
+    }
+    save_weights(weights, folder / WEIGHTS)
+    write_json(config, folder / CONFIG)
+
+
+def load_learned(plug: LearnedPlug, argument: str, *, dt_s: float) -> Learned:
+    """The predictor in a finished run's folder.
+
+    Raises:
+        CheckpointError: it is missing, damaged, or of another predictor.
+        AspEnvError: it was trained for another time step.
+    """
+    if not argument:
+        raise CheckpointError(
+            f"predictor {plug.name} is trained: name its run as {plug.name}:RUN_DIR"
+        )
+    folder = Path(argument)
+    config = read_config(folder)
+    if config["predictor"] != plug.name:
+        raise CheckpointError(
+            f"{folder} holds the predictor {config['predictor']!r}, not {plug.name!r}: "
+            f"name it as {config['predictor']}:{folder}"
+        )
+    try:
+        shape, view, network = _build(plug, config)
+    except (KeyError, TypeError, ValueError, RuntimeError) as error:
+        raise CheckpointError(
+            f"{folder / CONFIG} does not describe a {plug.name}: {_brief(error)}"
+        ) from error
+    if abs(shape.dt_s - dt_s) > 1e-6:
+        raise AspEnvError(
+            f"{plug.name} in {folder} was trained for a time step of {shape.dt_s:g} s, "
+            f"the scenes have {dt_s:g} s"
+        )
+    _load_weights(network, folder / WEIGHTS)
+    return Learned(name=plug.name, network=network, view=view, shape=shape)
+
+
+def read_config(folder: Path) -> dict[str, Any]:
+    """What `config.json` of a finished run says.
+
+    Raises:
+        CheckpointError: it is missing or damaged.
+    """
+    path = folder / CONFIG
+    try:
+        config = json.loads(path.read_text())
+    except FileNotFoundError:
+        raise CheckpointError(
+            f"{folder} holds no trained predictor ({CONFIG} is missing): "
+            "give the folder of a finished run"
+        ) from None
+    except (OSError, ValueError) as error:
+        raise CheckpointError(f"{path} cannot be read: {_brief(error)}") from error
+    if not isinstance(config, dict) or config.get("format") != FORMAT:
+        raise CheckpointError(f"{path} is no checkpoint of format {FORMAT}: train again")
+    if not isinstance(config.get("predictor"), str):
+        raise CheckpointError(f"{path} does not name its predictor: train again")
+    return config
+
+
+def _build(
+    plug: LearnedPlug, config: dict[str, Any]
+) -> tuple[NetworkShape, PictureView, nn.Module]:
+    view = view_from_config(config["view"])
+    acceleration, steering = config["normaliser"]["action_range"]
+    shape = NetworkShape(
+        raster=view.shape,
+        history=int(config["history"]),
+        horizon=int(config["horizon"]),
+        dt_s=float(config["dt_s"]),
+        action_range=(float(acceleration), float(steering)),
+    )
+    return shape, view, plug.network(plug.config(**config["network"]), shape)
+
+
+def _load_weights(network: nn.Module, path: Path) -> None:
+    try:
+        weights = load_file(path)
+    except FileNotFoundError:
+        raise CheckpointError(f"{path} is missing: the run is not complete, train again") from None
+    except (OSError, ValueError, SafetensorError) as error:
+        raise CheckpointError(f"{path} cannot be read: {_brief(error)}") from error
+    try:
+        network.load_state_dict(weights)
+    except RuntimeError as error:
+        raise CheckpointError(
+            f"{path} does not fit the network of its {CONFIG}: {_brief(error)}"
+        ) from error
+    if not all(bool(np.isfinite(tensor.numpy()).all()) for tensor in weights.values()):
+        raise CheckpointError(f"{path} holds weights that are not finite: train again")
+
+
+def save_weights(weights: dict[str, Tensor], path: Path) -> None:
+    """Writes tensors aside, then renames."""
+    aside = path.with_name(path.name + ".part")
+    save_file({name: tensor.detach().contiguous() for name, tensor in weights.items()}, aside)
+    os.replace(aside, path)
+
+
+def write_json(content: dict[str, Any], path: Path) -> None:
+    """Writes JSON aside, then renames."""
+    aside = path.with_name(path.name + ".part")
+    aside.write_text(json.dumps(content, indent=1, sort_keys=True) + "\n")
+    os.replace(aside, path)
+
+
+def _brief(error: BaseException) -> str:
+    words = " ".join(str(error).split())
+    return words if len(words) <= 200 else words[:197] + "..."

@@ -1,0 +1,183 @@
+"""What Lightning runs: one thin module and one callback."""
+
+import math
+import sys
+from collections.abc import Iterable
+from pathlib import Path
+from typing import Any, final
+
+import lightning.pytorch as pl
+import numpy as np
+import torch
+from torch import Tensor, nn
+from torch.optim.lr_scheduler import LambdaLR, ReduceLROnPlateau
+
+from asp_env.errors import AspEnvError
+from asp_env.metrics.open_loop import moving, open_loop_errors
+from predictors.batch import Batch, Labels
+from predictors.checkpoint import save_weights
+from predictors.recipes import TrainingConfig
+from predictors.samples import Batches, epoch_rows
+
+SELECTED_BY = "validation FDE moving"
+"""Of the most probable mode, metres: the epoch with the lowest is kept."""
+
+WARM_UP = 0.1
+"""Share of all steps in which `one-cycle` raises the learning rate."""
+
+
+def one_cycle(step: int, steps: int) -> float:
+    """The learning rate as a share of the highest: up along a line, down along a cosine."""
+    rise = max(1, round(WARM_UP * steps))
+    if step < rise:
+        return (step + 1) / rise
+    return 0.5 * (1 + math.cos(math.pi * min(1.0, (step - rise) / max(1, steps - rise))))
+
+
+@final
+class Fit(pl.LightningModule):
+    """A network, its data in the order of epochs, and how it is optimised."""
+
+    def __init__(
+        self, network: nn.Module, *, config: TrainingConfig, training: Batches, validation: Batches
+    ) -> None:
+        """`training` holds all snippets in their order; each epoch takes its own stretch."""
+        super().__init__()
+        self.network = network
+        self.config = config
+        self._training = training
+        self._validation = validation
+        self._errors: list[dict[str, np.ndarray]] = []
+        count = len(training.snippets)
+        self._per_epoch = config.snippets_per_epoch or count
+        self._steps = config.epochs * -(-self._per_epoch // config.batch_size)
+
+    def train_dataloader(self) -> Iterable[tuple[Batch, Labels]]:
+        """The batches of the present epoch; asked for anew before each."""
+        return self._training.reordered(
+            epoch_rows(
+                len(self._training.snippets),
+                per_epoch=self._per_epoch,
+                epoch=self.current_epoch,
+                seed=self.config.seed,
+            )
+        )
+
+    def val_dataloader(self) -> Iterable[tuple[Batch, Labels]]:
+        """All validation batches."""
+        return self._validation
+
+    def configure_optimizers(self) -> Any:
+        """Adam (with decoupled weight decay, if any) and the schedule of the configuration."""
+        optimizer = torch.optim.AdamW(
+            self.network.parameters(),
+            lr=self.config.learning_rate,
+            weight_decay=self.config.weight_decay,
+        )
+        if self.config.schedule == "plateau":
+            plateau = ReduceLROnPlateau(optimizer, factor=0.2, patience=2)
+            return {
+                "optimizer": optimizer,
+                "lr_scheduler": {"scheduler": plateau, "monitor": "validation loss"},
+            }
+        cycle = LambdaLR(optimizer, lambda step: one_cycle(step, self._steps))
+        return {
+            "optimizer": optimizer,
+            "lr_scheduler": {"scheduler": cycle, "interval": "step"},
+        }
+
+    def training_step(self, sample: tuple[Batch, Labels]) -> Tensor:
+        """The loss of one batch.
+
+        Raises:
+            AspEnvError: it is not finite.
+        """
+        batch, labels = sample
+        terms: dict[str, Tensor] = self.network.loss(self.network(batch), labels)
+        if not torch.isfinite(terms["loss"]):
+            raise AspEnvError(
+                f"the loss is not finite in epoch {self.current_epoch}: lower the learning rate, "
+                "or look for faults in the data with asp-env inspect"
+            )
+        self.log_dict(
+            {f"training {name}": value.detach() for name, value in terms.items()},
+            on_step=False,
+            on_epoch=True,
+            batch_size=len(labels.states),
+        )
+        return terms["loss"]
+
+    def validation_step(self, sample: tuple[Batch, Labels]) -> None:
+        """Adds up the loss and keeps every target's errors."""
+        batch, labels = sample
+        modes = self.network(batch)
+        count = len(labels.states)
+        terms: dict[str, Tensor] = self.network.loss(modes, labels)
+        self.log("validation loss", terms["loss"], batch_size=count)
+        truth = labels.states[..., :2].cpu().numpy()
+        valid = np.ones(truth.shape[:2], dtype=bool)
+        now = np.zeros((count, 4), dtype=np.float32)
+        now[:, 3] = batch.speed_mps.cpu().numpy()
+        positions = modes.states[..., :2].float().cpu().numpy()
+        log_probs = modes.logits.float().log_softmax(dim=-1).cpu().numpy()
+        found = {"moving": moving(now, truth, valid)}
+        for selection in ("most-probable", "best-of-3"):
+            errors = open_loop_errors(positions, log_probs, truth, valid, selection)
+            found[selection] = errors["FDE"].value
+        self._errors.append(found)
+
+    def on_validation_epoch_end(self) -> None:
+        """Logs the mean errors over the subset `moving`; over all where nothing moves."""
+        joined = {key: np.concatenate([e[key] for e in self._errors]) for key in self._errors[0]}
+        self._errors.clear()
+        of = joined["moving"] if joined["moving"].any() else np.ones_like(joined["moving"])
+        self.log(SELECTED_BY, float(joined["most-probable"][of].mean()), prog_bar=True)
+        self.log(f"{SELECTED_BY} best of 3", float(joined["best-of-3"][of].mean()))
+
+
+@final
+class KeepBest(pl.Callback):
+    """After every epoch: keeps the best weights, and all that is needed to go on from there."""
+
+    def __init__(self, *, best: Path, state: Path) -> None:
+        """Where the best weights and the state of the run are written."""
+        self._best_path = best
+        self._state_path = state
+        self.best_value = math.inf
+        self.best_epoch = -1
+
+    def state_dict(self) -> dict[str, Any]:
+        """Which epoch was best so far."""
+        return {"best_value": self.best_value, "best_epoch": self.best_epoch}
+
+    def load_state_dict(self, state_dict: dict[str, Any]) -> None:
+        """Takes up what `state_dict` gave."""
+        self.best_value = state_dict["best_value"]
+        self.best_epoch = state_dict["best_epoch"]
+
+    def on_train_epoch_end(self, trainer: pl.Trainer, pl_module: pl.LightningModule) -> None:
+        """Writes the weights first, so that the state never speaks of some that are not there."""
+        value = float(trainer.callback_metrics[SELECTED_BY])
+        if value < self.best_value:
+            self.best_value, self.best_epoch = value, trainer.current_epoch
+            network: nn.Module = pl_module.get_submodule("network")
+            save_weights(network.state_dict(), self._best_path)
+        trainer.save_checkpoint(self._state_path)
+
+
+@final
+class TellEpochs(pl.Callback):
+    """One line per epoch where there is no terminal for a progress bar."""
+
+    def on_train_epoch_end(self, trainer: pl.Trainer, pl_module: pl.LightningModule) -> None:
+        """Writes it to standard error."""
+        del pl_module
+        if trainer.progress_bar_callback is not None:
+            return
+        found = trainer.callback_metrics
+        sys.stderr.write(
+            f"epoch {trainer.current_epoch + 1}/{trainer.max_epochs}: training loss "
+            f"{float(found['training loss']):.3f}, validation loss "
+            f"{float(found['validation loss']):.3f}, {SELECTED_BY} "
+            f"{float(found[SELECTED_BY]):.2f} m\n"
+        )

@@ -1,0 +1,64 @@
+"""Which of several modes is trained on a label, and what it costs."""
+
+import math
+from typing import Literal
+
+import torch
+from jaxtyping import Float, Int
+from torch import Tensor
+from torch.nn import functional
+
+Assignment = Literal["angle", "distance"]
+Classification = Literal["cross-entropy", "softmax"]
+
+MAX_ANGLE_RAD = math.radians(5.0)
+STANDING_M = 2.0
+HUBER_M = 1.0
+
+
+def best_mode(
+    positions: Float[Tensor, "n m t 2"],
+    label: Float[Tensor, "n t 2"],
+    assignment: Assignment = "angle",
+) -> Int[Tensor, " n"]:
+    """The mode that each label is assigned to. Positions are seen from the agent, now at (0, 0).
+
+    `distance` takes the mode with the lowest mean L2 distance. `angle` (Cui et al. 2019, and the
+    paper) takes it among the modes whose last point lies within 5° of the label's last point, seen
+    from the agent; where there is none it takes the lowest distance of all, for which the published
+    code draws a random mode. A label that ends within 2 m has no direction: distance alone.
+    """
+    distance = torch.linalg.vector_norm(positions - label[:, None], dim=-1).mean(dim=-1)
+    if assignment == "angle":
+        end, label_end = positions[:, :, -1], label[:, None, -1]
+        cross = end[..., 0] * label_end[..., 1] - end[..., 1] * label_end[..., 0]
+        dot = (end * label_end).sum(dim=-1)
+        aside = torch.atan2(cross, dot).abs() > MAX_ANGLE_RAD
+        has_direction = torch.linalg.vector_norm(label_end, dim=-1) >= STANDING_M
+        excluded = aside & has_direction & ~aside.all(dim=1, keepdim=True)
+        distance = distance.masked_fill(excluded, math.inf)
+    return distance.argmin(dim=1)
+
+
+def regression_loss(
+    positions: Float[Tensor, "n m t 2"], label: Float[Tensor, "n t 2"], best: Int[Tensor, " n"]
+) -> Float[Tensor, ""]:
+    """Huber loss with h = 1 of the best modes' positions, mean over targets, ticks, coordinates."""
+    chosen = positions[torch.arange(len(best), device=best.device), best]
+    return functional.huber_loss(chosen, label, delta=HUBER_M)
+
+
+def classification_loss(
+    logits: Float[Tensor, "n m"],
+    best: Int[Tensor, " n"],
+    kind: Classification = "cross-entropy",
+) -> Float[Tensor, ""]:
+    """How improbable the best modes are, mean over targets.
+
+    `softmax` is the paper's formula read literally, the negative probability; its gradient vanishes
+    where that probability is near zero, so the cross-entropy is the default.
+    """
+    if kind == "softmax":
+        probability = logits.softmax(dim=1).gather(1, best[:, None])
+        return -probability.mean()
+    return functional.cross_entropy(logits, best)

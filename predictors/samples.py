@@ -1,0 +1,167 @@
+"""Training data: snippets drawn on the fly, in the order of an epoch."""
+
+from collections import deque
+from collections.abc import Iterator, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from itertools import islice
+from typing import final
+
+import numpy as np
+from jaxtyping import Bool, Int
+
+from asp_env.data.recording import Recording
+from asp_env.data.snippets import SnippetIndex, gather_future, gather_scene
+from asp_env.dynamics import MAX_ACCELERATION_MPS2, MAX_STEERING_RAD, inverse
+from asp_env.metrics.open_loop import moving
+from asp_env.views import PictureView
+from predictors.batch import Batch, Labels, make_batch, make_labels
+
+AHEAD = 4
+"""Batches drawn in advance."""
+
+CHUNK = 4096
+"""Snippets read at once where a whole set is scanned."""
+
+RANGE_PERCENTILE = 99.9
+MIN_ACTION_RANGE = (0.5, 0.05)
+
+
+@final
+class Batches:
+    """Batches of snippets, drawn by a thread while the network works on the one before.
+
+    Drawing releases the interpreter's lock, and takes about a tenth of the time that a small
+    network's step takes, so that processes of their own would only add copies. The order is given,
+    hence the batches are the same whenever it is.
+    """
+
+    def __init__(
+        self,
+        recordings: Sequence[Recording],
+        snippets: SnippetIndex,
+        *,
+        view: PictureView,
+        batch_size: int,
+    ) -> None:
+        """Of `batch_size` snippets each, the last one possibly smaller."""
+        self.snippets = snippets
+        self._recordings = recordings
+        self._view = view
+        self._batch_size = batch_size
+
+    def reordered(self, rows: Int[np.ndarray, " m"]) -> "Batches":
+        """Batches of the snippets at some rows, in their order."""
+        return Batches(
+            self._recordings,
+            self.snippets.select(rows),
+            view=self._view,
+            batch_size=self._batch_size,
+        )
+
+    def __len__(self) -> int:
+        """How many batches there are."""
+        return -(-len(self.snippets) // self._batch_size)
+
+    def __iter__(self) -> Iterator[tuple[Batch, Labels]]:
+        """All batches in order."""
+        numbers = iter(range(len(self)))
+        with ThreadPoolExecutor(1, thread_name_prefix="draw") as pool:
+            waiting = deque(pool.submit(self._make, number) for number in islice(numbers, AHEAD))
+            while waiting:
+                ready = waiting.popleft().result()
+                waiting.extend(pool.submit(self._make, number) for number in islice(numbers, 1))
+                yield ready
+
+    def _make(self, number: int) -> tuple[Batch, Labels]:
+        first = number * self._batch_size
+        rows = np.arange(first, min(first + self._batch_size, len(self.snippets)))
+        chosen = self.snippets.select(rows)
+        scene = gather_scene(self._recordings, chosen)
+        labels = make_labels(scene, gather_future(self._recordings, chosen))
+        return make_batch(scene, self._view, chosen.history), labels
+
+
+def epoch_rows(count: int, *, per_epoch: int, epoch: int, seed: int) -> Int[np.ndarray, " rows"]:
+    """Which of `count` snippets an epoch shows, in which order.
+
+    Shuffles of all of them follow each other without end, and an epoch is a stretch of that row of
+    `per_epoch`; with `per_epoch = count` each epoch is one shuffle. The same for equal arguments.
+    """
+    first, last = epoch * per_epoch, (epoch + 1) * per_epoch
+    shuffles = range(first // count, (last - 1) // count + 1)
+    rows = np.concatenate(
+        [np.random.default_rng([seed, number]).permutation(count) for number in shuffles]
+    )
+    skip = first - shuffles[0] * count
+    return rows[skip : skip + per_epoch]
+
+
+def choose_snippets(
+    recordings: Sequence[Recording],
+    snippets: SnippetIndex,
+    *,
+    standing_share: float,
+    max_snippets: int | None,
+    seed: int,
+) -> SnippetIndex:
+    """The snippets that are learnt from: standing ones held back, and no more than so many.
+
+    Args:
+        recordings: what the snippets are of.
+        snippets: those that there are.
+        standing_share: standing targets (not in the subset `moving`) are left out at random until
+            they are at most this share of what remains; 1 keeps them all.
+        max_snippets: how many to keep at most, at random; all of them if None.
+        seed: of what is left out.
+    """
+    rng = np.random.default_rng(seed)
+    keep = np.arange(len(snippets))
+    if standing_share < 1:
+        is_moving = moving_snippets(recordings, snippets)
+        going, standing = np.flatnonzero(is_moving), np.flatnonzero(~is_moving)
+        allowed = int(len(going) * standing_share / (1 - standing_share))
+        if len(standing) > allowed:
+            standing = rng.choice(standing, allowed, replace=False)
+        keep = np.sort(np.concatenate([going, standing]))
+    if max_snippets is not None and len(keep) > max_snippets:
+        keep = np.sort(rng.choice(keep, max_snippets, replace=False))
+    return snippets.select(keep)
+
+
+def moving_snippets(
+    recordings: Sequence[Recording], snippets: SnippetIndex
+) -> Bool[np.ndarray, " n"]:
+    """Which snippets are in the subset `moving`, on which predictors are compared."""
+    parts = [np.zeros(0, dtype=bool)]
+    for chosen in _chunks(snippets):
+        now = gather_scene(recordings, chosen).target_states
+        future = gather_future(recordings, chosen)
+        parts.append(moving(now, future.states[..., :2], future.valid))
+    return np.concatenate(parts)
+
+
+def action_range(recordings: Sequence[Recording], snippets: SnippetIndex) -> tuple[float, float]:
+    """What a network's outputs in [-1, 1] are multiplied by: (m/s², rad).
+
+    The 99.9th percentiles of the absolute actions of the snippets' futures, since the outliers of
+    the inverse model ruin a maximum; within the limits of actions, and never quite zero.
+    """
+    found = [np.zeros((0, 2))]
+    for chosen in _chunks(snippets):
+        scene = gather_scene(recordings, chosen)
+        future = gather_future(recordings, chosen).states
+        before = np.concatenate([scene.target_states[:, None], future[:, :-1]], axis=1)
+        lengths = scene.sizes[scene.targets[:, 0], scene.targets[:, 1], 0][:, None]
+        found.append(np.abs(inverse(before, future, lengths, snippets.dt_s)).reshape(-1, 2))
+    actions = np.concatenate(found)
+    if not len(actions):
+        return MIN_ACTION_RANGE
+    highest = np.percentile(actions, RANGE_PERCENTILE, axis=0)
+    low, high = np.array(MIN_ACTION_RANGE), np.array([MAX_ACCELERATION_MPS2, MAX_STEERING_RAD])
+    acceleration, steering = np.clip(highest, low, high)
+    return float(acceleration), float(steering)
+
+
+def _chunks(snippets: SnippetIndex) -> Iterator[SnippetIndex]:
+    for first in range(0, len(snippets), CHUNK):
+        yield snippets.select(np.arange(first, min(first + CHUNK, len(snippets))))
