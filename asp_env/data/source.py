@@ -2,10 +2,10 @@
 
 import hashlib
 import re
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from importlib import resources
 from pathlib import Path
-from typing import SupportsIndex, overload
+from typing import Any, SupportsIndex, overload
 
 from asp_env import registry
 from asp_env.data.readers.levelx import RecordingFiles, find_recordings
@@ -16,7 +16,7 @@ from asp_env.errors import DataError, unknown_name
 _SCHEME = re.compile(r"^([a-z][a-z0-9-]+):(.*)$", re.DOTALL)
 
 
-class Recordings(Sequence[Recording]):
+class Recordings(Sequence[Any]):  # not of Recording: checking its items at run time opens them
     """The recordings of one DATA, each read when it is first asked for and kept from then on.
 
     Attributes:
@@ -60,6 +60,10 @@ class Recordings(Sequence[Recording]):
         if isinstance(index, slice):
             return self.subset(range(len(self))[index])
         return open_recording(self._files[index], self._opened)
+
+    def __iter__(self) -> Iterator[Recording]:
+        """Opens one after the other."""
+        return (self[index] for index in range(len(self)))
 
     def subset(self, indices: Iterable[SupportsIndex]) -> "Recordings":
         """Some of the recordings, sharing those that are open."""

@@ -49,6 +49,20 @@ class RecordingFiles:
         """The three files that every recording has."""
         return (self.recording_meta, self.tracks_meta, self.tracks)
 
+    def check_complete(self) -> None:
+        """Refuses a recording that lacks one of its tables.
+
+        Raises:
+            DataError: it does.
+        """
+        there = [path.name for path in self.tables if path.is_file()]
+        for path in self.tables:
+            if path.name not in there:
+                raise DataError(
+                    f"{path}: no such file, though {', '.join(there)} is there; "
+                    "copy it beside the others or remove the recording"
+                )
+
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class RecordingMeta:
@@ -96,13 +110,8 @@ def read_recording_meta(path: Path) -> RecordingMeta:
     """Reads `XX_recordingMeta.csv`.
 
     Raises:
-        DataError: it is absent, damaged, or its frame rate is no positive number.
+        DataError: it is damaged, or its frame rate is no positive number.
     """
-    if not path.is_file():
-        raise DataError(
-            f"{path}: no such file, but the recording's tracks are there; "
-            "copy the metadata beside them or remove the recording"
-        )
     needed = ("recordingId", "locationId", "frameRate", "xUtmOrigin", "yUtmOrigin")
     table = read_table(
         path,

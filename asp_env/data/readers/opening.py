@@ -46,6 +46,7 @@ def open_recording(files: RecordingFiles, opened: Opened) -> Recording:
         DataError: its files are damaged.
     """
     if files.name not in opened.recordings:
+        files.check_complete()
         meta = read_recording_meta(files.recording_meta)
         place = (find_map(files, meta), meta.origin)
         recording = _recording(files, meta, opened.maps.get(place) or _road_map(*place))
@@ -60,6 +61,7 @@ def content_hash(files: RecordingFiles) -> str:
     Raises:
         DataError: a file is missing.
     """
+    files.check_complete()
     map_path = find_map(files, read_recording_meta(files.recording_meta))
     sources = (*files.tables, map_path)
 

@@ -2,11 +2,12 @@
 
 import csv
 import gzip
+import io
 import math
 import zlib
 from collections.abc import Iterator, Mapping
 from pathlib import Path
-from typing import IO, Literal, cast
+from typing import Literal
 
 import numpy as np
 import pandas as pd
@@ -37,14 +38,21 @@ def read_columns(
         Arrays (rows,) by name: int64, float64 (finite) or str objects.
 
     Raises:
-        DataError: the file is absent, empty or damaged; the line is named.
+        DataError: the file is absent, damaged or has no rows; where a line is wrong it is named.
     """
     try:
         header = _header(path)
         wanted = _wanted(path, header, columns, optional)
         if not _evenly_filled(path, len(header)):
             _diagnose(path, header, wanted)
-        yield from _chunks(path, wanted)
+        any_rows = False
+        for chunk in _chunks(path, wanted):
+            any_rows = True
+            yield chunk
+        if not any_rows:
+            raise DataError(
+                f"{path}: has a header but no rows; copy it again or remove the recording"
+            )
     except (pd.errors.ParserError, ValueError) as error:
         if isinstance(error, DataError):
             raise
@@ -58,17 +66,10 @@ def read_table(path: Path, columns: Mapping[str, Kind]) -> dict[str, np.ndarray]
     """All rows of `read_columns` at once, for small files.
 
     Raises:
-        DataError: as `read_columns`, or there are no rows.
+        DataError: as `read_columns`.
     """
     chunks = list(read_columns(path, columns))
-    if not chunks:
-        raise no_rows(path)
     return {name: np.concatenate([chunk[name] for chunk in chunks]) for name in columns}
-
-
-def no_rows(path: Path) -> DataError:
-    """The error for a file that has a header and nothing else."""
-    return DataError(f"{path}: has a header but no rows; copy it again or remove the recording")
 
 
 def find_line(path: Path, cells: Mapping[str, object], *, occurrence: int = 1) -> int:
@@ -91,13 +92,11 @@ def find_line(path: Path, cells: Mapping[str, object], *, occurrence: int = 1) -
     return 0
 
 
-def _open(path: Path) -> IO[bytes]:
-    return cast(IO[bytes], gzip.open(path)) if path.suffix == ".gz" else path.open("rb")
+def _open(path: Path) -> io.BufferedIOBase:
+    return gzip.GzipFile(path) if path.suffix == ".gz" else path.open("rb")
 
 
 def _header(path: Path) -> list[str]:
-    if not path.is_file():
-        raise DataError(f"{path}: no such file; expected it beside the recording's other files")
     for _, row in _lines(path):
         return [name.strip() for name in row]
     raise DataError(f"{path}: is empty; expected a table with a header; copy it again")
@@ -141,6 +140,8 @@ def _chunks(path: Path, wanted: Mapping[str, Kind]) -> Iterator[dict[str, np.nda
     )
     with reader:
         for frame in reader:
+            if not len(frame):
+                continue
             frame.columns = frame.columns.str.strip()
             yield {name: _checked(frame[name], kind) for name, kind in wanted.items()}
 

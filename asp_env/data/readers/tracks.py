@@ -12,7 +12,6 @@ from asp_env.data.readers.osm import shorten
 from asp_env.data.readers.tables import (
     Kind,
     find_line,
-    no_rows,
     read_columns,
     read_table,
 )
@@ -77,13 +76,8 @@ def read_tracks(files: RecordingFiles) -> TrackTable:
     A track with a gap in its frames is split there: what follows gets an id of its own.
 
     Raises:
-        DataError: a file is absent or damaged, or the two disagree on which tracks there are.
+        DataError: a file is damaged, or the two disagree on which tracks there are.
     """
-    if not files.tracks_meta.is_file():
-        raise DataError(
-            f"{files.tracks_meta}: no such file, but the recording's tracks are there; "
-            "copy the metadata beside them or remove the recording"
-        )
     meta = read_table(files.tracks_meta, _META)
     ids = meta["trackId"]
     if len(np.unique(ids)) < len(ids):
@@ -187,8 +181,6 @@ def _read_rows(files: RecordingFiles) -> _Rows:
         unknown = np.zeros(len(chunk["frame"]))
         both = [chunk.get("length", unknown), chunk.get("width", unknown)]
         sizes.append(np.stack(both, axis=-1).astype(np.float32))
-    if not track:
-        raise no_rows(files.tracks)
     rows = _Rows(
         track=np.concatenate(track),
         frame=np.concatenate(frame),
