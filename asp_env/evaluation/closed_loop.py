@@ -1,9 +1,10 @@
 """`asp-env drive`: a planner drives by what a predictor says, in many episodes at once."""
 
+from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 import numpy as np
 import tyro
@@ -65,10 +66,13 @@ class Drive:
     def run(self) -> None:
         """Drives, writes the folder, prints the table; the expert stands first."""
         with output_folder(self.out) as folder:
-            rows, maps = drive(self, folder)
-            write_report(folder, title=f"Driving on {self.data}", maps=maps)
+            result = drive(self)
+            write_metrics(folder, result.rows)
+            write_manifest(folder, "drive", **result.manifest)
+            save_rollouts(folder, result)
+            write_report(folder, title=f"Driving on {self.data}", maps=result.maps)
         console = Console()
-        console.print(driving_table(rows))
+        console.print(driving_table(result.rows))
         console.print(f"wrote {self.out}/report.html")
 
 
@@ -89,12 +93,20 @@ class _Run:
         return f"{self.planner} + {kind}" if kind else self.planner
 
 
-def drive(config: Drive, folder: Path) -> tuple[list[Row], dict[str, RoadMap]]:
-    """Drives with every predictor, the expert first; writes everything but the report.
+@dataclass(frozen=True, slots=True, kw_only=True)
+class ClosedLoop:
+    """What the drives came to."""
 
-    Returns:
-        The rows of `metrics.csv`, and the maps of the saved rollouts by recording.
-    """
+    rows: list[Row]
+    manifest: dict[str, Any]
+    rollouts: Mapping[str, tuple[Rollout, ...]]
+    """By driver, of the same scenarios."""
+    maps: dict[str, RoadMap]
+    """By the names of the rollouts' recordings."""
+
+
+def drive(config: Drive) -> ClosedLoop:
+    """Drives with every predictor, the expert first."""
     recordings = open_data(config.data)
     horizon, history = ticks(config.horizon, config.dt), ticks(HISTORY_S, config.dt)
     predictors = [
@@ -128,23 +140,27 @@ def drive(config: Drive, folder: Path) -> tuple[list[Row], dict[str, RoadMap]]:
             for entrant in entrants
         ]  # fmt: skip
     rows = [row for run in runs for row in _rows(config, run, scenarios)]
-    write_metrics(folder, rows)
-    write_manifest(
-        folder,
-        "drive",
-        data=config.data,
-        data_hash=recordings.data_hash(),
-        planner=config.planner,
-        predictors=list(config.predictors),
-        traffic=config.traffic,
-        horizon_s=config.horizon,
-        dt_s=config.dt,
-        part=part,
-        scenarios=[scenario.name for scenario in scenarios],
-        endings={run.name: [kind.name for kind in run.endings] for run in runs},
-        intervals="95 %, bootstrap over recordings",
+    kept = _worst(runs)
+    return ClosedLoop(
+        rows=rows,
+        manifest={
+            "data": config.data,
+            "data_hash": recordings.data_hash(),
+            "planner": config.planner,
+            "predictors": list(config.predictors),
+            "traffic": config.traffic,
+            "horizon_s": config.horizon,
+            "dt_s": config.dt,
+            "part": part,
+            "scenarios": [scenario.name for scenario in scenarios],
+            "endings": {run.name: dict(Counter(kind.name for kind in run.endings)) for run in runs},
+            "intervals": "95 %, bootstrap over recordings",
+        },
+        rollouts={run.name: tuple(run.rollouts[i] for i in kept) for run in runs},
+        maps={
+            scenarios[i].recording_name: recordings[scenarios[i].recording].road_map for i in kept
+        },
     )
-    return rows, _save_rollouts(folder, recordings, scenarios, runs)
 
 
 def _spread(scenarios: ScenarioSet, most: int | None) -> list[Scenario]:
@@ -227,15 +243,16 @@ def _rows(config: Drive, run: _Run, scenarios: Sequence[Scenario]) -> list[Row]:
     return rows
 
 
-def _save_rollouts(
-    folder: Path, recordings: Recordings, scenarios: Sequence[Scenario], runs: Sequence[_Run]
-) -> dict[str, RoadMap]:
-    """The same scenarios of every driver: those with the lowest scores, the expert's left out."""
+def _worst(runs: Sequence[_Run]) -> list[int]:
+    """The scenarios with the lowest mean scores; the expert's count only where it is alone."""
     scores = np.mean([run.metrics["score"].value for run in runs[1:] or runs], axis=0)
-    kept = np.argsort(scores, kind="stable")[:SAVED_ROLLOUTS]
-    for run in runs:
-        into = folder / "rollouts" / run.name
-        into.mkdir(parents=True, exist_ok=True)
-        for i in kept:
-            run.rollouts[i].save(into / f"{scenarios[i].name}.npz")
-    return {scenarios[i].recording_name: recordings[scenarios[i].recording].road_map for i in kept}
+    return np.argsort(scores, kind="stable")[:SAVED_ROLLOUTS].tolist()
+
+
+def save_rollouts(folder: Path, result: ClosedLoop) -> None:
+    """`rollouts/DRIVER/SCENARIO.npz`."""
+    for driver, rollouts in result.rollouts.items():
+        into = folder / "rollouts" / driver
+        into.mkdir(parents=True)
+        for rollout in rollouts:
+            rollout.save(into / f"{rollout.scenario.name}.npz")

@@ -3,7 +3,7 @@
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 import numpy as np
 import tyro
@@ -27,7 +27,7 @@ from asp_env.errors import AspEnvError
 from asp_env.evaluation import intervals
 from asp_env.evaluation.output import Row, output_folder, write_manifest, write_metrics
 from asp_env.evaluation.report import ForecastExamples, write_report
-from asp_env.evaluation.tables import open_loop_table
+from asp_env.evaluation.tables import open_loop_tables
 from asp_env.evaluation.unseen import PartChoice, keep_within, ticks_to_judge
 from asp_env.metrics.open_loop import SELECTIONS, moving, open_loop_errors
 
@@ -64,11 +64,23 @@ class Evaluate:
     def run(self) -> None:
         """Evaluates, writes the folder, prints the table."""
         with output_folder(self.out) as folder:
-            rows, examples = evaluate(self, folder)
-            write_report(folder, title=f"Open loop on {self.data}", examples=examples)
+            result = evaluate(self)
+            write_metrics(folder, result.rows)
+            write_manifest(folder, "evaluate", **result.manifest)
+            write_report(folder, title=f"Open loop on {self.data}", examples=result.examples)
         console = Console()
-        console.print(open_loop_table(rows))
+        for table in open_loop_tables(result.rows):
+            console.print(table)
         console.print(f"wrote {self.out}/report.html")
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class OpenLoop:
+    """What an evaluation found."""
+
+    rows: list[Row]
+    manifest: dict[str, Any]
+    examples: ForecastExamples
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -82,8 +94,8 @@ class Judged:
     valid: Bool[np.ndarray, " n"]
 
 
-def evaluate(config: Evaluate, folder: Path) -> tuple[list[Row], ForecastExamples]:
-    """Runs every predictor on every snippet to be judged and writes everything but the report."""
+def evaluate(config: Evaluate) -> OpenLoop:
+    """Runs every predictor on every snippet to be judged."""
     recordings = open_data(config.data)
     horizon = ticks(config.horizon, config.dt)
     predictors = [
@@ -101,24 +113,23 @@ def evaluate(config: Evaluate, folder: Path) -> tuple[list[Row], ForecastExample
     index = index_snippets(recordings, dt_s=config.dt, horizon_s=config.horizon)
     index = keep_within(index, allowed)
     judged, subset = _judge(recordings, index, predictors, config.predictors)
-    rows = _rows(config, judged, subset, index.recording)
-    write_metrics(folder, rows)
-    write_manifest(
-        folder,
-        "evaluate",
-        data=config.data,
-        data_hash=recordings.data_hash(),
-        predictors=list(config.predictors),
-        horizon_s=config.horizon,
-        dt_s=config.dt,
-        part=part,
-        recordings=len(np.unique(index.recording)),
-        snippets=len(index),
-        moving=int(subset["moving"].sum()),
-        best_of_3="the mode with the lowest final error among the three most probable",
-        intervals="95 %, bootstrap over recordings",
+    return OpenLoop(
+        rows=_rows(config, judged, subset, index.recording),
+        manifest={
+            "data": config.data,
+            "data_hash": recordings.data_hash(),
+            "predictors": list(config.predictors),
+            "horizon_s": config.horizon,
+            "dt_s": config.dt,
+            "part": part,
+            "recordings": len(np.unique(index.recording)),
+            "snippets": len(index),
+            "moving snippets": int(subset["moving"].sum()),
+            "best-of-3": "the lowest final error among the three most probable modes",
+            "intervals": "95 %, bootstrap over recordings",
+        },
+        examples=_examples(recordings, index, subset["moving"], predictors, config.predictors),
     )
-    return rows, _examples(recordings, index, subset["moving"], predictors, config.predictors)
 
 
 def batches(

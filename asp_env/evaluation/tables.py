@@ -1,62 +1,78 @@
-"""Tables for terminals."""
+"""Tables for terminals, 80 columns wide; all intervals are in `metrics.csv` and the report."""
 
 from collections.abc import Sequence
 
+from rich import box
 from rich.table import Table
 
 from asp_env.evaluation.output import Row
 
-OPEN_LOOP = ("FDE", "FDE / constant velocity", "ADE", "MAE", "MSE", "miss")
-DRIVING = (
-    "score",
-    "no at-fault collision",
-    "no collision",
-    "on road",
-    "TTC",
-    "progress",
-    "comfort",
-    "log divergence",
-)
+OPEN_LOOP = {"FDE": "FDE m", "FDE / constant velocity": "FDE / const. vel."}
+OPEN_LOOP_SHORT = {"ADE": "ADE m", "miss": "miss"}
+DRIVING = {"score": "score"}
+DRIVING_SHORT = {
+    "no at-fault collision": "no fault",
+    "on road": "road",
+    "TTC": "TTC",
+    "progress": "progr.",
+    "comfort": "comf.",
+    "log divergence": "div. m",
+}
 
 
-def open_loop_table(rows: Sequence[Row]) -> Table:
-    """Predictor by metric, for every subset and selection."""
-    table = Table(title="open loop: errors in m, [95 % interval over recordings]")
-    for name in ("subset", "selection", "predictor", *OPEN_LOOP, "n"):
-        table.add_column(name)
-    groups: dict[tuple[str, str, str], dict[str, Row]] = {}
+def open_loop_tables(rows: Sequence[Row]) -> list[Table]:
+    """Predictor by metric, a table for every subset and selection."""
+    groups: dict[tuple[str, str], dict[str, dict[str, Row]]] = {}
     for row in rows:
-        groups.setdefault((row.subset, row.selection, row.predictor), {})[row.metric] = row
-    section = None
-    for key in sorted(groups, key=lambda key: (key[0], key[1] != "most-probable")):
-        if section not in (None, key[:2]):
-            table.add_section()
-        section = key[:2]
-        metrics = groups[key]
-        table.add_row(*key, *(_cell(metrics.get(name)) for name in OPEN_LOOP), _count(metrics))
-    return table
+        members = groups.setdefault((row.subset, row.selection), {})
+        members.setdefault(_short(row.predictor), {})[row.metric] = row
+    tables = []
+    for (subset, selection), members in groups.items():
+        table = _table(f"{subset} targets, {selection}, 95 % intervals over recordings")
+        _fill(table, "predictor", members, OPEN_LOOP, OPEN_LOOP_SHORT)
+        tables.append(table)
+    return tables
 
 
 def driving_table(rows: Sequence[Row]) -> Table:
     """Driver by metric; the expert, which is the noise floor, first."""
-    table = Table(title="closed loop: mean per episode, [95 % interval over recordings]")
-    for name in ("planner", "predictor", *DRIVING, "episodes"):
-        table.add_column(name)
-    groups: dict[tuple[str, str], dict[str, Row]] = {}
+    table = _table("driving, mean per episode, 95 % interval over recordings")
+    members: dict[str, dict[str, Row]] = {}
     for row in rows:
-        groups.setdefault((row.planner, row.predictor), {})[row.metric] = row
-    for key, metrics in groups.items():
-        table.add_row(*key, *(_cell(metrics.get(name)) for name in DRIVING), _count(metrics))
+        name = " + ".join(part for part in (row.planner, _short(row.predictor)) if part)
+        members.setdefault(name, {})[row.metric] = row
+    _fill(table, "driver", members, DRIVING, DRIVING_SHORT)
     return table
 
 
-def _cell(row: Row | None) -> str:
+def _table(title: str) -> Table:
+    return Table(title=title, box=box.SIMPLE_HEAD, show_edge=False, padding=(0, 1, 0, 0))
+
+
+def _fill(
+    table: Table,
+    who: str,
+    members: dict[str, dict[str, Row]],
+    with_interval: dict[str, str],
+    without: dict[str, str],
+) -> None:
+    table.add_column(who, min_width=18)
+    for heading in (*with_interval.values(), *without.values(), "n"):
+        table.add_column(heading, justify="right", no_wrap=True)
+    for name, metrics in members.items():
+        wide = (_cell(metrics.get(metric), interval=True) for metric in with_interval)
+        slim = (_cell(metrics.get(metric), interval=False) for metric in without)
+        count = max(row.n for row in metrics.values())
+        table.add_row(name, *wide, *slim, str(count))
+
+
+def _short(predictor: str) -> str:
+    return predictor.partition(":")[0]
+
+
+def _cell(row: Row | None, *, interval: bool) -> str:
     if row is None:
-        return "-"
-    if row.low is None or row.high is None:
+        return ""
+    if not interval or row.low is None or row.high is None:
         return f"{row.value:.2f}"
     return f"{row.value:.2f} [{row.low:.2f}, {row.high:.2f}]"
-
-
-def _count(metrics: dict[str, Row]) -> str:
-    return str(max(row.n for row in metrics.values()))

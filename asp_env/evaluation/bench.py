@@ -1,0 +1,119 @@
+"""`asp-env bench`: rates of the hot paths beside this machine's memory bandwidth, in one run."""
+
+import os
+from collections.abc import Callable
+from dataclasses import dataclass
+from time import perf_counter
+
+import numpy as np
+import tyro
+from rich.console import Console
+from rich.table import Table
+
+from asp_env.data.scenario import Scenario, find_scenarios
+from asp_env.data.snippets import gather_scene, index_snippets
+from asp_env.data.source import Recordings, open_data
+from asp_env.evaluation.unseen import nothing_left
+from asp_env.sim.drivers import DRIVERS, make_driver
+from asp_env.sim.simulation import Simulation
+from asp_env.views import make_view
+
+DT_S = 0.2
+HISTORY = 15
+REPEATS = 5
+SIZES_PX = ((360, 240), (90, 60))
+COPY_BYTES = 256 * 2**20
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Bench:
+    """Measure speeds on this machine: rasters and simulated steps, beside memory bandwidth."""
+
+    data: tyro.conf.Positional[str] = "sample:intersection"
+    """DATA to draw and to simulate."""
+    episodes: int = 256
+    """Episodes that are stepped together."""
+
+    def run(self) -> None:
+        """Measures and prints a table."""
+        recordings = open_data(self.data)
+        table = Table(title=f"medians of {REPEATS}, {os.cpu_count()} cores seen, one used")
+        for heading in ("what", "rate", "bytes moved", "share of copy bandwidth"):
+            table.add_column(heading, justify="left" if heading == "what" else "right")
+        copy = _copy_bandwidth()
+        table.add_row("memory copy (bytes written)", f"{copy / 1e9:.1f} GB/s", "", "1.00")
+        for height_px, width_px in SIZES_PX:
+            per_s, size = _rasters(recordings, height_px, width_px)
+            table.add_row(
+                f"raster 12x{height_px}x{width_px}",
+                f"{per_s:,.0f} /s",
+                f"{per_s * size / 1e9:.2f} GB/s",
+                f"{per_s * size / copy:.2f}",
+            )
+        scenarios = _scenarios(recordings, self.data, self.episodes)
+        for traffic in DRIVERS:
+            per_s, agents, size = _steps(recordings, scenarios, traffic)
+            table.add_row(
+                f"{self.episodes} episodes, {agents} slots, {traffic}, with events",
+                f"{per_s:,.0f} episode-steps/s",
+                f"{per_s * size / 1e9:.2f} GB/s",
+                f"{per_s * size / copy:.2f}",
+            )
+        Console(width=max(Console().width, 110)).print(table)
+
+
+def median_s(work: Callable[[], object]) -> float:
+    """Median duration of several calls after one that is not counted."""
+    work()
+    durations = []
+    for _ in range(REPEATS):
+        start = perf_counter()
+        work()
+        durations.append(perf_counter() - start)
+    return float(np.median(durations))
+
+
+def _copy_bandwidth() -> float:
+    source, target = np.ones(COPY_BYTES, dtype=np.uint8), np.zeros(COPY_BYTES, dtype=np.uint8)
+    return COPY_BYTES / median_s(lambda: np.copyto(target, source))
+
+
+def _rasters(recordings: Recordings, height_px: int, width_px: int) -> tuple[float, int]:
+    index = index_snippets(recordings, dt_s=DT_S, horizon_s=3.0)
+    if not len(index):
+        raise nothing_left("snippet")
+    chosen = np.linspace(0, len(index) - 1, min(256, len(index))).astype(int)
+    scene = gather_scene(recordings, index.select(chosen))
+    view = make_view("chauffeurnet", height_px=height_px, width_px=width_px)
+    out = np.zeros((len(chosen), *view.shape), dtype=np.uint8)
+    return len(chosen) / median_s(lambda: view.draw(scene, out)), out[0].nbytes
+
+
+def _scenarios(recordings: Recordings, source: str, count: int) -> list[Scenario]:
+    found = find_scenarios(recordings, source=source, dt_s=DT_S, history=HISTORY)
+    if not len(found):
+        raise nothing_left("scenario")
+    return [found[i % len(found)] for i in range(count)]
+
+
+def _steps(
+    recordings: Recordings, scenarios: list[Scenario], traffic: str
+) -> tuple[float, int, int]:
+    simulation = Simulation(
+        recordings, make_driver(traffic), num_episodes=len(scenarios), dt_s=DT_S, history=HISTORY
+    )
+    simulation.reset(scenarios, [np.random.default_rng(0)] * len(scenarios))
+    start = simulation.world.snapshot()
+    actions = np.zeros((len(scenarios), 2), dtype=np.float32)
+    driven = np.ones(len(scenarios), dtype=bool)
+    steps = min(scenario.length for scenario in scenarios)
+
+    def work() -> None:
+        simulation.world.restore(start)
+        for _ in range(steps):
+            simulation.step(actions, driven)
+            simulation.world.events()
+
+    agents = simulation.world.episodes.ids.shape[1]
+    state_bytes = agents * 4 * np.dtype(np.float32).itemsize
+    return steps * len(scenarios) / median_s(work), agents, state_bytes
