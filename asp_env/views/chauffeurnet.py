@@ -27,8 +27,8 @@ from jaxtyping import UInt8
 
 from asp_env.data.scene import Scene
 from asp_env.errors import AspEnvError
+from asp_env.views.boundaries import BoundaryCache
 from asp_env.views.draw import draw_agents, draw_pieces
-from asp_env.views.map_raster import BoundaryCache
 from asp_env.views.view import View
 
 SNAPSHOTS = (0, 2, 4, 6, 8, 9, 11, 13, 15)
@@ -131,6 +131,15 @@ class ChauffeurNet:
             draw_pieces(pieces, on_map, matrices, pixels_per_metre, half_width, out)
         half_width = 0.5 * max(TRAIL_WIDTH_M * pixels_per_metre, MIN_LINE_WIDTH_PX)
         draw_agents(
-            states, valid, sizes, targets, SNAPSHOTS, matrices, pixels_per_metre, half_width, out
+            states,
+            valid,
+            sizes,
+            targets,
+            SNAPSHOTS,
+            matrices,
+            pixels_per_metre,
+            (float(self.view.anchor_column_px), float(self.view.anchor_row_px)),
+            half_width,
+            out,
         )
         return out

@@ -153,6 +153,7 @@ def draw_agents(
     snapshots,
     pixels_from_world,
     pixels_per_metre,
+    anchor,
     trail_half_width,
     out,
 ):
@@ -166,6 +167,7 @@ def draw_agents(
         snapshots: ticks at which the other agents are drawn; the last is now.
         pixels_from_world: (targets, 2, 3).
         pixels_per_metre: of the view.
+        anchor: (column, row) of the ego in every picture.
         trail_half_width: pixels.
         out: (targets, 3 + snapshots, height, width).
     """
@@ -175,18 +177,25 @@ def draw_agents(
     turned = -1
     for t in range(len(targets)):
         b, ego = targets[t]
-        out[t, 1:] = 0
         if not valid[b, ego, now]:
+            out[t, 1:] = 0
             continue
         if b != turned:  # all targets of one situation see the same boxes
             turned = b
             _directions(states[b], valid[b], snapshots, cos, sin)
         matrix = affine(pixels_from_world[t])
+        # Channels are cleared one by one, just before they are drawn into: they fit the cache.
+        out[t, 1:3] = 0
+        # In its own frame the ego always looks the same, so no rounding of its pose may enter.
+        half_length = 0.5 * sizes[b, ego, 0] * pixels_per_metre
+        half_width = 0.5 * sizes[b, ego, 1] * pixels_per_metre
+        fill_box(out[t, 1], anchor[0], anchor[1], 0.0, -1.0, half_length, half_width)
         _draw_trail(out[t, 2], states[b, ego], valid[b, ego], matrix, trail_half_width)
         for k in range(len(snapshots)):
             tick = snapshots[k]
+            out[t, 3 + k] = 0
             for a in range(agents):
-                if (a == ego and tick != now) or not valid[b, a, tick]:
+                if a == ego or not valid[b, a, tick]:
                     continue
                 half_length = 0.5 * sizes[b, a, 0] * pixels_per_metre
                 half_width = 0.5 * sizes[b, a, 1] * pixels_per_metre
@@ -195,8 +204,7 @@ def draw_agents(
                     continue
                 across, down = turn(matrix, cos[k, a], sin[k, a])
                 across, down = across / pixels_per_metre, down / pixels_per_metre
-                canvas = out[t, 1] if a == ego else out[t, 3 + k]
-                fill_box(canvas, column, row, across, down, half_length, half_width)
+                fill_box(out[t, 3 + k], column, row, across, down, half_length, half_width)
 
 
 @njit(cache=True, nogil=True)
