@@ -47,7 +47,7 @@ def box_corners(
 
 def path_length(points: Shaped[np.ndarray, "*batch n 2"]) -> float | np.ndarray:
     """Length of a polyline, metres; points without motion add nothing."""
-    return np.hypot(*np.moveaxis(np.diff(points, axis=-2), -1, 0)).sum(axis=-1)
+    return np.hypot(*np.moveaxis(np.diff(points, axis=-2), -1, 0)).sum(axis=-1, dtype=np.float64)
 
 
 def resample(points: Float[np.ndarray, "n 2"], spacing_m: float) -> Float[np.ndarray, "m 2"]:

@@ -34,7 +34,7 @@ def wrap_angle(angle_rad: Any) -> Any:
 def forward(
     states: Float[Any, "*batch 4"],
     actions: Float[Any, "*batch 2"],
-    lengths_m: Float[Any, "*batch"],
+    lengths_m: Float[Any, "*#batch"],
     dt_s: float,
     *,
     integrator: Integrator = "heun",
@@ -45,7 +45,7 @@ def forward(
     Args:
         states: states now.
         actions: actions held during the step.
-        lengths_m: vehicle lengths; must be positive.
+        lengths_m: vehicle lengths, one per state or broadcast against them; must be positive.
         dt_s: duration of the step.
         integrator: `heun` (second order, default) or `euler` (the paper's, and highway-env's).
         reverse: whether speed may become negative. Otherwise braking ends at speed 0.
@@ -61,7 +61,7 @@ def forward(
 def rollout(
     states: Float[Any, "*batch 4"],
     actions: Float[Any, "*batch steps 2"],
-    lengths_m: Float[Any, "*batch"],
+    lengths_m: Float[Any, "*#batch"],
     dt_s: float,
     *,
     integrator: Integrator = "heun",
@@ -116,7 +116,7 @@ def _running_minimum(values: Any) -> Any:
 def inverse(
     states: Float[Any, "*batch 4"],
     next_states: Float[Any, "*batch 4"],
-    lengths_m: Float[Any, "*batch"],
+    lengths_m: Float[Any, "*#batch"],
     dt_s: float,
     *,
     integrator: Integrator = "heun",
