@@ -9,11 +9,12 @@ from typing import Any
 import numpy as np
 from safetensors import SafetensorError
 from safetensors.torch import load_file, save_file
-from torch import Tensor, nn
+from torch import Tensor
 
+from asp_env.data.parts import TrainedOn
 from asp_env.errors import AspEnvError, CheckpointError
 from asp_env.views import PictureView, view_from_config
-from predictors.learned import Learned, LearnedPlug, NetworkShape
+from predictors.learned import AbstractNetwork, Learned, LearnedPlug, NetworkShape
 
 CONFIG = "config.json"
 WEIGHTS = "weights.safetensors"
@@ -75,7 +76,7 @@ def load_learned(plug: LearnedPlug, argument: str, *, dt_s: float) -> Learned:
             f"name it as {config['predictor']}:{folder}"
         )
     try:
-        shape, view, network = _build(plug, config)
+        shape, view, network, trained_on = _build(plug, config)
     except (KeyError, TypeError, ValueError, RuntimeError) as error:
         raise CheckpointError(
             f"{folder / CONFIG} does not describe a {plug.name}: {_brief(error)}"
@@ -86,7 +87,7 @@ def load_learned(plug: LearnedPlug, argument: str, *, dt_s: float) -> Learned:
             f"the scenes have {dt_s:g} s"
         )
     _load_weights(network, folder / WEIGHTS)
-    return Learned(name=plug.name, network=network, view=view, shape=shape)
+    return Learned(name=plug.name, network=network, view=view, shape=shape, trained_on=trained_on)
 
 
 def read_config(folder: Path) -> dict[str, Any]:
@@ -114,7 +115,7 @@ def read_config(folder: Path) -> dict[str, Any]:
 
 def _build(
     plug: LearnedPlug, config: dict[str, Any]
-) -> tuple[NetworkShape, PictureView, nn.Module]:
+) -> tuple[NetworkShape, PictureView, AbstractNetwork, TrainedOn]:
     view = view_from_config(config["view"])
     acceleration, steering = config["normaliser"]["action_range"]
     shape = NetworkShape(
@@ -124,10 +125,11 @@ def _build(
         dt_s=float(config["dt_s"]),
         action_range=(float(acceleration), float(steering)),
     )
-    return shape, view, plug.network(plug.config(**config["network"]), shape)
+    trained_on = TrainedOn(**config["provenance"]["trained_on"])
+    return shape, view, plug.network(plug.config(**config["network"]), shape), trained_on
 
 
-def _load_weights(network: nn.Module, path: Path) -> None:
+def _load_weights(network: AbstractNetwork, path: Path) -> None:
     try:
         weights = load_file(path)
     except FileNotFoundError:

@@ -26,7 +26,7 @@ from asp_env.dynamics.bicycle import Integrator
 from asp_env.errors import AspEnvError
 from predictors.batch import Batch, Labels
 from predictors.encoders import EncoderName, make_encoder
-from predictors.learned import Modes, NetworkShape
+from predictors.learned import AbstractNetwork, Modes, NetworkShape
 from predictors.modes import (
     Assignment,
     Classification,
@@ -73,7 +73,7 @@ class FFWASPConfig:
 
 
 @final
-class FFWASPNetwork(nn.Module):
+class FFWASPNetwork(AbstractNetwork):
     """Encoder, decoder and the bicycle model."""
 
     def __init__(self, config: FFWASPConfig, shape: NetworkShape) -> None:

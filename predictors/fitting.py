@@ -18,6 +18,7 @@ from lightning.pytorch.loggers import CSVLogger, TensorBoardLogger
 from safetensors.torch import load_file
 
 from asp_env import registry
+from asp_env.data.parts import TrainedOn, snippet_parts
 from asp_env.data.snippets import SnippetIndex, index_snippets
 from asp_env.data.source import Recordings, open_data
 from asp_env.errors import AspEnvError
@@ -25,7 +26,6 @@ from asp_env.views import make_view
 from predictors.checkpoint import CONFIG, save_learned, write_json
 from predictors.learned import LearnedPlug, NetworkShape
 from predictors.lightning_parts import Fit, KeepBest, TellEpochs
-from predictors.parts import snippet_parts
 from predictors.recipes import TrainingConfig
 from predictors.resume import SafetensorsIO
 from predictors.samples import Batches, action_range, choose_snippets
@@ -61,7 +61,7 @@ def train(config: TrainingConfig, data: str, out: Path) -> Path:
     (out / STATE).mkdir(exist_ok=True)
 
     snippets = index_snippets(recordings, dt_s=config.dt_s, horizon_s=config.horizon_s)
-    training, validation, described = _choose(recordings, snippets, config)
+    training, validation, trained_on = _choose(recordings, snippets, config)
     view = make_view(config.view, height_px=config.height_px, width_px=config.width_px)
     shape = NetworkShape(
         raster=view.shape,
@@ -92,7 +92,7 @@ def train(config: TrainingConfig, data: str, out: Path) -> Path:
         weights=load_file(out / STATE / "best.safetensors"),
         provenance={
             **run,
-            **described,
+            "trained_on": dataclasses.asdict(trained_on),
             "snippets": {"training": len(training), "validation": len(validation)},
             "best_epoch": best.best_epoch,
             "best_value": best.best_value,
@@ -178,9 +178,9 @@ def _versions() -> dict[str, str]:
 
 def _choose(
     recordings: Recordings, snippets: SnippetIndex, config: TrainingConfig
-) -> tuple[SnippetIndex, SnippetIndex, dict[str, Any]]:
-    """Training and validation snippets, and the words of the provenance on them."""
-    parts, described = snippet_parts(recordings, snippets, config.split)
+) -> tuple[SnippetIndex, SnippetIndex, TrainedOn]:
+    """Training and validation snippets, and which recordings they are from."""
+    parts, trained_on = snippet_parts(recordings, snippets, config.split)
     found = {part: snippets.select(parts == part) for part in ("train", "validation")}
     for part, chosen in found.items():
         if not len(chosen):
@@ -202,4 +202,4 @@ def _choose(
         max_snippets=config.max_validation_snippets,
         seed=config.seed,
     )
-    return training, validation, described
+    return training, validation, trained_on

@@ -1,7 +1,8 @@
 """A trained network behind the predictor socket."""
 
 import dataclasses
-from typing import Any, ClassVar, NamedTuple, Protocol, final
+from abc import ABC, abstractmethod
+from typing import Any, NamedTuple, Protocol, final
 
 import numpy as np
 import torch
@@ -10,11 +11,12 @@ from torch import Tensor, nn
 
 from asp_env.data.forecast import Forecast, make_forecast
 from asp_env.data.geometry import from_frame
+from asp_env.data.parts import TrainedOn
 from asp_env.data.scene import Scene
 from asp_env.data.snippets import Future
 from asp_env.dynamics import wrap_angle
 from asp_env.views import PictureView
-from predictors.batch import make_batch
+from predictors.batch import Batch, Labels, make_batch
 from predictors.physical import seen_for
 
 CHUNK = 256
@@ -44,14 +46,35 @@ class NetworkShape:
     """What outputs in [-1, 1] are multiplied by: m/s², rad. The normaliser."""
 
 
+class AbstractNetwork(nn.Module, ABC):
+    """A network that can be trained and put behind the socket; made of (config, shape)."""
+
+    @abstractmethod
+    def forward(self, batch: Batch) -> Modes:
+        """The modes of every target."""
+
+    @abstractmethod
+    def loss(self, modes: Modes, labels: Labels) -> dict[str, Tensor]:
+        """The terms of the loss by name, `loss` their weighted sum."""
+
+
 class LearnedPlug(Protocol):
     """What the registry holds under a learned predictor's name, for training and loading."""
 
-    name: ClassVar[str]
-    config: ClassVar[type[Any]]
-    """A frozen dataclass of what JSON can hold."""
-    network: ClassVar[type[nn.Module]]
-    """Made of (config, shape); `forward(batch) -> Modes`, `loss(modes, labels) -> terms`."""
+    @property
+    def name(self) -> str:
+        """By which it is registered."""
+        ...
+
+    @property
+    def config(self) -> type[Any]:
+        """A frozen dataclass of what JSON can hold."""
+        ...
+
+    @property
+    def network(self) -> type[AbstractNetwork]:
+        """Made of (config, shape)."""
+        ...
 
 
 @final
@@ -61,7 +84,13 @@ class Learned:
     privileged = False
 
     def __init__(
-        self, *, name: str, network: nn.Module, view: PictureView, shape: NetworkShape
+        self,
+        *,
+        name: str,
+        network: AbstractNetwork,
+        view: PictureView,
+        shape: NetworkShape,
+        trained_on: TrainedOn,
     ) -> None:
         """The network sees what `view` draws."""
         self.name = name
@@ -69,6 +98,7 @@ class Learned:
         self.dt_s = shape.dt_s
         self.history = shape.history
         self.horizon = shape.horizon
+        self.trained_on: TrainedOn | None = trained_on
         self._network = network.eval()
 
     def predict(self, scene: Scene, future: Future | None = None) -> Forecast:

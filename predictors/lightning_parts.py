@@ -16,6 +16,7 @@ from asp_env.errors import AspEnvError
 from asp_env.metrics.open_loop import moving, open_loop_errors
 from predictors.batch import Batch, Labels
 from predictors.checkpoint import save_weights
+from predictors.learned import AbstractNetwork
 from predictors.recipes import TrainingConfig
 from predictors.samples import Batches, epoch_rows
 
@@ -39,7 +40,12 @@ class Fit(pl.LightningModule):
     """A network, its data in the order of epochs, and how it is optimised."""
 
     def __init__(
-        self, network: nn.Module, *, config: TrainingConfig, training: Batches, validation: Batches
+        self,
+        network: AbstractNetwork,
+        *,
+        config: TrainingConfig,
+        training: Batches,
+        validation: Batches,
     ) -> None:
         """`training` holds all snippets in their order; each epoch takes its own stretch."""
         super().__init__()

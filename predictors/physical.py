@@ -1,13 +1,13 @@
 """Forecasters without weights: the first rows of every table, and the oracle."""
 
 from dataclasses import dataclass
-from typing import Self
 
 import numpy as np
 from jaxtyping import Bool, Float
 
 from asp_env.data.classes import PREDICTED
 from asp_env.data.forecast import Forecast, constant_velocity, make_forecast
+from asp_env.data.parts import TrainedOn
 from asp_env.data.scene import Scene
 from asp_env.data.snippets import Future
 from asp_env.dynamics import clip_actions, inverse, rollout, wrap_angle
@@ -25,10 +25,11 @@ class ConstantVelocity:
     dt_s: float
     name: str = "constant-velocity"
     privileged: bool = False
+    trained_on: TrainedOn | None = None
     history: int = 0
 
     @classmethod
-    def from_name(cls, argument: str, *, horizon: int, dt_s: float) -> Self:
+    def from_name(cls, argument: str, *, horizon: int, dt_s: float) -> "ConstantVelocity":
         """The predictor for any horizon and time step; it takes no argument.
 
         Raises:
@@ -62,6 +63,7 @@ class ConstantTurnRate:
     dt_s: float
     name: str = "constant-turn-rate"
     privileged: bool = False
+    trained_on: TrainedOn | None = None
 
     @property
     def history(self) -> int:
@@ -69,7 +71,7 @@ class ConstantTurnRate:
         return max(1, round(TURN_OVER_S / self.dt_s))
 
     @classmethod
-    def from_name(cls, argument: str, *, horizon: int, dt_s: float) -> Self:
+    def from_name(cls, argument: str, *, horizon: int, dt_s: float) -> "ConstantTurnRate":
         """The predictor for any horizon and time step; it takes no argument.
 
         Raises:
@@ -89,11 +91,13 @@ class ConstantTurnRate:
         valid = seen_for(scene, self.history)
         at = (scene.targets[:, 0], scene.targets[:, 1])
         headings = scene.states[at][:, -self.history - 1 :, 2]
+        headings = np.where(valid[:, None], headings, 0)
         turned = wrap_angle(np.diff(headings, axis=-1)).mean(axis=-1)
         now = np.where(valid[:, None], scene.target_states, 0).astype(np.float32)
         lengths = np.where(valid, scene.sizes[at][:, 0], 1).astype(np.float32)
-        after = now + np.stack([turned], axis=-1) * np.array([0, 0, 1, 0], dtype=np.float32)
-        action = clip_actions(inverse(now, after.astype(np.float32), lengths, self.dt_s))
+        after = now.copy()
+        after[:, 2] += turned
+        action = clip_actions(inverse(now, after, lengths, self.dt_s))
         actions = np.repeat(action[:, None], self.horizon, axis=1)
         states = rollout(now, actions, lengths, self.dt_s, reverse=True)
         return _one_mode(scene, states, actions, valid)
@@ -110,10 +114,11 @@ class Oracle:
     dt_s: float
     name: str = "oracle"
     privileged: bool = True
+    trained_on: TrainedOn | None = None
     history: int = 0
 
     @classmethod
-    def from_name(cls, argument: str, *, horizon: int, dt_s: float) -> Self:
+    def from_name(cls, argument: str, *, horizon: int, dt_s: float) -> "Oracle":
         """The predictor for any horizon and time step; it takes no argument.
 
         Raises:

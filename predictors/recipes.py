@@ -5,9 +5,9 @@ from dataclasses import dataclass
 from typing import Literal
 
 from asp_env.data.clock import DEFAULT_DT_S
+from asp_env.data.parts import Split
 from asp_env.errors import AspEnvError, unknown_name
 from predictors.ffw_asp import FFWASPConfig
-from predictors.parts import Split
 
 NetworkConfig = FFWASPConfig
 

@@ -1,6 +1,6 @@
 """The socket for predictors, and how one is named: `name` or `name:RUN_DIR`."""
 
-from typing import Protocol
+from typing import Protocol, runtime_checkable
 
 from asp_env import registry
 from asp_env.data.forecast import Forecast
@@ -9,25 +9,46 @@ from asp_env.data.scene import Scene
 from asp_env.data.snippets import Future
 
 
+@runtime_checkable
 class Predictor(Protocol):
     """Anything that forecasts the targets of a scene."""
 
-    name: str
-    privileged: bool
-    """Whether it is handed the recorded future; tables name such a predictor as an oracle."""
-    dt_s: float
-    history: int
-    """Past ticks that it needs to see of a target."""
-    horizon: int
-    """Ticks that it forecasts."""
-    trained_on: TrainedOn | None
-    """What it learned from; None for one that learns nothing."""
+    @property
+    def name(self) -> str:
+        """What tables call it."""
+        ...
+
+    @property
+    def privileged(self) -> bool:
+        """Whether it is handed the recorded future; tables name such a predictor as an oracle."""
+        ...
+
+    @property
+    def dt_s(self) -> float:
+        """The time step of the scenes that it takes and of its forecasts."""
+        ...
+
+    @property
+    def history(self) -> int:
+        """Past ticks that it needs to see of a target."""
+        ...
+
+    @property
+    def horizon(self) -> int:
+        """Ticks that it forecasts."""
+        ...
+
+    @property
+    def trained_on(self) -> TrainedOn | None:
+        """What it learned from; None for one that learns nothing."""
+        ...
 
     def predict(self, scene: Scene, future: Future | None = None) -> Forecast:
         """Forecasts the scene's targets; only privileged predictors get a future."""
         ...
 
 
+@runtime_checkable
 class PredictorPlug(Protocol):
     """What the registry holds under a predictor's name."""
 
