@@ -3,6 +3,7 @@
 import math
 from collections import OrderedDict
 from dataclasses import dataclass
+from typing import no_type_check
 
 import cv2
 import numpy as np
@@ -39,6 +40,7 @@ class DrivableField:
 
 
 @njit(cache=True)
+@no_type_check
 def _look_up(grid, x_0, y_0, points, out):
     for i in range(len(points)):
         column = math.floor((points[i, 0] - x_0) / CELL_M + 0.5)
