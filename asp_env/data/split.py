@@ -105,25 +105,23 @@ def split_blocks(
 def _deal(counts: Int[np.ndarray, " members"], rng: np.random.Generator) -> list[Part]:
     if len(counts) < 3:
         return ["train"] * len(counts)
-    best: tuple[float, list[Part]] = (np.inf, [])
-    for _ in range(_TRIES):
-        order = rng.permutation(len(counts))
-        shares = counts[order] / counts.sum()
-        num_test = _nearest(shares[:-2])
-        num_validation = _nearest(shares[num_test:-1])
-        held_out = num_test + num_validation
-        miss = abs(shares[:num_test].sum() - SHARE) + abs(shares[num_test:held_out].sum() - SHARE)
-        if miss < best[0] - 1e-12:
-            parts: list[Part] = ["train"] * len(counts)
-            for place, member in enumerate(order[:held_out]):
-                parts[member] = "test" if place < num_test else "validation"
-            best = (float(miss), parts)
-    return best[1]
-
-
-def _nearest(shares: Shaped[np.ndarray, " candidates"]) -> int:
-    """How many of the first candidates, at least one, come nearest to the share."""
-    return int(np.abs(np.cumsum(shares) - SHARE).argmin()) + 1
+    orders = rng.permuted(np.tile(np.arange(len(counts)), (_TRIES, 1)), axis=1)
+    total = np.cumsum(counts[orders], axis=1) / counts.sum()
+    tries, place = np.arange(_TRIES), np.arange(len(counts))
+    last_test = np.abs(total[:, :-2] - SHARE).argmin(axis=1)
+    test_share = total[tries, last_test]
+    validation_share = total - test_share[:, None]
+    may_end = (place > last_test[:, None]) & (place < len(counts) - 1)
+    off = np.where(may_end, np.abs(validation_share - SHARE), np.inf)
+    last_validation = off.argmin(axis=1)
+    miss = np.abs(test_share - SHARE) + off[tries, last_validation]
+    best = int(miss.round(9).argmin())
+    parts: list[Part] = ["train"] * len(counts)
+    for member in orders[best, : last_validation[best] + 1]:
+        parts[member] = "validation"
+    for member in orders[best, : last_test[best] + 1]:
+        parts[member] = "test"
+    return parts
 
 
 def _block_parts(seed: int) -> Shaped[np.ndarray, " blocks"]:

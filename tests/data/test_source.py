@@ -1,0 +1,293 @@
+"""DATA: what it may be, and recordings that are opened late and once."""
+
+import os
+import struct
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from asp_env import registry
+from asp_env.data.readers import opening
+from asp_env.data.recording import Recording
+from asp_env.data.source import Recordings, load, open_data
+from asp_env.errors import AspEnvError, DataError
+from tests.data.levelx_files import write_folder, write_map, write_recording
+
+
+@pytest.fixture
+def kept(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """A cache folder of the test's own."""
+    monkeypatch.setenv("ASP_ENV_CACHE", str(tmp_path / "cache"))
+    return tmp_path / "cache"
+
+
+@pytest.fixture
+def folder(tmp_path: Path, kept: Path) -> Path:
+    """A folder of three recordings at one place, and a cache of its own."""
+    assert not kept.exists()
+    return write_folder(tmp_path / "folder", recordings=3)
+
+
+@pytest.fixture
+def reads(monkeypatch: pytest.MonkeyPatch) -> list[str]:
+    """The files that were read rather than found in the cache, in order."""
+    seen: list[str] = []
+    read_tracks, read_lanelet2 = opening.read_tracks, opening.read_lanelet2
+
+    def tracks(files):
+        seen.append(files.tracks.name)
+        return read_tracks(files)
+
+    def lanelets(path, origin):
+        seen.append(path.name)
+        return read_lanelet2(path, origin)
+
+    monkeypatch.setattr(opening, "read_tracks", tracks)
+    monkeypatch.setattr(opening, "read_lanelet2", lanelets)
+    return seen
+
+
+def equal(recording: Recording, other: Recording) -> bool:
+    """Whether two recordings hold the same, bit for bit."""
+    return all(
+        np.array_equal(getattr(recording, name), getattr(other, name))
+        for name in ("track_ids", "classes", "sizes", "first_frames", "starts", "states")
+    ) and all(
+        np.array_equal(
+            getattr(recording.road_map, name).points, getattr(other.road_map, name).points
+        )
+        for name in ("lines", "drivable", "lanes")
+    )
+
+
+def test_opened_late_and_once(folder: Path, reads: list[str]) -> None:
+    """Listing reads nothing; a recording is read when asked for, its map with it, both once."""
+    recordings = open_data(folder)
+    assert (len(recordings), recordings.names) == (3, ("00", "01", "02"))
+    assert recordings.source == str(folder)
+    assert reads == []
+    first = recordings[1]
+    assert first.name == "01"
+    assert reads == ["location1.osm", "01_tracks.csv"]
+    assert recordings[1] is first
+    assert recordings[-2] is first
+    assert recordings[0].road_map is first.road_map
+    assert reads == ["location1.osm", "01_tracks.csv", "00_tracks.csv"]
+    with pytest.raises(IndexError):
+        recordings[3]
+
+
+def test_from_the_cache(folder: Path, kept: Path, reads: list[str]) -> None:
+    """The second time nothing is read, all is equal, mapped and read-only; disk use is smaller."""
+    before = open_data(folder)[0]
+    del reads[:]
+    after = load(folder)[0]
+    assert reads == []
+    assert equal(before, after)
+    assert (after.num_frames, after.frame_rate_hz, after.location) == (250, 25.0, "1")
+    for array in (after.states, after.starts, after.road_map.lanes.points):
+        assert not array.flags.writeable
+    sources = [path for path in folder.rglob("*") if path.is_file() and path.name[:2] not in "0102"]
+    assert sum(path.stat().st_size for path in kept.iterdir()) < sum(
+        path.stat().st_size for path in sources
+    )
+
+
+@pytest.mark.parametrize(
+    ("name", "read_again"),
+    [
+        ("00_tracks.csv", ["00_tracks.csv"]),
+        ("00_tracksMeta.csv", ["00_tracks.csv"]),
+        ("00_recordingMeta.csv", ["00_tracks.csv"]),
+        ("01_tracks.csv", []),
+        ("location1.osm", ["location1.osm"]),
+    ],
+)
+def test_renewed_when_files_change(
+    folder: Path, kept: Path, reads: list[str], name: str, read_again: list[str]
+) -> None:
+    """A file touched since makes what came from it be read anew, in place of the old."""
+    open_data(folder)[0]
+    entries = sorted(kept.iterdir())
+    del reads[:]
+    (path,) = folder.rglob(name)
+    os.utime(path, ns=(1, 1))
+    open_data(folder)[0]
+    assert reads == read_again
+    assert sorted(kept.iterdir()) == entries
+
+
+def test_changed_content_is_seen(folder: Path) -> None:
+    """A position that is changed in the file is what is read next."""
+    before = open_data(folder)[0].states[0, 0]
+    path = folder / "data" / "00_tracks.csv"
+    path.write_text(path.read_text().replace(",5.0,", ",6.5,", 1))
+    assert open_data(folder)[0].states[0, 0] == before + 1.5
+
+
+def test_damaged_cache_is_made_anew(folder: Path, kept: Path, reads: list[str]) -> None:
+    """Truncated entries are read anew without a word."""
+    before = open_data(folder)[0]
+    states = before.states.copy()
+    for path in kept.iterdir():
+        content = path.read_bytes()
+        path.unlink()  # a mapping of the old file stays whole
+        path.write_bytes(content[: len(content) // 2])
+    del reads[:]
+    assert np.array_equal(open_data(folder)[0].states, states)
+    assert reads == ["location1.osm", "00_tracks.csv"]
+
+
+def test_without_a_cache(
+    folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, reads: list[str]
+) -> None:
+    """Where nothing can be kept a warning says so, and recordings are read all the same."""
+    before = open_data(folder)[0]
+    (tmp_path / "file").write_text("")
+    monkeypatch.setenv("ASP_ENV_CACHE", str(tmp_path / "file" / "below"))
+    del reads[:]
+    with pytest.warns(UserWarning, match="nothing is kept for next time: cache folder"):
+        after = open_data(folder)[0]
+    assert reads == ["location1.osm", "00_tracks.csv"]
+    assert equal(before, after)
+    assert not after.states.flags.writeable
+
+
+def test_full_disk(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A cache that cannot be written in the end is no fault of the recording either."""
+
+    def refuse(*_: object) -> None:
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr(opening.cache, "save", refuse)
+    with pytest.warns(UserWarning, match="No space left on device"):
+        assert len(open_data(folder)[0]) == 3
+
+
+def test_one_bad_among_good(folder: Path) -> None:
+    """A recording that cannot be read is so alone; the others open."""
+    (folder / "data" / "01_tracks.csv").write_text("")
+    recordings = open_data(folder)
+    assert [recordings[number].name for number in (0, 2)] == ["00", "02"]
+    with pytest.raises(DataError, match=r"01_tracks\.csv: is empty"):
+        recordings[1]
+
+
+def test_subset(folder: Path, reads: list[str]) -> None:
+    """Some of the recordings, in the order asked for, sharing those that are open."""
+    recordings = open_data(folder)
+    first = recordings[2]
+    some = recordings.subset([2, 0])
+    assert isinstance(some, Recordings)
+    assert some.names == ("02", "00")
+    assert some.source == recordings.source
+    assert some[0] is first
+    assert recordings[:2].names == ("00", "01")
+    assert [each.name for each in recordings] == ["00", "01", "02"]
+    assert reads.count("02_tracks.csv") == 1
+    assert some.hashes() == (recordings.hashes()[2], recordings.hashes()[0])
+
+
+def test_origin_of_each_recording(folder: Path) -> None:
+    """Recordings of one place with other origins see its map from there."""
+    path = folder / "data" / "01_recordingMeta.csv"
+    path.write_text(path.read_text().replace("300000.0", "300010.0"))
+    maps = [recording.road_map for recording in open_data(folder)]
+    assert maps[0] is maps[2]
+    shift = maps[0].lanes.points - maps[1].lanes.points
+    np.testing.assert_allclose(shift, np.broadcast_to((10.0, 0.0), shift.shape), atol=1e-6)
+
+
+def test_background(folder: Path) -> None:
+    """A picture comes with its scale: 120 m of road need 0.06 m of 0.01 m/px in 2,100 pixels."""
+    head = b"\x89PNG\r\n\x1a\n" + struct.pack(">I4sII", 13, b"IHDR", 2_100, 900)
+    (folder / "data" / "00_background.png").write_bytes(head)
+    (folder / "data" / "01_background.png").write_bytes(b"no picture")
+    recordings = open_data(folder)
+    background = recordings[0].background
+    assert background is not None
+    assert background.path.name == "00_background.png"
+    assert background.metres_per_pixel == pytest.approx(0.06)
+    assert recordings[1].background is None
+    assert recordings[1].repairs == ("01_background.png left out: its scale cannot be told",)
+    assert recordings[2].background is None
+
+
+def test_hashes_are_of_content(folder: Path, tmp_path: Path) -> None:
+    """The same files elsewhere hash alike, recordings differ, and every file counts."""
+    recordings = open_data(folder)
+    assert len(set(recordings.hashes())) == 3
+    moved = tmp_path / "elsewhere"
+    write_folder(moved, recordings=3)
+    assert open_data(moved).data_hash() == recordings.data_hash()
+    seen = {recordings.data_hash()}
+    for name in ("02_tracks.csv", "02_tracksMeta.csv", "02_recordingMeta.csv", "location1.osm"):
+        (path,) = moved.rglob(name)
+        path.write_text(path.read_text() + "\n")
+        seen.add(open_data(moved).data_hash())
+    assert len(seen) == 5
+    assert open_data(moved).hashes()[0] != recordings.hashes()[0]
+
+
+def test_hash_is_kept(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The second time no file is read for its hash."""
+    expected = open_data(folder).data_hash()
+
+    def refuse(path: Path) -> str:
+        raise AssertionError(path)
+
+    monkeypatch.setattr(opening.cache, "digest", refuse)
+    assert open_data(folder).data_hash() == expected
+
+
+def test_registered_source(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A scheme that a package registers is called with what follows the colon."""
+    given: list[str] = []
+
+    def source(argument: str) -> Path:
+        given.append(argument)
+        return folder
+
+    monkeypatch.setattr(registry, "names", lambda _: ("made-up",))
+    monkeypatch.setattr(registry, "find", lambda *_: source)
+    recordings = open_data("made-up:place:7")
+    assert given == ["place:7"]
+    assert recordings.source == "made-up:place:7"
+    assert len(recordings) == 3
+
+
+@pytest.mark.parametrize(
+    ("data", "expected"),
+    [
+        ("nowhere", "nowhere does not exist"),
+        ("syntetic:roundabout", "unknown source 'syntetic' (did you mean 'synthetic'?)"),
+        ("sample:square", "unknown sample 'square'"),
+        ("empty", "no recordings found; expected XX_recordingMeta.csv"),
+        ("file", "is a file; expected a folder"),
+        ("taf", "is in the INTERACTION layout"),
+    ],
+)
+def test_bad_data(
+    tmp_path: Path, kept: Path, monkeypatch: pytest.MonkeyPatch, data: str, expected: str
+) -> None:
+    """What is no DATA is refused with one line that says what would be."""
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "empty").mkdir()
+    (tmp_path / "file").write_text("")
+    (tmp_path / "taf" / "tracks").mkdir(parents=True)
+    (tmp_path / "taf" / "tracks" / "vehicle_tracks_000.csv").write_text("")
+    with pytest.raises(AspEnvError) as caught:
+        open_data(data)
+    assert expected in str(caught.value)
+    assert "\n" not in str(caught.value)
+    assert not kept.exists()
+
+
+def test_colon_in_a_folder(tmp_path: Path, kept: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A folder that exists is that folder, even if its name looks like a scheme."""
+    monkeypatch.chdir(tmp_path)
+    write_recording(tmp_path / "run:1")
+    write_map(tmp_path / "run:1")
+    assert open_data("run:1")[0].name == "00"
+    assert kept.exists()
