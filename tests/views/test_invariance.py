@@ -53,6 +53,34 @@ def test_turning_the_world_changes_nothing(
         assert (cv2.erode(one, kernel) <= other).all()
 
 
+@pytest.mark.parametrize("seed", range(10))
+def test_a_smaller_view_is_a_cut_out(seed: int) -> None:
+    """What reaches in from outside is drawn as far as it does: the middle third of a larger view.
+
+    Pixels of 0.5 m and anchors on whole pixels make the coordinates of both views agree exactly.
+    """
+    scene = make_scene(traffic(seed, agents=30), size_m=(6.0, 5.0), maps=(cross_map(),))
+    whole = ChauffeurNet(
+        View(
+            height_px=90,
+            width_px=90,
+            metres_per_pixel=0.5,
+            anchor_row_px=50.0,
+            anchor_column_px=45.0,
+        )
+    )
+    middle = ChauffeurNet(
+        View(
+            height_px=30,
+            width_px=30,
+            metres_per_pixel=0.5,
+            anchor_row_px=20.0,
+            anchor_column_px=15.0,
+        )
+    )
+    np.testing.assert_array_equal(middle.draw(scene), whole.draw(scene)[:, :, 30:60, 30:60])
+
+
 def test_ego_box_is_the_same_at_every_pose() -> None:
     """Bit for bit, although its edges lie on pixel centres: 19 by 7 pixels of 0.25 m."""
     poses = np.random.default_rng(0).uniform(-3, 3, (200, 3)) * [300, 300, 1]
