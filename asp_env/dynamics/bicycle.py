@@ -27,7 +27,7 @@ _MAX_SIN_SLIP = math.sin(math.atan(0.5 * math.tan(MAX_STEERING_RAD)))
 
 
 def wrap_angle(angle_rad: Any) -> Any:
-    """The same angle in [-π, π)."""
+    """The same angle in [-π, π); π itself only where rounding says so."""
     return (angle_rad + math.pi) % (2 * math.pi) - math.pi
 
 

@@ -1,0 +1,1 @@
+"""Nouns, clock, readers and files."""

@@ -1,0 +1,1 @@
+"""Errors of forecasts and scores of drives."""
