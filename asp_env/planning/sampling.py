@@ -26,11 +26,11 @@ class Weights:
 
     collision: float = 100.0
     """Times the probability to touch anybody, more for an early touch."""
-    closeness: float = 4.0
+    closeness: float = 10.0
     """Times the probability to come within the safety margin."""
     progress: float = 1.0
     """Times the metres not gained."""
-    comfort: float = 0.25
+    comfort: float = 0.5
     """Times the mean square of acceleration and lateral acceleration, (m/s²)²."""
     change: float = 0.15
     """Times the square of the step in acceleration from the last tick, (m/s²)²."""
@@ -40,7 +40,7 @@ class Weights:
     """Times the mean distance from the route, m."""
 
 
-FIRST_MPS2 = (-5.0, -3.0, -1.5, 0.0, 1.0, 2.0)
+FIRST_MPS2 = (-5.0, -2.5, -1.0, 0.0, 0.7, 1.4)
 THEN_MPS2 = (-5.0, -2.5, -1.0, 0.0, 1.5)
 OFFSETS_M = (0.0, -0.8, 0.8)
 SWITCH_S = 1.0
@@ -193,7 +193,7 @@ def _first_touch(plan, size, other, other_size, margin):
             other[t, 0], other[t, 1], other[t, 2], other_size[0], other_size[1],
         ):  # fmt: skip
             ahead = (other[t, 0] - x) * math.cos(heading) + (other[t, 1] - y) * math.sin(heading)
-            if ahead < -0.25 * size[0]:
+            if ahead < -0.5 * size[0]:
                 return -1
             return t
     return -1
