@@ -1,0 +1,128 @@
+"""Who may import whom, and what importing costs."""
+
+import ast
+import json
+import subprocess
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).parents[1]
+PACKAGES = ("asp_env", "predictors", "scenarios")
+
+ON_ALL = {"errors", "registry"}
+ARROWS = {
+    "__init__": {"envs", "data", "errors"},
+    "errors": set[str](),
+    "registry": {"errors"},
+    "cli": ON_ALL,
+    "dynamics": {"errors"},
+    "data": {"dynamics"} | ON_ALL,
+    "metrics": {"data", "dynamics"} | ON_ALL,
+    "views": {"data", "dynamics"} | ON_ALL,
+    "render": {"data"} | ON_ALL,
+    "sim": {"views", "metrics", "data", "dynamics"} | ON_ALL,
+    "envs": {"sim", "views", "metrics", "render", "data", "dynamics"} | ON_ALL,
+    "planning": {"sim", "metrics", "data", "dynamics"} | ON_ALL,
+    "evaluation": {
+        *("sim", "planning", "envs", "render", "views", "metrics", "data", "dynamics"),
+        *ON_ALL,
+    },
+    "predictors": {"views", "metrics", "data", "dynamics"} | ON_ALL,
+    "scenarios": {"data", "dynamics"} | ON_ALL,
+}
+"""For every part, the parts of `asp_env` that it may import besides itself."""
+
+LEARNING = {"torch", "lightning", "safetensors", "stable_baselines3", "tensorboard"}
+
+
+def files(*folders: str) -> list[Path]:
+    """All Python files below some folders of the project."""
+    return sorted(path for folder in folders for path in (ROOT / folder).rglob("*.py"))
+
+
+def imported(tree: ast.AST) -> Iterator[str]:
+    """The full names of the modules that some code imports, and of what it takes from them."""
+    for node in ast.walk(tree):
+        if isinstance(node, ast.Import):
+            yield from (alias.name for alias in node.names)
+        elif isinstance(node, ast.ImportFrom):
+            assert node.level == 0, "imports are absolute"
+            yield from (f"{node.module}.{alias.name}" for alias in node.names)
+
+
+def part_of(module: str) -> str:
+    """`asp_env.data.scene` is of `data`, `predictors.physical` of `predictors`."""
+    top, *inner = module.split(".")
+    return inner[0] if top == "asp_env" and inner else top
+
+
+@pytest.mark.parametrize("path", files(*PACKAGES), ids=lambda path: str(path.relative_to(ROOT)))
+def test_arrows(path: Path) -> None:
+    """A file imports only its own part and the parts below it."""
+    own = part_of(".".join(path.relative_to(ROOT).with_suffix("").parts))
+    allowed = ARROWS[own] | {own}
+    modules = [name for name in imported(ast.parse(path.read_text())) if name.startswith(PACKAGES)]
+    known = {part_of(name) for name in modules}
+    assert known <= allowed, f"{own} imports {sorted(known - allowed)}"
+
+
+@pytest.mark.parametrize("part", sorted(set(ARROWS)))
+def test_every_part_named_here_exists(part: str) -> None:
+    """A part that was renamed would otherwise be checked no more."""
+    places = (part, f"asp_env/{part}", f"asp_env/{part}.py")
+    assert any((ROOT / place).exists() for place in places)
+
+
+def test_every_part_is_named_here() -> None:
+    """A new part must say what it may import."""
+    inside = {part_of(".".join(path.relative_to(ROOT).parts)) for path in files("asp_env")}
+    assert {name.removesuffix(".py") for name in inside} <= set(ARROWS)
+
+
+def test_no_learning_at_the_top_of_a_module() -> None:
+    """Packages of the extras for learning are imported inside functions, if at all."""
+    for path in files("asp_env"):
+        body = [node for node in ast.parse(path.read_text()).body if not _defines(node)]
+        taken = {name.partition(".")[0] for node in body for name in imported(node)}
+        assert not taken & LEARNING, path
+
+
+def _defines(node: ast.stmt) -> bool:
+    return isinstance(node, ast.FunctionDef | ast.AsyncFunctionDef | ast.ClassDef)
+
+
+def loaded_by(code: str) -> set[str]:
+    """The top-level modules that a fresh interpreter has loaded after running some code."""
+    report = "import json, sys; print(json.dumps([name.partition('.')[0] for name in sys.modules]))"
+    done = subprocess.run(
+        [sys.executable, "-c", f"{code}\n{report}"],
+        capture_output=True, text=True, check=True, cwd=ROOT,
+    )  # fmt: skip
+    return set(json.loads(done.stdout.splitlines()[-1]))
+
+
+def test_importing_is_cheap() -> None:
+    """`import asp_env` loads none of the extras, and no plug."""
+    extras = {"plotly", "sumo", "traci", "sumolib", "predictors", "scenarios", "selenium"}
+    assert not loaded_by("import asp_env") & (LEARNING | extras)
+
+
+def test_no_module_loads_torch() -> None:
+    """Not even all modules of `asp_env` together load torch."""
+    code = """
+import importlib, pkgutil, asp_env
+for found in pkgutil.walk_packages(asp_env.__path__, "asp_env."):
+    if "plots" not in found.name:
+        importlib.import_module(found.name)
+"""
+    assert not loaded_by(code) & LEARNING
+
+
+@pytest.mark.parametrize("folder", [*PACKAGES, "tests", "examples"])
+def test_files_are_short(folder: str) -> None:
+    """No file has more than 350 lines."""
+    lengths = {path: len(path.read_text().splitlines()) for path in files(folder)}
+    assert not {str(path): count for path, count in lengths.items() if count > 350}
