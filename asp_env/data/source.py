@@ -125,7 +125,7 @@ def load(path: str | Path) -> Recordings:
 def _resolve(source: str) -> Path:
     match = _SCHEME.match(source)
     if match is None or Path(source).exists():
-        return Path(source).expanduser()
+        return Path(source).expanduser().absolute()
     scheme, argument = match.groups()
     if scheme == "sample":
         return _sample(argument)

@@ -258,7 +258,13 @@ def test_construction_map(tmp_path: Path, number: int, folder: str) -> None:
 
 @pytest.mark.parametrize(
     ("folder", "expected_m"),
-    [("inD-dataset-v1.0", 0.12), ("rounD", 0.10), ("exiD", 0.06), ("industry", 0.02)],
+    [
+        ("inD-dataset-v1.0", 0.12),
+        ("rounD", 0.10),
+        ("exiD", 0.06),
+        ("uniD", 0.02),
+        ("industry", 0.02),
+    ],
 )
 def test_background_scale(tmp_path: Path, folder: str, expected_m: float) -> None:
     """The data set's factor by its folder's name, else the smallest with which tracks fit."""
@@ -275,6 +281,15 @@ def test_background_that_cannot_fit(tmp_path: Path) -> None:
     ((files, meta),) = described(tmp_path)
     xy = np.array([[0.0, -2.0], [400.0, -8.0]])
     assert metres_per_pixel(files, meta, (1000, 500), xy) is None
+
+
+def test_background_of_a_folder_that_is_called_like_a_data_set(tmp_path: Path) -> None:
+    """A name whose factor cannot be is overruled: 110 m in 1,000 pixels need 12, not 10."""
+    write_recording(tmp_path / "round-1")
+    ((files, meta),) = described(tmp_path)
+    xy = np.array([[0.0, -2.0], [110.0, -8.0]])
+    scale = metres_per_pixel(files, meta, (1000, 500), xy)
+    assert scale == pytest.approx(0.12)
 
 
 def test_background_is_found(tmp_path: Path) -> None:

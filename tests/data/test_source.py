@@ -291,3 +291,11 @@ def test_colon_in_a_folder(tmp_path: Path, kept: Path, monkeypatch: pytest.Monke
     write_map(tmp_path / "run:1")
     assert open_data("run:1")[0].name == "00"
     assert kept.exists()
+
+
+def test_from_inside_the_data_folder(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Standing in `data`, `.` finds the recordings there and the maps beside it."""
+    monkeypatch.chdir(folder / "data")
+    recordings = open_data(".")
+    assert recordings.source == "."
+    assert len(recordings[0].road_map.lanes) == 2

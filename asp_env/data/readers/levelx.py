@@ -28,6 +28,8 @@ DOWNSCALE = {"ind": 12, "round": 10, "exid": 6, "unid": 2}
 """By how much the published background images are smaller than `orthoPxToMeter` says."""
 
 SCALES = (1, 2, 6, 10, 12)
+MARGIN_PX = 5.0
+"""So far outside its image a position may lie by the rounding of scales and smoothing."""
 
 _PART = re.compile(r"^(.+)_(recordingMeta\.csv|tracksMeta\.csv|tracks\.csv(?:\.gz)?)$")
 
@@ -171,7 +173,8 @@ def metres_per_pixel(
 
     `orthoPxToMeter` is that of the original image; the published one is smaller by a factor that
     no file tells. It is the dataset's where a folder carries its name (inD 12, rounD 10, exiD 6,
-    uniD 2), else the smallest of 1, 2, 6, 10, 12 with which 99 % of the positions lie in the image.
+    uniD 2), else the smallest of 1, 2, 6, 10, 12; in either case all positions must lie in the
+    image, as they do where they were seen in it.
 
     Args:
         files: the recording's files.
@@ -185,19 +188,20 @@ def metres_per_pixel(
     if meta.metres_per_ortho_pixel is None:
         return None
     folders = [part.lower() for part in files.recording_meta.resolve().parts[:-1]]
-    for name, factor in DOWNSCALE.items():
-        if any(re.match(rf"{name}(?![a-z])", folder) for folder in folders):
-            return factor * meta.metres_per_ortho_pixel
-    if not len(xy):
-        return None
-    low_x, high_x = np.quantile(xy[:, 0], (0.01, 0.99))
-    low_y, high_y = np.quantile(xy[:, 1], (0.01, 0.99))
-    for factor in SCALES:
+    named = [
+        factor
+        for name, factor in DOWNSCALE.items()
+        if any(re.match(rf"{name}(?![a-z])", folder) for folder in folders)
+    ]
+    low, high = xy.min(axis=0), xy.max(axis=0)
+    for factor in (*named, *SCALES):
         scale = factor * meta.metres_per_ortho_pixel
+        margin = MARGIN_PX * scale
+        right, bottom = size_px[0] * scale, size_px[1] * scale
         if (
-            min(low_x, -high_y) > -10
-            and high_x < size_px[0] * scale
-            and -low_y < size_px[1] * scale
+            min(low[0], -high[1]) > -margin
+            and high[0] - right < margin
+            and -low[1] - bottom < margin
         ):
             return scale
     return None
