@@ -11,6 +11,10 @@ BOUNDARIES = (LineType.CURB, LineType.SOLID)
 """What a vehicle is not to cross. Dashed and virtual lines are no boundary."""
 
 
+TOLERANCE_M = 0.05
+"""Points that lie this near to a straight piece are left out: a quarter of a pixel of 0.2 m."""
+
+
 def boundary_pieces(road_map: RoadMap) -> Float[np.ndarray, "pieces 5"]:
     """The straight pieces of all curbs and solid lines.
 
@@ -20,13 +24,35 @@ def boundary_pieces(road_map: RoadMap) -> Float[np.ndarray, "pieces 5"]:
     pieces = [np.zeros((0, 4))]
     for line, kind in enumerate(road_map.line_types):
         if kind in BOUNDARIES:
-            points = road_map.lines[line]
+            points = _thinned(road_map.lines[line])
             pieces.append(np.concatenate([points[:-1], points[1:]], axis=1))
     ends = np.concatenate(pieces)
     middle, along = 0.5 * (ends[:, :2] + ends[:, 2:]), ends[:, 2:] - ends[:, :2]
     length = np.hypot(along[:, 0], along[:, 1])[:, None]
     keep = length[:, 0] > 0
     return np.concatenate([middle, along / np.maximum(length, 1e-9), 0.5 * length], axis=1)[keep]
+
+
+def _thinned(points: Float[np.ndarray, "n 2"]) -> Float[np.ndarray, "m 2"]:
+    """The line without the points that it hardly needs (Douglas and Peucker)."""
+    if len(points) < 3:
+        return points
+    keep = {0, len(points) - 1}
+    spans = [(0, len(points) - 1)]
+    while spans:
+        first, last = spans.pop()
+        if last - first < 2:
+            continue
+        start, along = points[first], points[last] - points[first]
+        offsets = points[first + 1 : last] - start
+        share = np.clip(offsets @ along / max(float(along @ along), 1e-12), 0, 1)
+        distances = np.hypot(*(offsets - share[:, None] * along).T)
+        farthest = int(distances.argmax())
+        if distances[farthest] > TOLERANCE_M:
+            middle = first + 1 + farthest
+            keep.add(middle)
+            spans += [(first, middle), (middle, last)]
+    return points[sorted(keep)]
 
 
 class BoundaryCache:
