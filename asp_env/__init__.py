@@ -6,8 +6,9 @@ Importing this package registers the Gymnasium environment `asp_env/Replay-v0`.
 import gymnasium
 
 from asp_env.data.source import load
+from asp_env.envs.flat import FlatParts
 from asp_env.errors import AspEnvError
 
-__all__ = ["AspEnvError", "load"]
+__all__ = ["AspEnvError", "FlatParts", "load"]
 
 gymnasium.register(id="asp_env/Replay-v0", entry_point="asp_env.envs.replay:ReplayEnv")

@@ -23,7 +23,7 @@ class RewardWeights:
     collision: float = 1.0
     """-1 when the ego touches anybody in a way that it answers for."""
     off_road: float = 1.0
-    """-1 when a corner of the ego is over 0.3 m outside the drivable area."""
+    """-1 for every second in which a corner of the ego is over 0.3 m outside the drivable area."""
 
 
 def reward_terms(
@@ -44,7 +44,7 @@ def reward_terms(
         "progress": gained / goal,
         "comfort": -strain.astype(np.float64),
         "collision": -after.at_fault.astype(np.float64),
-        "off_road": -(after.off_road_m > OFF_ROAD_M).astype(np.float64),
+        "off_road": -dt_s * (after.off_road_m > OFF_ROAD_M),
     }
 
 
