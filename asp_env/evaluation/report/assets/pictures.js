@@ -36,7 +36,8 @@ function pictureCaption(row, predictor) {
   }
   const bold = document.createElement("b");
   bold.textContent = `${fde.toFixed(2)} m`;
-  text.append("FDE ", bold, ` · nearest mode ${best.toFixed(2)} m`);
+  text.append("FDE ", bold);
+  if (best < fde) text.append(` · nearest mode ${best.toFixed(2)} m`);
   return text;
 }
 
@@ -44,7 +45,7 @@ function showPictures() {
   const grid = document.getElementById("picture-grid");
   if (!grid) return;
   const predictors = Object.keys(DATA.pictures[0].forecasts);
-  const columns = Math.max(2, predictors.length);
+  const columns = Math.min(4, Math.max(2, predictors.length));
   grid.style.gridTemplateColumns = `repeat(${columns}, minmax(0, 1fr))`;
   const dialog = document.getElementById("picture-dialog");
   const large = dialog.querySelector("canvas");

@@ -29,6 +29,7 @@ class Replay {
     const drivers = [...new Set(DATA.drives.map((drive) => drive.driver))];
     document.getElementById("replay-driver-label").hidden = drivers.length < 2;
     this.driver.replaceChildren(...drivers.map((name) => new Option(name)));
+    this.driver.value = drivers.find((name) => name !== "expert") ?? drivers[0];
     this.fillDrives();
   }
 
@@ -125,6 +126,7 @@ class Replay {
   trail(ctx, poses, first, stroke, pose) {
     const last = Math.floor(this.tick), ticks = Math.round(TRAIL_S / this.log.dt);
     let [x, y] = pose;
+    ctx.lineCap = "butt";
     for (let tick = last; tick >= Math.max(first, last - ticks); tick--) {
       const at = poses[tick - first];
       if (!at) break;
@@ -132,6 +134,7 @@ class Replay {
       drawPath(ctx, [x, y, at[0] / 100, at[1] / 100], stroke, 2.2, Math.max(fade, 0), this.scale);
       [x, y] = [at[0] / 100, at[1] / 100];
     }
+    ctx.lineCap = "round";
   }
 
   centre(ego) {
