@@ -11,7 +11,7 @@ target of a scene, which is the *ego* of its picture, in its frame now: heading 
 | `ego_box` | the ego's box now |
 | `ego_trail` | the way of the ego's centre over the last 15 ticks, 0.4 m wide |
 | `agents_0` … `agents_8` | the boxes of all other agents at the states 0, 2, 4, 6, 8, 9, 11, 13 \
-and 15 of those 15 ticks: oldest first, the last is now |
+and 15 of the last 16: oldest first, 15 is now |
 
 The ego is not among the agents: it has channels of its own. Agents of every class are drawn with
 their footprint. What is not valid is not drawn; a target that is not valid now has an empty
