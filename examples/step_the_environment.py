@@ -1,0 +1,28 @@
+"""Drive with random actions on the shipped sample and tell how it went."""
+
+import gymnasium as gym
+
+import asp_env
+
+
+def main(episodes: int = 3) -> list[str]:
+    """Returns how each episode ended."""
+    env = gym.make("asp_env/Replay-v0", observations=("actions", "state"))
+    env = asp_env.FlatParts(env)
+    env.action_space.seed(0)
+    endings = []
+    for episode in range(episodes):
+        _, info = env.reset(seed=episode)
+        reward_sum, done = 0.0, False
+        while not done:
+            _, reward, terminated, truncated, info = env.step(env.action_space.sample())
+            reward_sum += float(reward)
+            done = terminated or truncated
+        endings.append(f"{info['scenario']}: {info['ending']}, reward {reward_sum:.2f}")
+    return endings
+
+
+if __name__ == "__main__":
+    import sys
+
+    sys.stdout.write("\n".join(main()) + "\n")
