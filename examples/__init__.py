@@ -1,0 +1,1 @@
+"""Short programs to start from; each runs on what is shipped."""
