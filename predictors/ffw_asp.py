@@ -7,8 +7,8 @@ model turns actions into states, on which the loss is taken.
 Read into the paper: z passes a LayerNorm before the decoder; actions are tanh times the symmetric
 99.9th percentile of the training data's actions, within the limits of actions. Changed, as options
 that the `paper` recipe leaves off: `skip` leads z, the present speed and the past actions around
-the recurrent layers to the output; `hidden` puts a hidden layer there; `around_last` makes actions
-deviations from the mean of the last three.
+the recurrent layers to the output, without which accuracy is lost; `hidden` puts a hidden layer
+there.
 
 Dimensions: n targets, m modes, t ticks ahead, z features.
 """
@@ -36,7 +36,6 @@ from predictors.modes import (
 )
 
 SPEED_SCALE_MPS = 10.0
-AROUND_LAST = 3
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -52,8 +51,6 @@ class FFWASPConfig:
     """Whether z, the present speed and the past actions also reach the output directly."""
     hidden: int = 0
     """Width of a hidden layer before the output; 0 for none, as in the paper."""
-    around_last: bool = False
-    """Whether actions are deviations from the mean of the last three known ones."""
     modes: int = 3
     integrator: Integrator = "euler"
     assignment: Assignment = "angle"
@@ -117,11 +114,7 @@ class FFWASPNetwork(AbstractNetwork):
         out = self.head(torch.cat(features, dim=-1))
         m, t = self.config.modes, self.shape.horizon
         logits, raw = out[:, :m], out[:, m:].unflatten(1, (m, t, 2))
-        actions = raw.tanh() * scale
-        if self.config.around_last:
-            last = batch.actions[:, -AROUND_LAST:].mean(dim=1).clamp(-scale, scale)
-            actions = actions + last[:, None, None]
-        actions = clip_actions(actions)
+        actions = clip_actions(raw.tanh() * scale)
         return Modes(actions, self._drive(actions, batch), logits)
 
     def _drive(self, actions: Float[Tensor, "n m t 2"], batch: Batch) -> Float[Tensor, "n m t 4"]:

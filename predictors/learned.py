@@ -2,7 +2,7 @@
 
 import dataclasses
 from abc import ABC, abstractmethod
-from typing import Any, NamedTuple, Protocol, final
+from typing import Any, NamedTuple, Protocol, final, runtime_checkable
 
 import numpy as np
 import torch
@@ -58,6 +58,7 @@ class AbstractNetwork(nn.Module, ABC):
         """The terms of the loss by name, `loss` their weighted sum."""
 
 
+@runtime_checkable
 class LearnedPlug(Protocol):
     """What the registry holds under a learned predictor's name, for training and loading."""
 

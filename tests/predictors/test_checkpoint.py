@@ -1,0 +1,148 @@
+"""Damaged, foreign and unfitting checkpoints: one line each."""
+
+import json
+import pickle
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import pytest
+import torch
+from safetensors.torch import load_file, save_file
+
+from asp_env.data.predictor import load_predictor
+from asp_env.errors import AspEnvError, CheckpointError
+from predictors.resume import SafetensorsIO
+from tests.predictors.tiny import save_random
+
+
+@pytest.fixture
+def run(tmp_path: Path) -> Path:
+    """A checkpoint with random weights."""
+    return save_random(tmp_path / "run")
+
+
+def change(run: Path, **fields: Any) -> None:
+    """Other values for some fields of its configuration."""
+    path = run / "config.json"
+    path.write_text(json.dumps({**json.loads(path.read_text()), **fields}))
+
+
+def change_network(run: Path, **fields: Any) -> None:
+    """Other values for some fields of its network's configuration."""
+    config = json.loads((run / "config.json").read_text())
+    change(run, network={**config["network"], **fields})
+
+
+def drop(run: Path, field: str) -> None:
+    """A configuration without one of its fields."""
+    path = run / "config.json"
+    config = json.loads(path.read_text())
+    del config[field]
+    path.write_text(json.dumps(config))
+
+
+def truncate(run: Path, name: str, size: int) -> None:
+    """Only the first bytes of a file."""
+    (run / name).write_bytes((run / name).read_bytes()[:size])
+
+
+def poison(run: Path) -> None:
+    """A weight that is no number."""
+    weights = load_file(run / "weights.safetensors")
+    weights["norm.bias"][0] = float("nan")
+    save_file(weights, run / "weights.safetensors")
+
+
+FAULTS: dict[str, tuple[Callable[[Path], Any], str]] = {
+    "no configuration": (lambda run: (run / "config.json").unlink(), "holds no trained predictor"),
+    "no weights": (lambda run: (run / "weights.safetensors").unlink(), "is missing: the run"),
+    "truncated configuration": (lambda run: truncate(run, "config.json", 100), "cannot be read"),
+    "truncated weights": (
+        lambda run: truncate(run, "weights.safetensors", 3000),
+        "cannot be read",
+    ),
+    "empty weights": (lambda run: truncate(run, "weights.safetensors", 0), "cannot be read"),
+    "pickled weights": (
+        lambda run: (run / "weights.safetensors").write_bytes(pickle.dumps({"a": 1})),
+        "cannot be read",
+    ),
+    "foreign JSON": (lambda run: (run / "config.json").write_text("[1, 2]"), "no checkpoint of"),
+    "other format": (lambda run: change(run, format=99), "no checkpoint of format 1"),
+    "other predictor": (lambda run: change(run, predictor="mtp"), "holds the predictor 'mtp'"),
+    "predictor without a name": (lambda run: drop(run, "predictor"), "does not name"),
+    "no view": (lambda run: drop(run, "view"), "does not describe a ffw-asp: 'view'"),
+    "unknown view": (lambda run: change(run, view={"name": "moon"}), "unknown view 'moon'"),
+    "no horizon": (lambda run: drop(run, "horizon"), "does not describe"),
+    "unknown field": (lambda run: change_network(run, colour=1), "colour"),
+    "impossible field": (lambda run: change_network(run, modes=0), "modes is 0"),
+    "field of another type": (lambda run: change_network(run, features="x"), "does not describe"),
+    "other shapes": (lambda run: change_network(run, gru_width=9), "does not fit"),
+    "weights of another network": (
+        lambda run: save_file({"w": torch.zeros(2)}, run / "weights.safetensors"),
+        "does not fit",
+    ),
+    "weights that are not finite": (poison, "not finite"),
+}
+
+
+@pytest.mark.parametrize("fault", FAULTS, ids=list(FAULTS))
+def test_every_fault_is_one_line(fault: str, run: Path) -> None:
+    """Loading says in one line what is wrong with the folder."""
+    damage, message = FAULTS[fault]
+    damage(run)
+    with pytest.raises(CheckpointError, match=message) as caught:
+        load_predictor(f"ffw-asp:{run}", horizon=15, dt_s=0.2)
+    assert "\n" not in str(caught.value)
+
+
+def test_missing_argument_says_how_to_name_a_run() -> None:
+    """`ffw-asp` alone is not enough."""
+    with pytest.raises(CheckpointError, match="ffw-asp:RUN_DIR"):
+        load_predictor("ffw-asp", horizon=15, dt_s=0.2)
+
+
+def test_other_time_step_is_refused(run: Path) -> None:
+    """A predictor of 0.2 s is not loaded for scenes of 0.1 s."""
+    with pytest.raises(AspEnvError, match=r"time step of 0\.2 s, the scenes have 0\.1 s"):
+        load_predictor(f"ffw-asp:{run}", horizon=30, dt_s=0.1)
+
+
+def test_predictor_keeps_the_horizon_it_was_trained_for(run: Path) -> None:
+    """Asked for 30 ticks, a predictor of 15 forecasts 15."""
+    assert load_predictor(f"ffw-asp:{run}", horizon=30, dt_s=0.2).horizon == 15
+
+
+def test_state_of_a_run_survives_the_disk(tmp_path: Path) -> None:
+    """Nested tensors, tuples, integer keys, None and infinities come back as they were."""
+    state = {
+        "epoch": 3,
+        "best": float("inf"),
+        "optimizer": [{"state": {0: {"m": torch.arange(3.0), "step": torch.tensor(7.0)}}}],
+        "betas": (0.9, 0.999),
+        "none": None,
+        "name": "a",
+        "flag": True,
+    }
+    SafetensorsIO().save_checkpoint(state, tmp_path / "state")
+    loaded = SafetensorsIO().load_checkpoint(tmp_path / "state")
+    moments = loaded["optimizer"][0]["state"][0]
+    assert torch.equal(moments["m"], torch.arange(3.0))
+    assert float(moments["step"]) == 7.0
+    assert loaded["betas"] == (0.9, 0.999)
+    rest = ("epoch", "best", "none", "name", "flag")
+    assert [loaded[key] for key in rest] == [state[key] for key in rest]
+
+
+def test_state_refuses_what_would_need_a_pickle(tmp_path: Path) -> None:
+    """An object in the state of a run is an error when it is written, not when it is read."""
+    with pytest.raises(TypeError, match="Path, which is not stored"):
+        SafetensorsIO().save_checkpoint({"where": Path()}, tmp_path / "state")
+
+
+def test_damaged_state_is_one_line(tmp_path: Path) -> None:
+    """A state cut short says to start the run again."""
+    SafetensorsIO().save_checkpoint({"a": torch.zeros(100)}, tmp_path / "state")
+    (tmp_path / "state").write_bytes((tmp_path / "state").read_bytes()[:90])
+    with pytest.raises(CheckpointError, match="start the run again"):
+        SafetensorsIO().load_checkpoint(tmp_path / "state")
