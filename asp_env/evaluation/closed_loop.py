@@ -70,7 +70,7 @@ class Drive:
             write_metrics(folder, result.rows)
             write_manifest(folder, "drive", **result.manifest)
             save_rollouts(folder, result)
-            write_report(folder, title=f"Driving on {self.data}", maps=result.maps)
+            write_report(folder, title=f"Driving on {Path(self.data).name}", maps=result.maps)
         console = Console()
         console.print(driving_table(result.rows))
         console.print(f"wrote {self.out}/report.html")

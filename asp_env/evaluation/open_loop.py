@@ -29,7 +29,7 @@ from asp_env.evaluation.output import Row, output_folder, write_manifest, write_
 from asp_env.evaluation.report import ForecastExamples, write_report
 from asp_env.evaluation.tables import open_loop_tables
 from asp_env.evaluation.unseen import PartChoice, keep_within, ticks_to_judge
-from asp_env.metrics.open_loop import SELECTIONS, moving, open_loop_errors
+from asp_env.metrics.open_loop import SELECTIONS, errors_over_time, moving, open_loop_errors
 
 BATCH = 256
 """Snippets whose scenes are held at once."""
@@ -67,7 +67,9 @@ class Evaluate:
             result = evaluate(self)
             write_metrics(folder, result.rows)
             write_manifest(folder, "evaluate", **result.manifest)
-            write_report(folder, title=f"Open loop on {self.data}", examples=result.examples)
+            write_report(
+                folder, title=f"Open loop on {Path(self.data).name}", examples=result.examples
+            )
         console = Console()
         for table in open_loop_tables(result.rows):
             console.print(table)

@@ -71,6 +71,26 @@ def open_loop_errors(
     return {name: Masked(value=value, valid=known) for name, value in values.items()}
 
 
+def errors_over_time(
+    modes: Float[np.ndarray, "n m t 2"],
+    log_probs: Float[np.ndarray, "n m"],
+    truth: Float[np.ndarray, "n t 2"],
+    valid: Bool[np.ndarray, "n t"],
+    selection: Selection,
+    *,
+    dt_s: float,
+) -> dict[str, Masked]:
+    """Per target, `L2@1s`, `L2@2s` and so on: the chosen mode's distance to the truth then, m."""
+    chosen = select_mode(modes, log_probs, truth, selection)
+    distance = np.linalg.norm(modes[np.arange(len(modes)), chosen] - truth, axis=-1)
+    whole = range(1, int(truth.shape[1] * dt_s + 1e-6) + 1)
+    at = {second: round(second / dt_s) - 1 for second in whole}
+    return {
+        f"L2@{second}s": Masked(value=distance[:, tick], valid=valid[:, tick])
+        for second, tick in at.items()
+    }
+
+
 def moving(
     now: Float[np.ndarray, "n 4"],
     truth: Float[np.ndarray, "n t 2"],
