@@ -174,7 +174,8 @@ def _judge(
             forecast = ask(predictor, scene, future, index.horizon)
             modes = forecast.states[:, :, : index.horizon, :2]
             for selection in SELECTIONS:
-                errors = open_loop_errors(modes, forecast.log_probs, truth, future.valid, selection)
+                said = (modes, forecast.log_probs, truth, future.valid, selection)
+                errors = open_loop_errors(*said) | errors_over_time(*said, dt_s=index.dt_s)
                 for metric, error in errors.items():
                     key = (name, selection, metric)
                     values.setdefault(key, np.zeros(len(index)))[rows] = error.value
