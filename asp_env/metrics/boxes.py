@@ -2,6 +2,7 @@
 
 import math
 from enum import IntEnum
+from typing import no_type_check
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
@@ -31,6 +32,7 @@ lanes; here it always counts, which is stricter."""
 
 
 @njit(cache=True, inline="always")
+@no_type_check
 def _separated(
     dx, dy, cos, sin, half_length, half_width, cos_o, sin_o, half_length_o, half_width_o
 ):
@@ -45,6 +47,7 @@ def _separated(
 
 
 @njit(cache=True)
+@no_type_check
 def overlaps(x, y, heading, length, width, x_o, y_o, heading_o, length_o, width_o):
     """Whether two oriented boxes intersect (separating axis theorem); touching is no overlap."""
     dx, dy = x_o - x, y_o - y
@@ -59,6 +62,7 @@ def overlaps(x, y, heading, length, width, x_o, y_o, heading_o, length_o, width_
 
 
 @njit(cache=True)
+@no_type_check
 def _contact(ego, size, other, other_size):
     x, y, heading, speed = ego[0], ego[1], ego[2], ego[3]
     xo, yo, ho, lo, wo = other[0], other[1], other[2], other_size[0], other_size[1]
@@ -78,6 +82,7 @@ def _contact(ego, size, other, other_size):
 
 
 @njit(cache=True)
+@no_type_check
 def _contacts(states, sizes, valid, out):
     for b in range(states.shape[0]):
         for a in range(1, states.shape[1]):
@@ -98,6 +103,7 @@ def ego_contacts(
 
 
 @njit(cache=True)
+@no_type_check
 def _ttc(states, sizes, valid, touching, out):
     steps = round(TTC_HORIZON_S / TTC_STEP_S)
     for b in range(states.shape[0]):

@@ -12,6 +12,7 @@ from numba import njit
 
 from asp_env.data.geometry import box_corners
 from asp_env.data.road_map import RoadMap
+from asp_env.errors import DataError
 
 CELL_M = 0.1
 MARGIN_M = 5.0
@@ -55,7 +56,11 @@ _fields: OrderedDict[int, tuple[RoadMap, DrivableField]] = OrderedDict()
 
 
 def drivable_field(road_map: RoadMap) -> DrivableField:
-    """The field of a map; the latest maps' fields are kept."""
+    """The field of a map; the latest maps' fields are kept.
+
+    Raises:
+        DataError: the map has no drivable area.
+    """
     key = id(road_map)
     if key not in _fields:
         _fields[key] = (road_map, _draw(road_map))
@@ -67,6 +72,8 @@ def drivable_field(road_map: RoadMap) -> DrivableField:
 
 def _draw(road_map: RoadMap) -> DrivableField:
     points = road_map.drivable.points
+    if not len(points):
+        raise DataError(f"map {road_map.name}: no drivable area; expected one lanelet at least")
     low = points.min(axis=0) - MARGIN_M
     columns, rows = np.ceil((points.max(axis=0) + MARGIN_M - low) / CELL_M).astype(int) + 1
     image = np.full((rows, columns), 255, dtype=np.uint8)

@@ -19,7 +19,7 @@ MIN_GOAL_M = 1.0
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Drives:
-    """What B episodes of up to T ticks looked like from the ego; `lasted` marks the ticks."""
+    """What B episodes of up to T ticks looked like from the ego; `lasted` marks the first few."""
 
     states: Float[np.ndarray, "b t 4"]
     """The ego's."""
@@ -35,7 +35,7 @@ class Drives:
 
 
 def driving_metrics(drives: Drives) -> dict[str, Masked]:
-    """Per episode.
+    """Per episode; missing where it has no tick.
 
     - `no collision`, `no at-fault collision`: 1 or 0 (nuPlan's classes of contact; hits from
       behind by replayed traffic are contacts but nobody's fault here).
@@ -47,13 +47,12 @@ def driving_metrics(drives: Drives) -> dict[str, Masked]:
     - `score`: NC·DAC·(5·EP + 5·TTC + 2·C)/12 (PDMS); where comfort is missing, without it over 10.
     """
     lasted = drives.lasted
-    always = np.ones(len(lasted), dtype=bool)
+    count = lasted.sum(axis=1)
     touches = (drives.contacts > 0) & lasted[..., None]
     guilty = np.isin(drives.contacts, [int(kind) for kind in AT_FAULT]) & lasted[..., None]
     off_road = (drives.off_road_m > OFF_ROAD_M) & lasted
     short = (drives.ttc_s < MIN_TTC_S) & lasted
-    last = lasted.sum(axis=1) - 1
-    reached = drives.route_m[np.arange(len(last)), last]
+    reached = drives.route_m[np.arange(len(count)), count - 1]
     progress = np.clip(reached / np.maximum(drives.goal_m, MIN_GOAL_M), 0, 1)
     away = np.linalg.norm(drives.states[..., :2] - drives.log_states[..., :2], axis=-1)
     comfort = _comfort(drives)
@@ -69,9 +68,11 @@ def driving_metrics(drives: Drives) -> dict[str, Masked]:
         "on road": on_road,
         "progress": progress,
         "TTC": ttc,
-        "log divergence": (away * lasted).sum(axis=1) / lasted.sum(axis=1),
+        "log divergence": np.where(lasted, away, 0).sum(axis=1) / np.maximum(count, 1),
     }
-    metrics = {name: Masked(value=value, valid=always) for name, value in values.items()}
+    metrics = {
+        name: Masked(value=value, valid=np.asarray(count > 0)) for name, value in values.items()
+    }
     return {**metrics, "comfort": comfort}
 
 

@@ -1,6 +1,7 @@
 """Where a point lies along a route whose points are 1 m apart, compiled."""
 
 import math
+from typing import no_type_check
 
 import numpy as np
 from jaxtyping import Bool, Float
@@ -8,6 +9,7 @@ from numba import njit
 
 
 @njit(cache=True)
+@no_type_check
 def project(route, count, x, y, near_m, reach_m):
     """(arc length, lateral offset, heading) of the nearest point of a route.
 
@@ -45,6 +47,7 @@ def project(route, count, x, y, near_m, reach_m):
 
 
 @njit(cache=True)
+@no_type_check
 def _project_all(routes, counts, states, near, out):
     for b in range(len(routes)):
         out[b, 0], out[b, 1], out[b, 2] = project(

@@ -3,6 +3,7 @@
 import itertools
 import math
 from dataclasses import dataclass
+from typing import no_type_check
 
 import numpy as np
 from jaxtyping import Float, Int
@@ -163,11 +164,12 @@ class SamplingPlanner:
 
 
 @njit(cache=True)
+@no_type_check
 def _control(state, arc, lengths, profiles, later, dt_s, routes, counts, limits, actions):
     for b in range(state.shape[0]):
         for c in range(state.shape[1]):
             x, y, heading, speed = state[b, c]
-            along, _, _ = project(routes[b], counts[b], x, y, arc[b, c], 10.0)
+            along, _, _ = project(routes[b], counts[b], x, y, max(arc[b, c], 0.0), 10.0)
             arc[b, c] = along
             wanted = profiles[c, 1] if later else profiles[c, 0]
             at = min(max(int(along + 0.5), 0), counts[b] - 1)
@@ -181,6 +183,7 @@ def _control(state, arc, lengths, profiles, later, dt_s, routes, counts, limits,
 
 
 @njit(cache=True)
+@no_type_check
 def _first_touch(plan, size, other, other_size, margin):
     """The first step at which the boxes overlap, -1 for never; rear-end hits do not count."""
     for t in range(len(plan)):
@@ -200,6 +203,7 @@ def _first_touch(plan, size, other, other_size, margin):
 
 
 @njit(cache=True)
+@no_type_check
 def _weigh(plans, sizes, others, probabilities, other_sizes, starts, touched, close):
     steps = plans.shape[2]
     for b in range(plans.shape[0]):

@@ -6,6 +6,7 @@ vehicle's own box along that path until it would touch another box as it stands 
 
 import math
 from dataclasses import dataclass
+from typing import no_type_check
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
@@ -44,9 +45,12 @@ class IDM:
 
 
 def speed_limits(
-    path: Float[np.ndarray, "p 2"], desired_mps: float, idm: IDM
+    path: Float[np.ndarray, "p 2"], desired_mps: float, idm: IDM, *, stop_m: float = math.inf
 ) -> Float[np.ndarray, " p"]:
-    """Speed wanted at each point of a path (1 m apart): as desired, slower in and before bends."""
+    """Speed wanted at each point of a path (1 m apart): as desired, slower in and before bends.
+
+    From `stop_m` metres on it is 0.
+    """
     if len(path) < 5:
         return np.full(len(path), desired_mps, dtype=np.float32)
     step = path[4:] - path[:-4]
@@ -55,12 +59,14 @@ def speed_limits(
     curvature = np.pad(curvature, 2, mode="edge")
     lateral = np.sqrt(idm.max_lateral_acceleration_mps2 / np.maximum(curvature, 1e-4))
     limit = np.minimum(desired_mps, lateral)
+    limit[np.arange(len(limit)) >= stop_m] = 0.0
     for i in range(len(limit) - 2, -1, -1):
         limit[i] = min(limit[i], math.sqrt(limit[i + 1] ** 2 + 2 * idm.comfortable_braking_mps2))
     return limit.astype(np.float32)
 
 
 @njit(cache=True)
+@no_type_check
 def _gap(states, sizes, valid, me, path, count, arc, reach_m):
     """(free metres ahead, speed along the path of what ends them); infinite if nothing does."""
     first = int(arc) + 1
@@ -85,8 +91,11 @@ def _gap(states, sizes, valid, me, path, count, arc, reach_m):
 
 
 @njit(cache=True)
+@no_type_check
 def idm_acceleration(speed, wanted, gap, leader_speed, law):
     """m/s² of the intelligent driver model, within the limits of actions."""
+    if wanted <= 0.0:
+        return -law[1]
     free = 1.0 - (speed / max(wanted, 0.1)) ** 4
     interaction = 0.0
     if gap < np.inf:
@@ -97,6 +106,7 @@ def idm_acceleration(speed, wanted, gap, leader_speed, law):
 
 
 @njit(cache=True)
+@no_type_check
 def pursuit_steering(x, y, heading, speed, length, path, count, arc, offset_m):
     """Steering, rad, that leads the centre to a point of the path ahead (pure pursuit).
 
@@ -118,6 +128,7 @@ def pursuit_steering(x, y, heading, speed, length, path, count, arc, offset_m):
 
 
 @njit(cache=True)
+@no_type_check
 def _follow(states, sizes, valid, driven, paths, counts, limits, arcs, law, actions):
     for b in range(states.shape[0]):
         for a in range(states.shape[1]):
@@ -126,7 +137,7 @@ def _follow(states, sizes, valid, driven, paths, counts, limits, arcs, law, acti
             x, y = states[b, a, 0], states[b, a, 1]
             heading, speed = states[b, a, 2], states[b, a, 3]
             path, count = paths[b, a], counts[b, a]
-            arc, _, _ = project(path, count, x, y, arcs[b, a], 15.0)
+            arc, _, _ = project(path, count, x, y, max(arcs[b, a], 0.0), 15.0)
             arcs[b, a] = arc
             reach = max(law[5], law[4] * speed)
             gap, leader = _gap(states[b], sizes[b], valid[b], a, path, count, arc, reach)

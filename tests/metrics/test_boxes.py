@@ -1,0 +1,190 @@
+"""Contacts and time to collision with boxes placed by hand; laws on generated boxes."""
+
+import math
+
+import hypothesis.strategies as st
+import numpy as np
+import pytest
+from hypothesis import assume, given
+from hypothesis.strategies import SearchStrategy
+
+from asp_env.data.geometry import box_corners, from_frame
+from asp_env.metrics.boxes import AT_FAULT, Contact, ego_contacts, overlaps, time_to_collision
+
+CAR = (4.0, 2.0)
+State = tuple[float, float, float, float]
+Box = tuple[float, float, float, float, float]
+
+EGO: State = (0.0, 0.0, 0.0, 10.0)
+
+
+def placed(*others: State, ego: State = EGO, at: State = (0.0, 0.0, 0.0, 0.0)) -> np.ndarray:
+    """One situation of the ego and others, with the origin at a pose."""
+    states = np.array([ego, *others])
+    xy = from_frame(states[:, :2], np.array(at))
+    return np.concatenate([xy, states[:, 2:3] + at[2], states[:, 3:]], axis=1)[None]
+
+
+def contacts(
+    *others: State, ego: State = EGO, size: tuple[float, float] = CAR, at: State = (0, 0, 0, 0)
+) -> list[Contact]:
+    """How the ego, a car, meets others of a size."""
+    states = placed(*others, ego=ego, at=at)
+    sizes = np.array([[CAR, *[size] * len(others)]])
+    found = ego_contacts(states, sizes, np.ones(states.shape[:2], dtype=bool))
+    assert found[0, 0] == Contact.NONE  # the ego does not meet itself
+    return [Contact(kind) for kind in found[0, 1:]]
+
+
+def seconds(*others: State, ego: State = EGO, touching: tuple[bool, ...] = ()) -> float:
+    """The time to collision of the ego with other cars."""
+    states = placed(*others, ego=ego)
+    valid = np.ones(states.shape[:2], dtype=bool)
+    met = np.array([[False, *(touching or (False,) * len(others))]])
+    (found,) = time_to_collision(states, np.full((*valid.shape, 2), CAR), valid, met)
+    return float(found)
+
+
+@pytest.mark.parametrize("at", [(0.0, 0.0, 0.0, 0.0), (100.0, -30.0, 2.0, 0.0)])
+@pytest.mark.parametrize(
+    ("x", "y", "size", "expected"),
+    [
+        (3.5, 0.0, CAR, Contact.FRONT),  # its tail 1.5 m ahead of our centre, our front at 2 m
+        (3.5, 1.9, CAR, Contact.FRONT),  # only our front left corner
+        (-3.5, 0.0, CAR, Contact.REAR),
+        (0.0, 1.8, (1.0, 2.0), Contact.SIDE),  # 1 m long beside our doors
+        (0.0, 0.0, (6.0, 1.0), Contact.FRONT),  # front and rear at once: the front decides
+        (3.99, 0.0, CAR, Contact.FRONT),
+        (4.01, 0.0, CAR, Contact.NONE),
+        (0.0, 2.01, CAR, Contact.NONE),
+        (3.99, 2.01, CAR, Contact.NONE),
+    ],
+)
+def test_contact(
+    x: float, y: float, size: tuple[float, float], expected: Contact, at: State
+) -> None:
+    """Our front is at 2 m, our sides at 1 m; turning and moving the scene changes nothing."""
+    assert contacts((x, y, 0.0, 5.0), size=size, at=at) == [expected]
+
+
+def test_touching_is_no_contact() -> None:
+    """Bumper to bumper, to the last bit, is not yet a contact."""
+    assert contacts((4.0, 0.0, 0.0, 5.0)) == [Contact.NONE]
+
+
+@pytest.mark.parametrize(
+    ("ego_mps", "other_mps", "expected"),
+    [
+        (0.05, 5.0, Contact.EGO_STANDS),
+        (0.0, 0.0, Contact.EGO_STANDS),
+        (-0.05, 5.0, Contact.EGO_STANDS),
+        (5.0, 0.05, Contact.OTHER_STANDS),
+        (5.0, -0.05, Contact.OTHER_STANDS),
+        (0.06, 0.06, Contact.FRONT),
+        (-0.06, 5.0, Contact.FRONT),
+    ],
+)
+def test_standing(ego_mps: float, other_mps: float, expected: Contact) -> None:
+    """Up to 0.05 m/s is standing; who stands decides before where it hit."""
+    assert contacts((3.5, 0.0, 0.0, other_mps), ego=(0.0, 0.0, 0.0, ego_mps)) == [expected]
+
+
+def test_fault() -> None:
+    """The ego answers for hitting with its front or side, and for hitting what stands."""
+    assert set(AT_FAULT) == {Contact.OTHER_STANDS, Contact.FRONT, Contact.SIDE}
+
+
+def test_each_agent_by_itself() -> None:
+    """Several others in any order keep their own classes."""
+    others = [(3.5, 0.0, 0.0, 5.0), (50.0, 0.0, 0.0, 5.0), (-3.5, 0.0, 0.0, 5.0)]
+    expected = [Contact.FRONT, Contact.NONE, Contact.REAR]
+    assert contacts(*others) == expected
+    assert contacts(*others[::-1]) == expected[::-1]
+
+
+def test_the_absent_touch_nobody() -> None:
+    """Neither an invalid other nor an invalid ego has a contact or a time to one."""
+    states = np.repeat(placed((3.5, 0.0, 0.0, 5.0)), 2, axis=0)
+    sizes = np.full((2, 2, 2), CAR)
+    valid = np.array([(True, False), (False, True)])
+    assert not ego_contacts(states, sizes, valid).any()
+    assert np.isinf(time_to_collision(states, sizes, valid, np.zeros((2, 2), dtype=bool))).all()
+
+
+@pytest.mark.parametrize(
+    ("other", "expected"),
+    [
+        ((13.95, 0.0, 0.0, 0.0), 1.0),  # 9.95 m between bumpers at 10 m/s: 0.995 s
+        ((13.95, 0.0, math.pi, 10.0), 0.5),  # the same, closing at 20 m/s: 0.4975 s
+        ((13.95, 0.0, 0.0, 5.0), 2.0),  # closing at 5 m/s: 1.99 s
+        ((13.95, 0.0, 0.0, 10.0), math.inf),  # equally fast
+        ((33.95, 0.0, 0.0, 0.0), 3.0),  # 29.95 m: 2.995 s
+        ((34.05, 0.0, 0.0, 0.0), math.inf),  # 30.05 m: beyond 3 s
+        ((13.95, 2.05, 0.0, 0.0), math.inf),  # we pass it by 5 cm
+        ((5.0, 4.95, -math.pi / 2, 5.0), 0.4),  # crosses: its nose 1.95 m from our way, 0.39 s
+        ((-8.0, 0.0, 0.0, 30.0), math.inf),  # behind our rear bumper does not count
+        ((-1.9, 5.95, -math.pi / 2, 10.0), math.inf),  # reaches us in 0.295 s, we are gone in 0.1 s
+    ],
+)
+def test_time_to_collision(other: State, expected: float) -> None:
+    """Worked out by hand, rounded up to the next 0.1 s."""
+    assert seconds(other) == pytest.approx(expected)
+
+
+def test_from_the_side_of_a_slow_ego() -> None:
+    """Its nose is 0.95 m above our side at 10 m/s: 0.095 s; with its centre behind us, never."""
+    slow = (0.0, 0.0, 0.0, 1.0)
+    assert seconds((-1.9, 3.95, -math.pi / 2, 10.0), ego=slow) == pytest.approx(0.1)
+    assert seconds((-2.1, 3.95, -math.pi / 2, 10.0), ego=slow) == math.inf
+
+
+def test_first_of_several() -> None:
+    """The soonest counts, whatever the order."""
+    near, far = (13.95, 0.0, 0.0, 0.0), (23.95, 0.0, 0.0, 0.0)
+    assert seconds(near, far) == seconds(far, near) == pytest.approx(1.0)
+    assert seconds(near, far, touching=(True, False)) == pytest.approx(2.0)
+
+
+@pytest.mark.parametrize(("speed", "expected"), [(0.05, math.inf), (0.06, 0.9)])
+def test_standing_ego(speed: float, expected: float) -> None:
+    """A standing ego has no time to collision, even with one that comes at it.
+
+    8.95 m at 10 + 0.06 m/s take 0.8897 s.
+    """
+    oncoming = (12.95, 0.0, math.pi, 10.0)
+    assert seconds(oncoming, ego=(0.0, 0.0, 0.0, speed)) == pytest.approx(expected)
+
+
+def boxes() -> SearchStrategy[Box]:
+    """x, y, heading, length, width near the origin."""
+    return st.tuples(
+        *[st.floats(-4, 4)] * 2, st.floats(-7, 7), st.floats(0.3, 8), st.floats(0.3, 3)
+    )
+
+
+def gap_m(box: Box, other: Box) -> float:
+    """The widest gap between the corners' shadows on any side's normal; negative for overlap."""
+    corners = [box_corners(np.array(each[:3]), np.array(each[3:])) for each in (box, other)]
+    gaps = []
+    for heading in (box[2], other[2]):
+        for angle in (heading, heading + math.pi / 2):
+            one, two = (each @ [math.cos(angle), math.sin(angle)] for each in corners)
+            gaps.append(max(one.min() - two.max(), two.min() - one.max()))
+    return max(gaps)
+
+
+@given(box=boxes(), other=boxes())
+def test_overlap(box: Box, other: Box) -> None:
+    """Boxes overlap where no line separates their corners; whoever is asked first."""
+    gap = gap_m(box, other)
+    assume(abs(gap) > 1e-9)
+    assert overlaps(*box, *other) == (gap < 0)
+    assert overlaps(*other, *box) == (gap < 0)
+
+
+@given(box=boxes(), share=st.floats(0, 0.999))
+def test_a_box_within_a_box(box: Box, share: float) -> None:
+    """Boxes of the same centre overlap, also if one is a line without depth."""
+    x, y, heading, length, width = box
+    assert overlaps(*box, x, y, heading + share, share * length, share * width)
+    assert overlaps(*box, x, y, heading, 0.0, width)
