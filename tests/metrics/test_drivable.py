@@ -1,0 +1,103 @@
+"""Distances to the drivable area on maps drawn by hand."""
+
+import math
+
+import hypothesis.strategies as st
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis.extra.numpy import arrays
+
+from asp_env.data.road_map import Ragged, RoadMap
+from asp_env.errors import DataError
+from asp_env.metrics.drivable import OFF_ROAD_M, drivable_field, off_road_m
+
+
+def map_of(*rings: list[tuple[float, float]]) -> RoadMap:
+    """A map of nothing but drivable rings."""
+    return RoadMap(
+        name="by hand",
+        lines=Ragged.pack([]),
+        line_types=np.zeros(0, dtype=np.int64),
+        drivable=Ragged.pack([np.array(ring) for ring in rings]),
+        lanes=Ragged.pack([]),
+        successors=np.zeros((0, 2), dtype=np.int64),
+    )
+
+
+SQUARE = map_of([(0, 0), (20, 0), (20, 20), (0, 20)])
+CAR = np.array([4.0, 2.0])
+
+
+def outside_m(x: float, y: float, heading: float = 0.0, road_map: RoadMap = SQUARE) -> float:
+    """How far a car sticks out."""
+    return float(off_road_m(road_map, np.array([[x, y, heading, 5.0]]), CAR[None])[0])
+
+
+@pytest.mark.parametrize(
+    ("x", "y", "heading", "expected"),
+    [
+        (10.0, 10.0, 0.7, 0.0),
+        (17.9, 10.0, 0.0, 0.0),  # its front at 19.9 m
+        (18.5, 10.0, 0.0, 0.5),
+        (18.5, 10.0, math.pi, 0.5),  # its tail instead
+        (10.0, 18.5, math.pi / 2, 0.5),
+        (18.5, 10.0, math.pi / 2, 0.0),  # its side at 19.5 m
+        (19.5, 10.0, -math.pi / 2, 0.5),
+        (10.0, -1.0, 0.0, 2.0),
+        (-1.0, -1.0, 0.0, math.hypot(3, 2)),  # the corner (-3, -2) from the corner (0, 0)
+        (40.0, 10.0, 0.0, 5.0),  # further than the margin of 5 m counts as the margin
+        (1e6, -1e6, 0.0, 5.0),
+    ],
+)
+def test_outermost_corner(x: float, y: float, heading: float, expected: float) -> None:
+    """A car of 4 by 2 m on a square of 20 m, to the cell of 0.1 m."""
+    assert outside_m(x, y, heading) == pytest.approx(expected, abs=0.1)
+
+
+@pytest.mark.parametrize(("over_m", "off"), [(0.0, False), (0.2, False), (0.4, True), (0.6, True)])
+def test_tolerance(over_m: float, off: bool) -> None:
+    """0.2 m over the edge is still on the road, 0.4 m is off it: nuPlan's 0.3 m to the cell."""
+    assert OFF_ROAD_M == 0.3
+    assert (outside_m(18 + over_m, 10.0) > OFF_ROAD_M) == off
+
+
+@given(points=arrays(np.float64, (64, 2), elements=st.floats(-4.9, 24.9)))
+def test_distance_to_a_square(points: np.ndarray) -> None:
+    """Everywhere within 0.1 m of the exact distance, and 0 inside."""
+    exact = np.hypot(*np.maximum(np.maximum(-points, points - 20), 0).T)
+    found = drivable_field(SQUARE).distance_m(points)
+    assert np.abs(found - exact).max() < 0.1
+    within = ((points > 0) & (points < 20)).all(axis=1)
+    assert (found[within] == 0).all()
+
+
+def test_rings_that_overlap() -> None:
+    """The area is the union: where two roads cross nothing is cut out."""
+    cross = map_of(
+        [(-20, -3), (20, -3), (20, 3), (-20, 3)], [(-3, -20), (3, -20), (3, 20), (-3, 20)]
+    )
+    assert outside_m(0.0, 0.0, road_map=cross) == 0
+    assert outside_m(15.0, 0.0, road_map=cross) == 0
+    assert outside_m(5.0, 5.0, road_map=cross) == pytest.approx(3.0, abs=0.1)  # corner (7, 6)
+
+
+def test_any_axes() -> None:
+    """Points of any arrangement keep it."""
+    points = np.array([[(10.0, 10.0), (21.0, 10.0)], [(10.0, 22.0), (10.0, -3.0)]])
+    found = drivable_field(SQUARE).distance_m(points)
+    np.testing.assert_allclose(found, [(0, 1), (2, 3)], atol=0.1)
+
+
+def test_drawn_once() -> None:
+    """The same map is not drawn again; an equal one at another place is its own."""
+    assert drivable_field(SQUARE) is drivable_field(SQUARE)
+    moved = map_of([(100, 0), (120, 0), (120, 20), (100, 20)])
+    assert outside_m(110.0, 10.0, road_map=moved) == 0
+    assert outside_m(10.0, 10.0, road_map=moved) == 5
+
+
+def test_nothing_drivable() -> None:
+    """A map without drivable area is refused in a line that names it."""
+    with pytest.raises(DataError, match="map by hand: no drivable area"):
+        outside_m(0.0, 0.0, road_map=map_of())
