@@ -1,7 +1,7 @@
 """The socket for planners."""
 
 from dataclasses import dataclass
-from typing import Protocol
+from typing import Protocol, runtime_checkable
 
 import numpy as np
 from jaxtyping import Float
@@ -19,6 +19,7 @@ class Plan:
     states: Float[np.ndarray, "b t 4"]
 
 
+@runtime_checkable
 class Planner(Protocol):
     """Decides for the egos (slot 0) of a scene."""
 

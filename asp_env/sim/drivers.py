@@ -1,7 +1,8 @@
 """Who moves the agents that the caller does not: a table agent → driver, merged by mask."""
 
+import math
 from dataclasses import dataclass
-from typing import Protocol
+from typing import Protocol, runtime_checkable
 
 import numpy as np
 from jaxtyping import Bool, Float
@@ -9,6 +10,7 @@ from jaxtyping import Bool, Float
 from asp_env.data.classes import PREDICTED, AgentClass
 from asp_env.data.clock import frames_per_tick
 from asp_env.data.geometry import route_along
+from asp_env.data.scenario import STANDING_MPS
 from asp_env.dynamics import inverse
 from asp_env.errors import unknown_name
 from asp_env.sim.idm import IDM, follow_paths, speed_limits
@@ -17,6 +19,9 @@ from asp_env.sim.world import EGO
 
 MIN_DESIRED_MPS = 3.0
 """Nobody wants to stand: a vehicle that the log shows waiting wants at least this speed."""
+
+HALTED_M = 1.0
+"""A vehicle that is to halt has done so within this distance of the place."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -28,6 +33,7 @@ class Control:
     leaving: Bool[np.ndarray, "b a"]
 
 
+@runtime_checkable
 class Driver(Protocol):
     """Moves some agents of a world. It may keep arrays between ticks, made anew by `reset`."""
 
@@ -95,7 +101,8 @@ class LogActionsDriver:
 class IDMDriver:
     """Vehicles follow their logged path and react to whoever is on it; others replay.
 
-    A vehicle wants the highest speed that it had in its log. It leaves behind the path's end.
+    A vehicle wants the highest speed that it had in its log. It leaves behind the path's end; one
+    whose log ends with it standing comes to stand there, and leaves when the log has ended.
     """
 
     def __init__(self, idm: IDM | None = None) -> None:
@@ -104,24 +111,27 @@ class IDMDriver:
         self._paths = np.zeros((0, 0, 0, 2), dtype=np.float32)
         self._limits = np.zeros((0, 0, 0), dtype=np.float32)
         self._counts = np.zeros((0, 0), dtype=np.int64)
+        self._halts = np.zeros((0, 0), dtype=bool)
         self._ends = np.zeros((0, 0), dtype=np.float64)
         self._arcs = np.zeros((0, 0), dtype=np.float64)
 
     def reset(self, world: ReplayWorld, where: Bool[np.ndarray, " b"]) -> None:
         """Takes the paths of the new episodes' vehicles from their recordings."""
-        found: dict[tuple[int, int], tuple[np.ndarray, float]] = {}
+        found: dict[tuple[int, int], tuple[np.ndarray, float, bool]] = {}
         vehicles = _vehicles(world)
         for b, a in np.argwhere(vehicles & where[:, None]).tolist():
             found[b, a] = self._path(world, b, a)
-        points = max([self._paths.shape[2], *(len(path) for path, _ in found.values())])
+        points = max([self._paths.shape[2], *(len(path) for path, _, _ in found.values())])
         self._grow(vehicles.shape[0], vehicles.shape[1], points)
         self._counts[where] = 0
         self._arcs[where] = 0.0
-        for (b, a), (path, desired_mps) in found.items():
-            self._paths[b, a, : len(path)] = path
-            self._limits[b, a, : len(path)] = speed_limits(path, desired_mps, self.idm)
-            self._counts[b, a] = len(path)
-            self._ends[b, a] = len(path) - 1 - BEYOND_M
+        for (b, a), (path, desired_mps, halts) in found.items():
+            end = len(path) - 1 - BEYOND_M
+            stop = end if halts else math.inf
+            limits = speed_limits(path, desired_mps, self.idm, stop_m=stop)
+            self._paths[b, a, : len(path)], self._limits[b, a, : len(path)] = path, limits
+            self._counts[b, a], self._halts[b, a] = len(path), halts
+            self._ends[b, a] = end - HALTED_M if halts else end
 
     def control(self, world: ReplayWorld) -> Control:
         """What the law says for the present states."""
@@ -141,10 +151,12 @@ class IDMDriver:
             self._arcs,
             self.idm,
         )
-        leaving = driven & (self._arcs >= self._ends)
+        waits = self._halts & episodes.log_valid[rows, world.now]
+        leaving = driven & (self._arcs >= self._ends) & ~waits
         return Control(actions=actions, driven=driven & ~leaving, leaving=leaving)
 
-    def _path(self, world: ReplayWorld, b: int, a: int) -> tuple[np.ndarray, float]:
+    def _path(self, world: ReplayWorld, b: int, a: int) -> tuple[np.ndarray, float, bool]:
+        """(path, desired speed m/s, whether the log ends with the vehicle standing)."""
         episodes = world.episodes
         recording = world.recordings[int(episodes.recording[b])]
         track = int(episodes.tracks[b, a])
@@ -154,12 +166,13 @@ class IDMDriver:
         if not len(states):
             states = recording.track(track)[-1:]
         fastest = float(np.abs(recording.track(track)[:, 3]).max())
-        return route_along(states, beyond_m=BEYOND_M), max(fastest, MIN_DESIRED_MPS)
+        halts = bool(abs(states[-1, 3]) < STANDING_MPS)
+        return route_along(states, beyond_m=BEYOND_M), max(fastest, MIN_DESIRED_MPS), halts
 
     def _grow(self, episodes: int, agents: int, points: int) -> None:
         if (episodes, agents, points) == self._limits.shape:
             return
-        for name in ("_paths", "_limits", "_counts", "_ends", "_arcs"):
+        for name in ("_paths", "_limits", "_counts", "_halts", "_ends", "_arcs"):
             old = getattr(self, name)
             new = np.zeros((episodes, agents, points, 2)[: old.ndim], dtype=old.dtype)
             new[tuple(map(slice, old.shape))] = old

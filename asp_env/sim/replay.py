@@ -194,29 +194,28 @@ class ReplayWorld:
     ) -> None:
         """One tick: `driven` agents obey their actions, `leaving` ones vanish, the rest replay.
 
-        Only agents that are present can be driven. Behind the end of its recording an episode has
-        no logged agents; the ego goes on if it is driven.
+        Only agents that are present can be driven. An episode whose scenario has run its length
+        stays as it is, whatever the others do.
         """
         data = self.episodes
-        rows = np.arange(len(self))
-        now = self.now
-        after = np.minimum(now + 1, data.valid.shape[1] - 1)
+        rows = np.flatnonzero(data.elapsed < data.length)
+        now = self.now[rows]
         if leaving is not None:
-            data.gone |= leaving
+            data.gone[rows] |= leaving[rows]
         states, valid = data.states[rows, now], data.valid[rows, now]
-        obeys = driven & valid
-        lengths = np.maximum(data.sizes[..., 0], 0.1)
-        moved = forward(states, actions.astype(np.float32), lengths, self.dt_s)
-        data.states[rows, after] = np.where(
-            obeys[..., None], moved, data.log_states[rows, after]
-        ).astype(np.float32)
-        present = np.where(obeys, True, data.log_valid[rows, after] & ~driven) & ~data.gone
-        data.valid[rows, after] = present
-        data.states[rows, after] *= present[..., None]
-        data.elapsed += 1
-        data.on_route = route_coordinates(
-            data.route, data.route_valid, self.ego_states(), data.on_route[:, 0]
-        )
+        obeys = driven[rows] & valid
+        lengths = np.maximum(data.sizes[rows, :, 0], 0.1)
+        moved = forward(states, actions[rows].astype(np.float32), lengths, self.dt_s)
+        logged, there = data.log_states[rows, now + 1], data.log_valid[rows, now + 1]
+        present = np.where(obeys, True, there & ~driven[rows]) & ~data.gone[rows]
+        states = np.where(obeys[..., None], moved, logged) * present[..., None]
+        data.states[rows, now + 1] = states.astype(np.float32)
+        data.valid[rows, now + 1] = present
+        data.elapsed[rows] += 1
+        # a negative arc length would make the search begin anew everywhere
+        near = np.maximum(data.on_route[:, 0], 0.0)
+        on_route = route_coordinates(data.route, data.route_valid, self.ego_states(), near)
+        data.on_route[rows] = on_route[rows]
 
     def scene(self) -> Scene:
         """All that may be known now; targets are all present agents but the ego."""
@@ -227,14 +226,15 @@ class ReplayWorld:
         valid = np.ascontiguousarray(data.valid[rows, ticks].swapaxes(1, 2))
         others = valid[..., -1].copy()
         others[:, EGO] = False
+        seen = valid.any(axis=-1)  # of who comes later, nothing is known yet
         maps, map_index = self.maps()
         return Scene(
             states=states,
             actions=infer_actions(states, valid, data.sizes[..., 0], self.dt_s),
             valid=valid,
-            sizes=data.sizes.copy(),
-            classes=data.classes.copy(),
-            ids=data.ids.copy(),
+            sizes=np.where(seen[..., None], data.sizes, 0).astype(np.float32),
+            classes=np.where(seen, data.classes, 0).astype(np.int32),
+            ids=np.where(seen, data.ids, -1),
             tick=data.start_tick + data.elapsed,
             targets=np.argwhere(others),
             route=data.route.copy(),

@@ -3,7 +3,7 @@
 from collections.abc import Sequence
 from dataclasses import dataclass
 from enum import IntEnum
-from typing import Any, Protocol
+from typing import Any, Protocol, runtime_checkable
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
@@ -58,6 +58,7 @@ class Events:
         return np.asarray(np.isin(self.contacts, [int(kind) for kind in AT_FAULT]).any(axis=1))
 
 
+@runtime_checkable
 class World(Protocol):
     """B episodes that are stepped together. Slot 0 of each is the ego."""
 

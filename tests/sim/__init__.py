@@ -1,0 +1,1 @@
+"""Worlds, drivers, rewards and observations."""

@@ -1,0 +1,314 @@
+"""What happens in a world of replayed recordings, step by step."""
+
+import dataclasses
+import math
+
+import numpy as np
+import pytest
+
+from asp_env.data.classes import AgentClass
+from asp_env.data.recording import Recording
+from asp_env.errors import AspEnvError
+from asp_env.metrics.boxes import Contact
+from tests.builders import Drive, make_recording
+from tests.sim.worlds import (
+    DT_S,
+    HISTORY,
+    car,
+    drive,
+    now,
+    on_road,
+    replay,
+    scenario,
+    simulate,
+)
+
+
+def test_log_traffic_repeats_the_recording_bit_for_bit():
+    """Every state and every presence equals the track at that frame, for a whole episode."""
+    recording = make_recording()
+    simulation = simulate(recording, scenario(3, length=60))
+    replay(simulation, 60)
+    episodes = simulation.world.episodes
+    for slot, track in enumerate(episodes.tracks[0].tolist()):
+        for tick in range(HISTORY + 61):
+            row = 5 * tick - recording.first_frames[track]
+            there = 0 <= row < len(recording.track(track))
+            assert episodes.valid[0, tick, slot] == there
+            expected = recording.track(track)[row] if there else np.zeros(4)
+            assert episodes.states[0, tick, slot].tobytes() == np.float32(expected).tobytes()
+
+
+def test_slots_are_ego_then_first_appearance_then_id():
+    """Ids 3, 1, 2 appear at 4 s, 0 s and 0 s; the ego is 3, so slots hold 3, 1, 2, 4."""
+    recording = on_road(car(-50, 5), car(0, 5, appears_s=4.0), car(30, 5, appears_s=6.0))
+    world = simulate(recording, scenario(3, start=40, length=20)).world
+    assert world.episodes.ids.tolist() == [[3, 1, 2, 4]]
+    assert world.scene().ids.tolist() == [[3, 1, 2, 4]]
+
+
+def test_constant_acceleration_by_hand():
+    """From 10 m/s with 1 m/s²: 10.2, 10.4, … m/s, and 10 t + t²/2 metres after t seconds."""
+    simulation = simulate(
+        make_recording(drives=(car(-90.0, 10.0),), duration_s=12.0), scenario(length=10)
+    )
+    start = now(simulation, 1)
+    assert start is not None
+    assert start.tolist() == pytest.approx([-60.0, -1.75, 0.0, 10.0], abs=1e-4)
+    for step in range(1, 6):
+        drive(simulation, [(1.0, 0.0)])
+        t = DT_S * step
+        expected = [-60 + 10 * t + 0.5 * t * t, -1.75, 0.0, 10 + t]
+        assert now(simulation, 1) == pytest.approx(expected, abs=1e-4)
+
+
+def test_steering_by_hand():
+    """Sine of slip 0.27, 5 m/s, axle 1.35 m: 1 rad/s; each step is a chord of 0.995 m.
+
+    Heun takes the mean of the velocities at both ends of a step, whose courses differ by 0.2 rad:
+    length 5·0.2·cos(0.1) along the middle course.
+    """
+    simulation = simulate(
+        make_recording(drives=(car(-90.0, 5.0),), duration_s=12.0), scenario(length=10)
+    )
+    slip = math.asin(0.27)
+    x, y = -75.0, -1.75
+    for step in range(5):
+        drive(simulation, [(0.0, math.atan(2 * math.tan(slip)))])
+        course = slip + 0.2 * step + 0.1
+        x, y = x + math.cos(0.1) * math.cos(course), y + math.cos(0.1) * math.sin(course)
+        expected = [x, y, 0.2 * (step + 1), 5.0]
+        assert now(simulation, 1) == pytest.approx(expected, abs=1e-4)
+
+
+def test_braking_ends_at_standstill():
+    """1 m/s less 5 m/s² for 0.2 s is 0, and it stays 0."""
+    recording = make_recording(
+        drives=(car(-90.0, 6.0, (3.0, -5 / 3, 0.0)), car(0.0, 0.0)), duration_s=12.0
+    )
+    simulation = simulate(recording, scenario(start=15, length=10))
+    drive(simulation, [(-5.0, 0.0)] * 4)
+    state = now(simulation, 1)
+    assert state is not None
+    assert state[3] == 0.0
+    x = state[0]
+    drive(simulation, [(-5.0, 0.3)] * 3)
+    assert now(simulation, 1) == pytest.approx([x, -1.75, 0.0, 0.0], abs=1e-6)
+
+
+def test_leaving_agents_stay_away():
+    """Somebody who has left is invalid and zero from then on, though its log goes on."""
+    simulation = simulate(on_road(car(-50, 5)), scenario(length=10))
+    world = simulation.world
+    nobody = np.zeros((1, 2), dtype=bool)
+    leaving = np.array([[False, True]])
+    world.step(np.zeros((1, 2, 2), dtype=np.float32), nobody, leaving)
+    assert now(simulation, 2) is None
+    world.step(np.zeros((1, 2, 2), dtype=np.float32), nobody)
+    assert now(simulation, 2) is None
+    assert not world.episodes.states[0, world.now[0], 1].any()
+
+
+def test_nobody_absent_can_be_driven():
+    """A `driven` agent that is not there yet does not come into being."""
+    simulation = simulate(on_road(car(-50, 5, appears_s=4.0)), scenario(length=10))
+    driven = np.array([[False, True]])
+    simulation.world.step(np.ones((1, 2, 2), dtype=np.float32), driven)
+    assert now(simulation, 2) is None
+
+
+@pytest.mark.parametrize("traffic", ["log", "log-actions", "idm"])
+def test_an_episode_that_is_over_stays_as_it_is(traffic):
+    """Steps behind the scenario's length change nothing: not the states, not the events."""
+    simulation = simulate(on_road(car(-50, 5)), scenario(length=4), traffic)
+    drive(simulation, [(0.5, 0.0)] * 4)
+    scene, events = simulation.world.scene(), simulation.world.events()
+    assert events.elapsed.tolist() == [4]
+    drive(simulation, [(0.5, 0.0)] * 3)
+    assert simulation.world.scene().states.tobytes() == scene.states.tobytes()
+    after = simulation.world.events()
+    assert after.elapsed.tolist() == [4]
+    assert after.route_m.tolist() == events.route_m.tolist()
+
+
+@pytest.mark.parametrize(
+    ("wrong", "what"),
+    [
+        (scenario(9), "has no track 9"),
+        (scenario(1, start=14), "ticks -1 to"),
+        (scenario(1, length=0), "are needed"),
+        (scenario(1, start=90, length=11), "spans 0 to 100"),
+    ],
+    ids=["no such track", "before its track", "no length", "behind its track"],
+)
+def test_a_scenario_that_does_not_fit_is_refused(wrong, what):
+    """One line that says what is needed and what there is; a 20 s track has ticks 0 to 100."""
+    with pytest.raises(AspEnvError, match=what) as caught:
+        simulate(on_road(), wrong)
+    assert "\n" not in str(caught.value)
+
+
+def test_a_refused_reset_changes_nothing():
+    """A scenario that does not fit leaves all episodes as they were, also those before it."""
+    simulation = simulate(on_road(), [scenario(), scenario()])
+    drive(simulation, [(1.0, 0.0)] * 3)
+    before = simulation.world.scene()
+    rngs = [np.random.default_rng(0)] * 2
+    with pytest.raises(AspEnvError):
+        simulation.reset([scenario(), scenario(9)], rngs)
+    assert simulation.world.scene().states.tobytes() == before.states.tobytes()
+
+
+def test_standing_car_ahead_is_run_into():
+    """10 m/s towards a car whose rear is 3.5 m + 2·4.5 m/2 away: FRONT or OTHER_STANDS at 4 m."""
+    recording = make_recording(drives=(car(-90.0, 10.0), car(-52.0, 0.0)), duration_s=10.0)
+    simulation = simulate(recording, scenario(length=20))
+    contacts = []
+    for _ in range(4):
+        contacts.append(Contact(int(simulation.world.events().contacts[0, 1])))
+        drive(simulation, [(0.0, 0.0)])
+    # centres 8, 6, 4, 2 m apart, boxes 4.5 m long
+    assert contacts == [Contact.NONE, Contact.NONE, Contact.OTHER_STANDS, Contact.OTHER_STANDS]
+    events = simulation.world.events()
+    assert events.collision.tolist() == [True]
+    assert events.at_fault.tolist() == [True]
+
+
+def test_hit_from_behind_is_not_the_egos_fault():
+    """A replayed follower at 10 m/s drives into the braking ego: a contact, and not its fault."""
+    recording = make_recording(drives=(car(-80.0, 10.0), car(-90.0, 10.0)), duration_s=10.0)
+    simulation = simulate(recording, scenario(length=20))
+    drive(simulation, [(-5.0, 0.0)] * 8)  # 1.6 s: the gap of 5.5 m is lost after 1.48 s
+    events = simulation.world.events()
+    assert events.contacts[0].tolist() == [Contact.NONE, Contact.REAR]
+    assert events.collision.tolist() == [True]
+    assert events.at_fault.tolist() == [False]
+
+
+def test_off_road_by_hand():
+    """Road edge at y = -3.5; a car of 1.8 m at y = -3.5 sticks out by 0.9 m, at -2.5 not at all."""
+    for y_m, outside_m in ((-2.5, 0.0), (-3.5, 0.9)):
+        recording = make_recording(drives=(car(-90.0, 5.0, y_m=y_m),), duration_s=10.0)
+        events = simulate(recording, scenario()).world.events()
+        assert events.off_road_m[0] == pytest.approx(outside_m, abs=0.11)
+
+
+def test_route_coordinates_by_hand():
+    """5 m/s for 4 ticks of 0.2 s: 4 m along; the goal of 30 ticks lies at 30 m."""
+    simulation = simulate(on_road(), scenario(length=30))
+    events = simulation.world.events()
+    assert events.route_m[0] == pytest.approx(0.0, abs=1e-3)
+    assert events.goal_m[0] == pytest.approx(30.0, abs=1e-2)
+    drive(simulation, [(0.0, 0.0)] * 4)
+    events = simulation.world.events()
+    assert events.route_m[0] == pytest.approx(4.0, abs=1e-2)
+    assert events.route_offset_m[0] == pytest.approx(0.0, abs=1e-3)
+    assert events.route_heading_rad[0] == pytest.approx(math.pi / 2, abs=1e-3)
+    drive(simulation, [(0.0, 0.2)] * 5)
+    assert simulation.world.events().route_offset_m[0] > 0.1
+
+
+def test_the_route_goes_on_behind_the_recorded_way():
+    """Points 1 m apart: what is left of the track, and 60 m straight on."""
+    scene = simulate(on_road(), scenario(length=30)).world.scene()
+    route = scene.route[0, scene.route_valid[0]]
+    assert np.hypot(*np.diff(route, axis=0).T) == pytest.approx(1.0, abs=1e-3)
+    # 100 ticks in all, 85 after now, of 1 m each
+    assert len(route) == 85 + 60 + 1
+
+
+def test_a_loop_that_ends_at_its_start_is_not_cut_short():
+    """Standing just behind the start of a closed loop is progress of about 0, not of 94 m."""
+    circle = Drive(
+        kind=AgentClass.CAR, start=(40.0, 25.0, 0.0, 10.0), phases=((60.0, 0.0, 0.17989),)
+    )
+    recording = make_recording(drives=(circle,), duration_s=20.0)
+    simulation = simulate(recording, scenario(length=46))
+    episodes = simulation.world.episodes
+    assert episodes.goal_m[0] == pytest.approx(92.0, abs=1.0)
+    back = episodes.states[0, HISTORY, 0].copy()
+    back[:2] -= 0.3 * np.array([np.cos(back[2]), np.sin(back[2])])
+    back[3] = 0.0
+    episodes.states[0, HISTORY, 0] = back
+    for _ in range(3):
+        drive(simulation, [(0.0, 0.0)])
+        assert simulation.world.events().route_m[0] == pytest.approx(-0.3, abs=0.05)
+
+
+def test_a_scene_shows_what_there_is():
+    """Shapes of the contract: 15 past ticks and now, actions between them, targets but the ego."""
+    recording = make_recording()
+    simulation = simulate(recording, [scenario(1, length=20), scenario(3, start=30)])
+    drive(simulation, [(0.0, 0.0)] * 2)
+    scene = simulation.world.scene()
+    agents = scene.ids.shape[1]
+    assert scene.states.shape == (2, agents, 16, 4)
+    assert scene.actions.shape == (2, agents, 15, 2)
+    assert scene.tick.tolist() == [17, 32]
+    assert scene.dt_s == DT_S
+    present = {(b, a) for b, a in np.argwhere(scene.valid[..., -1]).tolist() if a}
+    assert {(b, a) for b, a in scene.targets.tolist()} == present
+    absent = ~scene.valid.any(axis=-1)
+    assert absent.any()
+    assert (scene.ids[absent] == -1).all()
+    assert not scene.sizes[absent].any()
+    assert not scene.states[~scene.valid].any()
+
+
+def test_actions_of_a_scene_are_inferred_from_its_states():
+    """After a step with 2 m/s² the last action of the ego is 2 m/s², whoever drove it."""
+    simulation = simulate(on_road(), scenario())
+    drive(simulation, [(2.0, 0.1)])
+    action = simulation.world.scene().actions[0, 0, -1]
+    assert action == pytest.approx([2.0, 0.1], abs=2e-3)
+
+
+def _with_other_future(recording: Recording, frame: int, keep: int) -> Recording:
+    """The recording with everybody's rows but one track's changed behind a frame."""
+    states = recording.states.copy()
+    for track in range(len(recording)):
+        first = int(recording.first_frames[track])
+        rows = states[recording.starts[track] : recording.starts[track + 1]]
+        if track != keep:
+            rows[max(frame + 1 - first, 0) :, :3] += 7.0
+    return dataclasses.replace(recording, states=states)
+
+
+@pytest.mark.parametrize("traffic", ["log", "idm"])
+def test_a_scene_holds_no_future(traffic):
+    """Other tracks' rows behind the present frame can be anything: the scene is the same bits."""
+    recording = make_recording()
+    steps, start = 8, HISTORY
+    changed = _with_other_future(recording, frame=5 * start, keep=0)
+    scenes = []
+    for each in (recording, changed):
+        scenes.append(simulate(each, scenario(1, start=start), traffic).world.scene())
+    for field in dataclasses.fields(scenes[0]):
+        before, after = (getattr(scene, field.name) for scene in scenes)
+        if isinstance(before, np.ndarray):
+            assert before.tobytes() == after.tobytes(), field.name
+    if traffic == "log":
+        late = _with_other_future(recording, frame=5 * (start + steps), keep=0)
+        pair = [simulate(each, scenario(1, start=start)) for each in (recording, late)]
+        for each in pair:
+            replay(each, steps)
+        first, second = (each.world.scene() for each in pair)
+        assert first.states.tobytes() == second.states.tobytes()
+
+
+def test_earlier_scenes_are_not_written_to():
+    """Steps and resets leave the arrays of a scene that was handed out before as they were."""
+    simulation = simulate(make_recording(), scenario(1))
+    scene, events = simulation.world.scene(), simulation.world.events()
+    arrays = {
+        (kind, field.name): getattr(given, field.name)
+        for kind, given in (("scene", scene), ("events", events))
+        for field in dataclasses.fields(given)
+        if isinstance(getattr(given, field.name), np.ndarray)
+    }
+    kept = {name: array.copy() for name, array in arrays.items()}
+    drive(simulation, [(1.0, 0.1)] * 3)
+    simulation.reset([scenario(3, start=20)], [np.random.default_rng(1)])
+    drive(simulation, [(1.0, 0.1)] * 2)
+    for name, array in arrays.items():
+        assert array.tobytes() == kept[name].tobytes(), name

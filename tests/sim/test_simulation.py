@@ -1,0 +1,50 @@
+"""Why an episode is over."""
+
+import dataclasses
+
+import numpy as np
+import pytest
+
+from asp_env.metrics.boxes import Contact
+from asp_env.sim.simulation import ending
+from asp_env.sim.world import Ending, Events
+
+RUNNING = Events(
+    contacts=np.zeros((1, 2), dtype=np.int8),
+    off_road_m=np.zeros(1, dtype=np.float32),
+    route_m=np.full(1, 10.0),
+    route_offset_m=np.zeros(1),
+    route_heading_rad=np.zeros(1),
+    goal_m=np.full(1, 30.0),
+    elapsed=np.full(1, 5),
+    length=np.full(1, 20),
+)
+SIGNS = {
+    Ending.COLLISION: {"contacts": np.array([[0, Contact.FRONT]], dtype=np.int8)},
+    Ending.OFF_ROAD: {"off_road_m": np.full(1, 2.1, dtype=np.float32)},
+    Ending.GOAL: {"route_m": np.full(1, 29.995)},
+    Ending.OUT_OF_DATA: {"elapsed": np.full(1, 20)},
+}
+
+
+def test_an_episode_goes_on_while_nothing_holds():
+    """2 m off the road, a hit from behind, a tick left and 1 cm to go are no end yet."""
+    almost = dataclasses.replace(
+        RUNNING,
+        contacts=np.array([[0, Contact.REAR]], dtype=np.int8),
+        off_road_m=np.full(1, 2.0, dtype=np.float32),
+        route_m=np.full(1, 29.98),
+        elapsed=np.full(1, 19),
+    )
+    assert ending(RUNNING).tolist() == [Ending.RUNNING]
+    assert ending(almost).tolist() == [Ending.RUNNING]
+
+
+@pytest.mark.parametrize("kind", list(SIGNS), ids=lambda kind: kind.name)
+def test_the_first_of_the_enumeration_wins(kind):
+    """Of a reason and all that come after it in the enumeration, the reason is named."""
+    assert ending(dataclasses.replace(RUNNING, **SIGNS[kind])).tolist() == [kind]
+    all_later = {}
+    for later in reversed([each for each in SIGNS if each >= kind]):
+        all_later |= SIGNS[later]
+    assert ending(dataclasses.replace(RUNNING, **all_later)).tolist() == [kind]

@@ -1,0 +1,90 @@
+"""Short ways to recordings of a few vehicles, their scenarios, and simulations of them."""
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from asp_env.data.classes import AgentClass
+from asp_env.data.recording import Recording
+from asp_env.data.scenario import Scenario
+from asp_env.sim.drivers import make_driver
+from asp_env.sim.simulation import Simulation
+from tests.builders import Drive, make_recording
+
+DT_S = 0.2
+HISTORY = 15
+
+EGO = Drive(kind=AgentClass.CAR, start=(1.75, -95.0, np.pi / 2, 5.0))
+"""Drives north, away from what happens on the road along x."""
+
+
+def car(
+    x_m: float,
+    speed_mps: float,
+    *phases: tuple[float, float, float],
+    y_m: float = -1.75,
+    kind: AgentClass = AgentClass.CAR,
+    appears_s: float = 0.0,
+) -> Drive:
+    """Somebody on the eastbound lane; an appearance after 0 s keeps it from being parked."""
+    start = (x_m, y_m, 0.0, speed_mps)
+    return Drive(kind=kind, start=start, phases=phases, appears_s=appears_s)
+
+
+def scenario(
+    ego_id: int = 1, *, start: int = HISTORY, length: int = 30, recording: int = 0
+) -> Scenario:
+    """A scenario of a recording made in memory."""
+    return Scenario(
+        source="made-up",
+        recording=recording,
+        recording_name=f"{recording:02d}",
+        start_tick=start,
+        length=length,
+        ego_id=ego_id,
+    )
+
+
+def simulate(
+    recordings: Sequence[Recording] | Recording,
+    scenarios: Sequence[Scenario] | Scenario,
+    traffic: str = "log",
+) -> Simulation:
+    """Episodes that have just begun."""
+    recordings = [recordings] if isinstance(recordings, Recording) else recordings
+    scenarios = [scenarios] if isinstance(scenarios, Scenario) else scenarios
+    simulation = Simulation(
+        recordings, make_driver(traffic), num_episodes=len(scenarios), dt_s=DT_S, history=HISTORY
+    )
+    simulation.reset(scenarios, [np.random.default_rng(each.seed) for each in scenarios])
+    return simulation
+
+
+def on_road(*drives: Drive, duration_s: float = 20.0) -> Recording:
+    """The ego on the crossing road with id 1, then the given ones numbered from 2."""
+    return make_recording(drives=(EGO, *drives), duration_s=duration_s)
+
+
+def replay(simulation: Simulation, steps: int) -> None:
+    """Steps in which the egos replay their log."""
+    count = len(simulation.world)
+    for _ in range(steps):
+        simulation.step(np.zeros((count, 2), dtype=np.float32), np.zeros(count, dtype=bool))
+
+
+def drive(simulation: Simulation, actions: Sequence[tuple[float, float]]) -> None:
+    """Steps in which every ego carries out the same actions."""
+    count = len(simulation.world)
+    for action in actions:
+        held = np.tile(np.array(action, dtype=np.float32), (count, 1))
+        simulation.step(held, np.ones(count, dtype=bool))
+
+
+def now(simulation: Simulation, track_id: int, episode: int = 0) -> np.ndarray | None:
+    """The state of somebody now, None if it is not there."""
+    world = simulation.world
+    tick = world.now[episode]
+    slot = int(np.flatnonzero(world.episodes.ids[episode] == track_id)[0])
+    if not world.episodes.valid[episode, tick, slot]:
+        return None
+    return world.episodes.states[episode, tick, slot].copy()
