@@ -16,7 +16,6 @@ DRIVING_SHORT = {
     "TTC": "TTC",
     "progress": "progr.",
     "comfort": "comf.",
-    "log divergence": "div. m",
 }
 
 
