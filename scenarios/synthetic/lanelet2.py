@@ -1,0 +1,118 @@
+"""Writes lanelets as a lanelet2 map in OSM XML, with coordinates that UTM brings back exactly."""
+
+from pathlib import Path
+
+import numpy as np
+import pyproj
+
+from scenarios.synthetic.polylines import Polyline
+from scenarios.synthetic.surface import Border, Lanelet, Marking
+
+UTM_ZONE_32 = "EPSG:32632"
+_TAGS: dict[Marking, dict[str, str]] = {
+    "curb": {"type": "curbstone", "subtype": "high"},
+    "dashed": {"type": "line_thin", "subtype": "dashed"},
+    "zebra": {"type": "line_thick", "subtype": "dashed"},
+    "virtual": {"type": "virtual"},
+}
+_SAME_M = 0.06
+"""Points closer than this become one node."""
+
+
+def to_degrees(points_utm: Polyline) -> Polyline:
+    """(latitude, longitude) of points in UTM zone 32."""
+    transform = pyproj.Transformer.from_crs(UTM_ZONE_32, "EPSG:4326", always_xy=True)
+    lon, lat = transform.transform(points_utm[:, 0], points_utm[:, 1])
+    return np.stack([lat, lon], axis=1)
+
+
+def _tag_lines(tags: dict[str, str]) -> str:
+    return "".join(f'    <tag k="{key}" v="{value}"/>\n' for key, value in tags.items())
+
+
+class _Elements:
+    """Nodes and ways with shared ends, numbered as they come."""
+
+    def __init__(self) -> None:
+        self.points: list[np.ndarray] = []
+        self._cells: dict[tuple[int, int], list[int]] = {}
+        self.ways: dict[tuple[int, ...], tuple[int, Marking]] = {}
+
+    def node(self, point: np.ndarray) -> int:
+        column, row = (int(value) for value in np.floor(point / 0.1))
+        for near in ((column + i, row + j) for i in (-1, 0, 1) for j in (-1, 0, 1)):
+            for number in self._cells.get(near, []):
+                if np.hypot(*(self.points[number] - point)) < _SAME_M:
+                    return number
+        self.points.append(point)
+        self._cells.setdefault((column, row), []).append(len(self.points) - 1)
+        return len(self.points) - 1
+
+    def way(self, border: Border) -> int:
+        """The number of the way along a border; both directions of a line share one way."""
+        numbers = [self.node(point) for point in border.line]
+        key = tuple(n for i, n in enumerate(numbers) if i == 0 or n != numbers[i - 1])
+        for direction in (key, key[::-1]):
+            if direction in self.ways:
+                return self.ways[direction][0]
+        self.ways[key] = (len(self.ways), border.marking)
+        return len(self.ways) - 1
+
+
+def write_map(
+    path: Path,
+    lanelets: list[Lanelet],
+    parking: np.ndarray,
+    *,
+    origin_utm_m: tuple[float, float],
+    speed_limit_mps: float,
+) -> None:
+    """Writes the map of a place.
+
+    Args:
+        path: the `.osm` file to write.
+        lanelets: strips in the recording's frame.
+        parking: (lots, 4, 2) corners of places for parked cars.
+        origin_utm_m: what to add to the recording's frame to get UTM.
+        speed_limit_mps: of all lanes.
+    """
+    elements = _Elements()
+    sides = [(elements.way(lanelet.left), elements.way(lanelet.right)) for lanelet in lanelets]
+    rings = [
+        elements.way(Border(line=np.concatenate([lot, lot[:1]]), marking="virtual"))
+        for lot in parking
+    ]
+    first_way = len(elements.points) + 1
+    first_relation = first_way + len(elements.ways)
+    degrees = to_degrees(np.stack(elements.points) + np.array(origin_utm_m))
+    parts = ['<?xml version="1.0" encoding="UTF-8"?>\n<osm version="0.6" generator="asp-env">\n']
+    parts += [
+        f'  <node id="{number}" lat="{lat:.11f}" lon="{lon:.11f}" version="1"/>\n'
+        for number, (lat, lon) in enumerate(degrees, start=1)
+    ]
+    for key, (number, marking) in elements.ways.items():
+        refs = "".join(f'    <nd ref="{node + 1}"/>\n' for node in key)
+        tags = _tag_lines(_TAGS[marking])
+        parts.append(f'  <way id="{first_way + number}" version="1">\n{refs}{tags}  </way>\n')
+    for number, (lanelet, (left, right)) in enumerate(zip(lanelets, sides, strict=True)):
+        members = {"left": first_way + left, "right": first_way + right}
+        tags = {
+            "type": "lanelet",
+            "subtype": lanelet.subtype,
+            "location": "urban",
+            "one_way": "yes" if lanelet.subtype == "road" else "no",
+        }
+        if lanelet.subtype == "road":
+            tags["speed_limit"] = f"{speed_limit_mps * 3.6:.0f} km/h"
+        parts.append(_relation(first_relation + number, members, tags))
+    for number, ring in enumerate(rings, start=first_relation + len(lanelets)):
+        tags = {"type": "multipolygon", "subtype": "parking"}
+        parts.append(_relation(number, {"outer": first_way + ring}, tags))
+    path.write_text("".join([*parts, "</osm>\n"]))
+
+
+def _relation(number: int, members: dict[str, int], tags: dict[str, str]) -> str:
+    lines = "".join(
+        f'    <member type="way" ref="{way}" role="{role}"/>\n' for role, way in members.items()
+    )
+    return f'  <relation id="{number}" version="1">\n{lines}{_tag_lines(tags)}  </relation>\n'

@@ -1,0 +1,118 @@
+"""The files of one recording in the inD layout: exact columns, in order."""
+
+import gzip
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from jaxtyping import Float
+
+from scenarios.synthetic.motion import FRAME_RATE_HZ
+
+RECORDING_META_COLUMNS = (
+    "recordingId", "locationId", "frameRate", "speedLimit", "weekday", "startTime", "duration",
+    "numTracks", "numVehicles", "numVRUs", "latLocation", "lonLocation", "xUtmOrigin",
+    "yUtmOrigin", "orthoPxToMeter",
+)  # fmt: skip
+TRACKS_META_COLUMNS = (
+    "recordingId", "trackId", "initialFrame", "finalFrame", "numFrames", "width", "length", "class",
+)  # fmt: skip
+TRACKS_COLUMNS = (
+    "recordingId", "trackId", "frame", "trackLifetime", "xCenter", "yCenter", "heading", "width",
+    "length", "xVelocity", "yVelocity", "xAcceleration", "yAcceleration", "lonVelocity",
+    "latVelocity", "lonAcceleration", "latAcceleration",
+)  # fmt: skip
+VULNERABLE = ("pedestrian", "bicycle")
+"""Classes that the format gives no size."""
+_ROW = "%d,%d,%d,%d,%.4f,%.4f,%.4f,%s,%s,%.4f,%.4f,%.3f,%.3f,%.4f,%.4f,%.3f,%.3f\n"
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Track:
+    """One road user while it is in the picture, in the recording's frame."""
+
+    kind: str
+    length_m: float
+    width_m: float
+    first_frame: int
+    xy: Float[np.ndarray, "frames 2"]
+    heading_rad: Float[np.ndarray, " frames"]
+    velocity_mps: Float[np.ndarray, "frames 2"]
+    acceleration_mps2: Float[np.ndarray, "frames 2"]
+
+    @property
+    def last_frame(self) -> int:
+        """The last frame in which it is seen."""
+        return self.first_frame + len(self.xy) - 1
+
+    @property
+    def written_size_m(self) -> tuple[float, float]:
+        """(length, width) as the file gives them: zero for people on foot and on bicycles."""
+        return (0.0, 0.0) if self.kind in VULNERABLE else (self.length_m, self.width_m)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Meta:
+    """What is written of a recording besides its tracks."""
+
+    recording: int
+    location: int
+    speed_limit_mps: float
+    weekday: str
+    start_hour: int
+    num_frames: int
+    lat_deg: float
+    lon_deg: float
+    utm_origin_m: tuple[float, float]
+    metres_per_ortho_pixel: float
+
+
+def write_recording_meta(path: Path, meta: Meta, tracks: list[Track]) -> None:
+    """Writes `XX_recordingMeta.csv`."""
+    vulnerable = sum(track.kind in VULNERABLE for track in tracks)
+    values = (
+        meta.recording, meta.location, FRAME_RATE_HZ, f"{meta.speed_limit_mps:.2f}", meta.weekday,
+        meta.start_hour, f"{meta.num_frames / FRAME_RATE_HZ:.2f}", len(tracks),
+        len(tracks) - vulnerable, vulnerable, f"{meta.lat_deg:.6f}", f"{meta.lon_deg:.6f}",
+        *(f"{value:.2f}" for value in meta.utm_origin_m), f"{meta.metres_per_ortho_pixel:.5f}",
+    )  # fmt: skip
+    rows = (RECORDING_META_COLUMNS, values)
+    path.write_text("".join(",".join(map(str, row)) + "\n" for row in rows))
+
+
+def write_tracks_meta(path: Path, recording: int, tracks: list[Track]) -> None:
+    """Writes `XX_tracksMeta.csv`; a track's id is its place in the list."""
+    rows = [",".join(TRACKS_META_COLUMNS)]
+    for number, track in enumerate(tracks):
+        length, width = track.written_size_m
+        frames = f"{track.first_frame},{track.last_frame},{len(track.xy)}"
+        rows.append(f"{recording},{number},{frames},{width:.2f},{length:.2f},{track.kind}")
+    path.write_text("\n".join(rows) + "\n")
+
+
+def write_tracks(path: Path, recording: int, tracks: list[Track]) -> None:
+    """Writes `XX_tracks.csv`, compressed where the name ends in `.gz`."""
+    text = ",".join(TRACKS_COLUMNS) + "\n"
+    text += "".join(_rows(recording, number, track) for number, track in enumerate(tracks))
+    data = text.encode()
+    # No time in the header of the compressed file, so that equal tracks give equal bytes.
+    path.write_bytes(gzip.compress(data, mtime=0) if path.suffix == ".gz" else data)
+
+
+def _rows(recording: int, number: int, track: Track) -> str:
+    count = len(track.xy)
+    ahead = np.stack([np.cos(track.heading_rad), np.sin(track.heading_rad)], axis=1)
+    left = np.stack([-ahead[:, 1], ahead[:, 0]], axis=1)
+    velocity, acceleration = track.velocity_mps, track.acceleration_mps2
+    heading = np.round(np.degrees(track.heading_rad), 4) % 360.0
+    along = [np.sum(a * b, axis=1) for a in (velocity, acceleration) for b in (ahead, left)]
+    columns = [
+        *track.xy.T.round(4), heading, *velocity.T.round(4), *acceleration.T.round(3),
+        *(np.round(along[:2], 4)), *(np.round(along[2:], 3)),
+    ]  # fmt: skip
+    numbers = (np.stack(columns) + 0.0).T.tolist()  # adding zero turns -0 into 0
+    length, width = (f"{value:.2f}" for value in track.written_size_m)
+    return "".join(
+        _ROW % (recording, number, track.first_frame + i, i, *row[:3], width, length, *row[3:])
+        for i, row in zip(range(count), numbers, strict=True)
+    )
