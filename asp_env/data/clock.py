@@ -21,7 +21,7 @@ def frames_per_tick(frame_rate_hz: float, dt_s: float = DEFAULT_DT_S) -> int:
     whole = round(frames)
     if whole < 1 or abs(frames - whole) > 1e-4 * frames:
         around = range(max(1, int(frames) - 1), int(frames) + 4)
-        possible = ", ".join(f"{count / frame_rate_hz:.4g}" for count in around)
+        possible = ", ".join(f"{count / frame_rate_hz:.6g}" for count in around)
         raise AspEnvError(
             f"time step {dt_s:g} s does not divide recordings of {frame_rate_hz:g} Hz: "
             f"choose one of {possible}, … s"

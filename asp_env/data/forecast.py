@@ -78,7 +78,7 @@ def constant_velocity(scene: Scene, *, steps: int) -> Float[np.ndarray, "t steps
 
 
 def fill_missing(forecast: Forecast, scene: Scene) -> Forecast:
-    """The forecast with constant velocity, in every mode, for targets that it leaves out.
+    """The forecast with constant velocity, in every mode alike, for targets that it leaves out.
 
     For planners and drivers, which need a word on everybody who is there now.
     """
@@ -88,6 +88,10 @@ def fill_missing(forecast: Forecast, scene: Scene) -> Forecast:
         return forecast
     straight = constant_velocity(scene, steps=forecast.states.shape[2])[:, None]
     states = np.where(fill[:, None, None, None], straight, forecast.states)
+    alike = np.float32(-np.log(forecast.log_probs.shape[1]))
     return dataclasses.replace(
-        forecast, states=states.astype(np.float32), valid=forecast.valid | fill
+        forecast,
+        states=states.astype(np.float32),
+        log_probs=np.where(fill[:, None], alike, forecast.log_probs),
+        valid=forecast.valid | fill,
     )

@@ -4,8 +4,10 @@ import dataclasses
 import json
 import os
 import zipfile
+import zlib
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
@@ -14,6 +16,11 @@ from asp_env.data.scenario import Scenario
 from asp_env.errors import DataError
 
 FORMAT = 1
+
+_DAMAGED = (
+    *(OSError, EOFError, ValueError, KeyError, TypeError),
+    *(zipfile.BadZipFile, zlib.error, RuntimeError),  # the last: encrypted, or of another method
+)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -50,14 +57,14 @@ class Rollout:
             "dt_s": self.dt_s,
             "event_names": self.event_names,
         }
-        arrays = {
+        arrays: dict[str, Any] = {
             field.name: value
             for field in dataclasses.fields(self)
             if isinstance(value := getattr(self, field.name), np.ndarray)
         }
         text = np.frombuffer(json.dumps(header).encode(), dtype=np.uint8)
         aside = path.with_name(f".{path.name}.{os.getpid()}.npz")
-        np.savez_compressed(aside, allow_pickle=False, header=text, **arrays)
+        np.savez_compressed(aside, header=text, **arrays)
         aside.replace(path)
 
     @classmethod
@@ -68,7 +75,7 @@ class Rollout:
             DataError: the file is missing, damaged, or of another format.
         """
         try:
-            with np.load(path, allow_pickle=False) as file:
+            with path.open("rb") as raw, np.load(raw, allow_pickle=False) as file:
                 arrays = {name: file[name] for name in file.files}
             header = json.loads(arrays.pop("header").tobytes())
             if header["format"] != FORMAT:
@@ -83,5 +90,6 @@ class Rollout:
             )
         except DataError:
             raise
-        except (OSError, ValueError, KeyError, TypeError, zipfile.BadZipFile) as error:
-            raise DataError(f"{path}: not a rollout that can be read ({error})") from error
+        except _DAMAGED as error:
+            why = str(error) or type(error).__name__
+            raise DataError(f"{path}: not a rollout that can be read ({why})") from error

@@ -1,12 +1,13 @@
 """Where, when and who: the table of episodes that can be driven."""
 
+import math
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
 import numpy as np
 from jaxtyping import Bool
 
-from asp_env.data.clock import frames_per_tick, ticks
+from asp_env.data.clock import frames_per_tick
 from asp_env.data.geometry import path_length
 from asp_env.data.recording import Recording
 from asp_env.dynamics import wrap_angle
@@ -112,7 +113,7 @@ def _windows(
     first: int, last: int, history: int, dt_s: float, allowed: Bool[np.ndarray, " ticks"] | None
 ) -> Iterator[tuple[int, int]]:
     """(start, length) of the windows in every allowed stretch of the ticks first to last."""
-    longest, shortest = ticks(MAX_LENGTH_S, dt_s), ticks(MIN_LENGTH_S, dt_s)
+    longest, shortest = int(MAX_LENGTH_S / dt_s + 1e-6), math.ceil(MIN_LENGTH_S / dt_s - 1e-6)
     marked = np.ones(last - first + 1, dtype=bool) if allowed is None else allowed[first : last + 1]
     edges = np.flatnonzero(np.diff(marked, prepend=False, append=False)) + first
     for begin, end in edges.reshape(-1, 2).tolist():
