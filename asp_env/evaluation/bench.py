@@ -4,6 +4,7 @@ import os
 from collections.abc import Callable
 from dataclasses import dataclass
 from time import perf_counter
+from typing import Annotated
 
 import numpy as np
 import tyro
@@ -29,7 +30,9 @@ COPY_BYTES = 256 * 2**20
 class Bench:
     """Measure speeds on this machine: rasters and simulated steps, beside memory bandwidth."""
 
-    data: tyro.conf.Positional[str] = "sample:intersection"
+    data: Annotated[tyro.conf.Positional[str], tyro.conf.arg(metavar="DATA")] = (
+        "sample:intersection"
+    )
     """DATA to draw and to simulate."""
     episodes: int = 256
     """Episodes that are stepped together."""

@@ -42,7 +42,7 @@ EXPERT = "expert"
 class Drive:
     """Drive in closed loop: does the predictor make the planner drive better?"""
 
-    data: tyro.conf.Positional[str]
+    data: Annotated[tyro.conf.Positional[str], tyro.conf.arg(metavar="DATA")]
     """A folder in the inD/rounD layout, `sample:…` or `synthetic:…`."""
     out: Path
     """Folder to write; must not exist."""

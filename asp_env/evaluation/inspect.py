@@ -2,6 +2,7 @@
 
 from collections.abc import Mapping
 from dataclasses import dataclass
+from typing import Annotated
 
 import numpy as np
 import tyro
@@ -48,7 +49,7 @@ class Findings:
 class Inspect:
     """Show recordings, tracks, classes, maps, snippet counts, drift floor, and every fault."""
 
-    data: tyro.conf.Positional[str]
+    data: Annotated[tyro.conf.Positional[str], tyro.conf.arg(metavar="DATA")]
     """A folder in the inD/rounD layout, `sample:SITE` or `synthetic:SITE`."""
     dt: float = DEFAULT_DT_S
     """Time step in seconds; it must divide the recordings' frame rate."""

@@ -45,7 +45,7 @@ REFERENCE = "constant-velocity"
 class Evaluate:
     """Judge predictors in open loop: their forecasts against what happened."""
 
-    data: tyro.conf.Positional[str]
+    data: Annotated[tyro.conf.Positional[str], tyro.conf.arg(metavar="DATA")]
     """A folder in the inD/rounD layout, `sample:…` or `synthetic:…`."""
     out: Path
     """Folder to write; must not exist."""
