@@ -1,0 +1,63 @@
+"""Classes of road users by the names that files use."""
+
+import pytest
+
+from asp_env.data.classes import ALIASES, FOOTPRINTS_M, PREDICTED, AgentClass, parse_class
+from asp_env.errors import DataError
+
+
+@pytest.mark.parametrize(
+    ("name", "kind"),
+    [
+        ("car", AgentClass.CAR),
+        ("Car", AgentClass.CAR),
+        (" VAN ", AgentClass.VAN),
+        ("truck_bus", AgentClass.TRUCK_BUS),
+        ("trailer", AgentClass.TRAILER),
+        ("Pedestrian/Bicycle", AgentClass.BICYCLE),
+        ("motorbike", AgentClass.MOTORCYCLE),
+        ("person", AgentClass.PEDESTRIAN),
+        ("unknown", AgentClass.OTHER),
+    ],
+)
+def test_aliases(name: str, kind: AgentClass) -> None:
+    """Names of inD, rounD and INTERACTION in any case."""
+    assert parse_class(name) is kind
+
+
+def test_every_class_has_its_own_name() -> None:
+    """The lower-cased name of each class means that class."""
+    assert all(ALIASES[kind.name.lower()] is kind for kind in AgentClass)
+
+
+def test_unknown_class() -> None:
+    """The error is one line that lists the known names."""
+    with pytest.raises(DataError) as caught:
+        parse_class("hovercraft")
+    (line,) = str(caught.value).splitlines()
+    assert line.startswith("unknown class 'hovercraft': known are animal, bicycle, bike, bus, ")
+
+
+def test_stored_numbers() -> None:
+    """Caches and rollouts hold these numbers."""
+    assert [kind.name for kind in sorted(AgentClass)] == [
+        *("CAR", "VAN", "TRUCK", "BUS", "TRUCK_BUS", "TRAILER", "MOTORCYCLE", "BICYCLE"),
+        *("PEDESTRIAN", "ANIMAL", "OTHER"),
+    ]
+    assert sorted(AgentClass) == list(range(11))
+
+
+def test_footprints() -> None:
+    """Each class has one, in m, longer than wide or square; a bus is longer than a car."""
+    assert FOOTPRINTS_M.shape == (11, 2)
+    assert (FOOTPRINTS_M > 0).all()
+    assert (FOOTPRINTS_M[:, 0] >= FOOTPRINTS_M[:, 1]).all()
+    assert FOOTPRINTS_M[AgentClass.BUS, 0] > FOOTPRINTS_M[AgentClass.CAR, 0]
+
+
+def test_predicted() -> None:
+    """Every class but bicycles, pedestrians, animals and trailers."""
+    left_out = set(AgentClass) - PREDICTED
+    assert left_out == {
+        *(AgentClass.BICYCLE, AgentClass.PEDESTRIAN, AgentClass.ANIMAL, AgentClass.TRAILER)
+    }
