@@ -7,8 +7,9 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import torch
 from safetensors import SafetensorError
-from safetensors.torch import load_file, save_file
+from safetensors.torch import load_file, save
 from torch import Tensor
 
 from asp_env.data.parts import TrainedOn
@@ -126,7 +127,9 @@ def _build(
         action_range=(float(acceleration), float(steering)),
     )
     trained_on = TrainedOn(**config["provenance"]["trained_on"])
-    return shape, view, plug.network(plug.config(**config["network"]), shape), trained_on
+    with torch.random.fork_rng(devices=[]):  # initial weights are drawn and at once replaced
+        network = plug.network(plug.config(**config["network"]), shape)
+    return shape, view, network, trained_on
 
 
 def _load_weights(network: AbstractNetwork, path: Path) -> None:
@@ -148,15 +151,17 @@ def _load_weights(network: AbstractNetwork, path: Path) -> None:
 
 def save_weights(weights: dict[str, Tensor], path: Path) -> None:
     """Writes tensors aside, then renames."""
-    aside = path.with_name(path.name + ".part")
-    save_file({name: tensor.detach().contiguous() for name, tensor in weights.items()}, aside)
-    os.replace(aside, path)
+    _write(save({name: tensor.detach().contiguous() for name, tensor in weights.items()}), path)
 
 
 def write_json(content: dict[str, Any], path: Path) -> None:
     """Writes JSON aside, then renames."""
+    _write((json.dumps(content, indent=1, sort_keys=True) + "\n").encode(), path)
+
+
+def _write(content: bytes, path: Path) -> None:
     aside = path.with_name(path.name + ".part")
-    aside.write_text(json.dumps(content, indent=1, sort_keys=True) + "\n")
+    aside.write_bytes(content)
     os.replace(aside, path)
 
 

@@ -95,11 +95,12 @@ class FFWASPNetwork(AbstractNetwork):
 
     def forward(self, batch: Batch) -> Modes:
         """The modes of every target."""
-        dtype = torch.bfloat16 if torch.is_autocast_enabled("cpu") else torch.float32
+        device = batch.raster.device.type
+        dtype = torch.bfloat16 if torch.is_autocast_enabled(device) else torch.float32
         # Bytes are moved to channels-last before they grow into floats: a seventh of the time.
         pixels = batch.raster.contiguous(memory_format=torch.channels_last).to(dtype)
         z = self.norm(self.encoder(pixels * (1 / 255)).float())
-        with torch.autocast(z.device.type, enabled=False):
+        with torch.autocast(device, enabled=False):
             return self._decode(z, batch)
 
     def _decode(self, z: Float[Tensor, "n z"], batch: Batch) -> Modes:

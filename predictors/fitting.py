@@ -41,8 +41,9 @@ def train(config: TrainingConfig, data: str, out: Path) -> Path:
     Args:
         config: everything that decides the weights.
         data: DATA, as `open_data` takes it.
-        out: the run's folder: `config.json` and `weights.safetensors` once it is finished, `logs`
-            all the time, and `unfinished` until then.
+        out: the run's folder. It holds `logs` and, until the run is finished, `unfinished`; then
+            `config.json` and `weights.safetensors`, of the epoch with the lowest
+            `validation FDE moving`.
 
     Returns:
         `out`.
@@ -52,13 +53,8 @@ def train(config: TrainingConfig, data: str, out: Path) -> Path:
             else; the data are bad; or the loss is not finite.
     """
     recordings = open_data(data)
-    run = {
-        "config": dataclasses.asdict(config),
-        "source": data,
-        "data_hash": recordings.data_hash(),
-    }
-    _claim(out, run)
-    (out / STATE).mkdir(exist_ok=True)
+    run = {"config": dataclasses.asdict(config), "data_hash": recordings.data_hash()}
+    resumed = _resumes(out, run)
 
     snippets = index_snippets(recordings, dt_s=config.dt_s, horizon_s=config.horizon_s)
     training, validation, trained_on = _choose(recordings, snippets, config)
@@ -72,13 +68,16 @@ def train(config: TrainingConfig, data: str, out: Path) -> Path:
     )
 
     plug: LearnedPlug = registry.find("predictors", config.predictor)
-    with torch.random.fork_rng():
+    with torch.random.fork_rng(devices=[]):
         torch.manual_seed(config.seed)
         network = plug.network(config.network, shape)
     batches = [
         Batches(recordings, chosen, view=view, batch_size=size)
         for chosen, size in ((training, config.batch_size), (validation, 256))
     ]
+    if not resumed:
+        (out / STATE).mkdir(parents=True)
+        write_json(run, out / STATE / RUN)
     best = _fit(
         Fit(network, config=config, training=batches[0], validation=batches[1]), config, out
     )
@@ -103,13 +102,13 @@ def train(config: TrainingConfig, data: str, out: Path) -> Path:
     return out
 
 
-def _claim(out: Path, run: dict[str, Any]) -> None:
-    """Makes the folder this run's own, or finds that it is already."""
+def _resumes(out: Path, run: dict[str, Any]) -> bool:
+    """Whether the folder holds this run unfinished; False where there is nothing yet."""
     if (out / CONFIG).exists():
         raise AspEnvError(f"{out} holds a finished run: give another --out, or delete it")
-    if (out / RUN).exists():
+    if (out / STATE / RUN).exists():
         try:
-            found = json.loads((out / RUN).read_text())
+            found = json.loads((out / STATE / RUN).read_text())
         except ValueError:
             found = None
         if found != json.loads(json.dumps(run)):
@@ -117,11 +116,10 @@ def _claim(out: Path, run: dict[str, Any]) -> None:
                 f"{out} holds an unfinished run of another configuration or other data: "
                 "give another --out, or delete it"
             )
-        return
+        return True
     if out.exists() and (not out.is_dir() or any(out.iterdir())):
         raise AspEnvError(f"{out} holds something that is no run: give another --out")
-    out.mkdir(parents=True, exist_ok=True)
-    write_json(run, out / RUN)
+    return False
 
 
 def _fit(module: Fit, config: TrainingConfig, out: Path) -> KeepBest:
@@ -136,7 +134,7 @@ def _fit(module: Fit, config: TrainingConfig, out: Path) -> KeepBest:
         # Lightning advises on loaders, loggers and folders; what matters here raises.
         warnings.filterwarnings("ignore", module="lightning|torch")
         trainer = pl.Trainer(
-            accelerator="cpu",
+            accelerator="auto",
             devices=1,
             precision=config.precision,
             max_epochs=config.epochs,

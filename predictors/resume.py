@@ -9,7 +9,7 @@ import torch
 from lightning.fabric.utilities.types import _PATH
 from lightning.pytorch.plugins.io import CheckpointIO
 from safetensors import SafetensorError, safe_open
-from safetensors.torch import save_file
+from safetensors.torch import save
 
 from asp_env.errors import CheckpointError
 
@@ -26,8 +26,7 @@ class SafetensorsIO(CheckpointIO):
         tensors: dict[str, torch.Tensor] = {}
         tree = _encode(checkpoint, tensors)
         aside = Path(f"{path}.part")
-        aside.parent.mkdir(parents=True, exist_ok=True)
-        save_file(tensors, aside, metadata={"tree": json.dumps(tree)})
+        aside.write_bytes(save(tensors, metadata={"tree": json.dumps(tree)}))
         os.replace(aside, path)
 
     def load_checkpoint(

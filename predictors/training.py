@@ -6,6 +6,7 @@ from pathlib import Path
 from typing import Annotated, Literal
 
 import tyro
+from rich.console import Console
 
 from asp_env.errors import MissingExtraError
 
@@ -55,4 +56,5 @@ class Train:
             max_snippets=self.max_snippets,
             epochs=config.epochs if self.epochs is None else self.epochs,
         )
-        train(config, self.data, self.out)
+        run = train(config, self.data, self.out)
+        Console().print(f"wrote {run}: name it as {self.predictor}:{run}")

@@ -146,3 +146,10 @@ def test_damaged_state_is_one_line(tmp_path: Path) -> None:
     (tmp_path / "state").write_bytes((tmp_path / "state").read_bytes()[:90])
     with pytest.raises(CheckpointError, match="start the run again"):
         SafetensorsIO().load_checkpoint(tmp_path / "state")
+
+
+def test_loading_leaves_the_global_generator_alone(run: Path) -> None:
+    """What torch draws next does not depend on whether a predictor was loaded."""
+    before = torch.random.get_rng_state()
+    load_predictor(f"ffw-asp:{run}", horizon=15, dt_s=0.2)
+    assert torch.equal(torch.random.get_rng_state(), before)

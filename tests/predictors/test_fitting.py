@@ -91,12 +91,12 @@ def test_other_seed_gives_other_weights(data: str, finished: Path, tmp_path: Pat
 
 
 def test_run_folder_holds_no_pickles(finished: Path) -> None:
-    """Configuration, weights, the run's description and logs, and nothing else."""
+    """Configuration, weights and logs, and nothing else."""
     files = {str(path.relative_to(finished)) for path in finished.rglob("*") if path.is_file()}
-    assert {"config.json", "weights.safetensors", "run.json"} <= files
+    assert {"config.json", "weights.safetensors"} <= files
     assert "logs/from-epoch-00/metrics.csv" in files
     logs = {name for name in files if name.startswith("logs/")}
-    assert len(files - logs) == 3
+    assert len(files - logs) == 2
     assert all("events" in n or n.endswith(("metrics.csv", "hparams.yaml")) for n in logs)
 
 
@@ -125,8 +125,8 @@ def test_finished_run_is_refused(data: str, finished: Path) -> None:
 def test_other_configuration_is_refused(data: str, tmp_path: Path) -> None:
     """An unfinished run is gone on with only by its own configuration."""
     out = tmp_path / "run"
-    out.mkdir()
-    (out / "run.json").write_text("{}")
+    (out / "unfinished").mkdir(parents=True)
+    (out / "unfinished" / "run.json").write_text("{}")
     with pytest.raises(AspEnvError, match="unfinished run of another configuration"):
         train(tiny_config(), data, out)
 
@@ -150,11 +150,12 @@ def test_loss_that_is_not_finite_stops_the_run(
     assert not (tmp_path / "run" / "config.json").exists()
 
 
-def test_blocks_train_on_one_recording(tmp_path: Path) -> None:
-    """Where a split by recording leaves nothing to test on, the error names blocks."""
+def test_too_few_recordings_leave_no_folder(tmp_path: Path) -> None:
+    """Where nothing is left to test on the error names blocks, and nothing is half written."""
     data = write_data(tmp_path / "data", recordings=1)
     with pytest.raises(AspEnvError, match="--split blocks"):
         train(tiny_config(), data, tmp_path / "run")
+    assert not (tmp_path / "run").exists()
 
 
 def test_forecasts_do_not_depend_on_the_batch(data: str, finished: Path) -> None:
