@@ -1,9 +1,9 @@
 """Worlds that replay recordings: logged agents move as recorded, driven ones by the bicycle."""
 
+import copy
 import dataclasses
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
@@ -64,7 +64,7 @@ class Episodes:
         return Episodes(**{field.name: getattr(self, field.name).copy() for field in fields})
 
 
-Snapshot = tuple[Episodes, list[Scenario | None], list[Mapping[str, Any]]]
+Snapshot = tuple[Episodes, list[Scenario | None], list[np.random.Generator]]
 
 _FILL = {"ids": -1, "tracks": -1}
 
@@ -226,7 +226,7 @@ class ReplayWorld:
         valid = np.ascontiguousarray(data.valid[rows, ticks].swapaxes(1, 2))
         others = valid[..., -1].copy()
         others[:, EGO] = False
-        seen = valid.any(axis=-1)  # of who comes later, nothing is known yet
+        seen = np.asarray(valid.any(axis=-1))  # of who comes later, nothing is known yet
         maps, map_index = self.maps()
         return Scene(
             states=states,
@@ -278,15 +278,13 @@ class ReplayWorld:
 
     def snapshot(self) -> Snapshot:
         """The whole state, to be handed to `restore`."""
-        generators = [rng.bit_generator.state for rng in self.rngs]
-        return self.episodes.copy(), list(self.scenarios), generators
+        return self.episodes.copy(), list(self.scenarios), copy.deepcopy(self.rngs)
 
     def restore(self, snapshot: Snapshot) -> None:
         """Goes back to a snapshot, bit for bit."""
-        episodes, scenarios, generators = snapshot
+        episodes, scenarios, rngs = snapshot
         self.episodes, self.scenarios = episodes.copy(), list(scenarios)
-        for rng, state in zip(self.rngs, generators, strict=True):
-            rng.bit_generator.state = state
+        self.rngs = copy.deepcopy(rngs)
 
 
 def _allocate(num_episodes: int, *, agents: int, ticks: int, points: int) -> Episodes:
