@@ -2,9 +2,10 @@
 
 from pathlib import Path
 
+import cv2
 import pytest
 
-from examples import own_predictor, step_the_environment
+from examples import own_predictor, picture, step_the_environment
 
 EXAMPLES = sorted(Path(own_predictor.__file__).parent.glob("*.py"))
 
@@ -25,3 +26,10 @@ def test_random_actions_bring_every_episode_to_a_named_end() -> None:
 def test_an_own_predictor_drives_the_planner() -> None:
     """With forecasts of its own the planner gets somewhere."""
     assert own_predictor.main() > 0.2
+
+
+def test_the_picture_of_the_readme_can_be_drawn(tmp_path: Path) -> None:
+    """720 pixels high: a square frame, and the raster at 2:3 beside it."""
+    image = cv2.imread(str(picture.main(tmp_path / "scene.png")))
+    assert image is not None
+    assert image.shape == (720, 720 + 480, 3)
