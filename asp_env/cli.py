@@ -1,7 +1,11 @@
 """`asp-env COMMAND …`: the commands that this package and others register."""
 
+import contextlib
+import io
+import re
 import sys
 from collections.abc import Sequence
+from typing import Any
 
 import tyro
 from rich.console import Console
@@ -22,7 +26,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     name, rest = given[0], given[1:]
     try:
         command = registry.find("commands", name)
-        tyro.cli(command, prog=f"asp-env {name}", args=rest).run()
+        _parse(name, command, rest).run()
     except AspEnvError as error:
         return _refuse(str(error))
     except OSError as error:
@@ -34,6 +38,24 @@ def main(argv: Sequence[str] | None = None) -> int:
     return 0
 
 
+def _parse(name: str, command: Any, rest: Sequence[str]) -> Any:
+    """The command with its options.
+
+    Raises:
+        AspEnvError: they are not understood; the parser's box of text becomes one line.
+    """
+    told = io.StringIO()
+    try:
+        with contextlib.redirect_stderr(told):
+            return tyro.cli(command, prog=f"asp-env {name}", args=rest)
+    except SystemExit as stop:
+        if not stop.code:
+            raise
+        lines = [line.strip("│─ ") or ";" for line in told.getvalue().splitlines()[1:-1]]
+        what = re.split("; (?:For full|Argument) helptext", " ".join(lines).replace(" ;", ";"))[0]
+        raise AspEnvError(f"{what.rstrip('.')}; see asp-env {name} --help") from None
+
+
 def _refuse(message: str) -> int:
     sys.stderr.write(f"asp-env: {' '.join(message.split())}\n")
     return BAD_INPUT
@@ -42,8 +64,11 @@ def _refuse(message: str) -> int:
 def _list_commands() -> None:
     table = Table(box=None, show_header=False, padding=(0, 2))
     for name in registry.names("commands"):
-        command = registry.find("commands", name)
-        table.add_row(name, (command.__doc__ or "").strip().partition("\n")[0])
+        try:
+            what = registry.find("commands", name).__doc__ or ""
+        except AspEnvError as error:
+            what = str(error)
+        table.add_row(name, what.strip().partition("\n")[0])
     console = Console()
     console.print("usage: asp-env COMMAND …    (asp-env COMMAND --help tells its options)\n")
     console.print(table)

@@ -12,7 +12,7 @@ from rich.console import Console
 from rich.progress import Progress
 
 from asp_env.data.clock import DEFAULT_DT_S, ticks
-from asp_env.data.predictor import Predictor, load_predictor
+from asp_env.data.predictor import Predictor
 from asp_env.data.road_map import RoadMap
 from asp_env.data.rollout import Rollout
 from asp_env.data.scenario import Scenario, ScenarioSet, find_scenarios
@@ -20,6 +20,7 @@ from asp_env.data.snippets import HISTORY_S
 from asp_env.data.source import Recordings, open_data
 from asp_env.errors import AspEnvError
 from asp_env.evaluation import intervals
+from asp_env.evaluation.entrants import load_predictors, short_names
 from asp_env.evaluation.episodes import drive_episodes
 from asp_env.evaluation.output import Row, output_folder, write_manifest, write_metrics
 from asp_env.evaluation.report import write_report
@@ -86,12 +87,6 @@ class _Run:
     endings: tuple[Ending, ...]
     rollouts: tuple[Rollout, ...]
 
-    @property
-    def name(self) -> str:
-        """The driver, as reports call it."""
-        kind = self.predictor.partition(":")[0]
-        return f"{self.planner} + {kind}" if kind else self.planner
-
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class ClosedLoop:
@@ -109,9 +104,7 @@ def drive(config: Drive) -> ClosedLoop:
     """Drives with every predictor, the expert first."""
     recordings = open_data(config.data)
     horizon, history = ticks(config.horizon, config.dt), ticks(HISTORY_S, config.dt)
-    predictors = [
-        load_predictor(name, horizon=horizon, dt_s=config.dt) for name in config.predictors
-    ]
+    predictors = load_predictors(config.predictors, horizon=horizon, dt_s=config.dt)
     allowed, part = ticks_to_judge(
         recordings, predictors, config.part, dt_s=config.dt, horizon_s=config.horizon
     )
@@ -140,6 +133,11 @@ def drive(config: Drive) -> ClosedLoop:
             for entrant in entrants
         ]  # fmt: skip
     rows = [row for run in runs for row in _rows(config, run, scenarios)]
+    short = short_names(config.predictors)
+    drivers = {
+        f"{run.planner} + {short[run.predictor]}" if run.predictor else run.planner: run
+        for run in runs
+    }
     kept = _worst(runs)
     return ClosedLoop(
         rows=rows,
@@ -153,10 +151,13 @@ def drive(config: Drive) -> ClosedLoop:
             "dt_s": config.dt,
             "part": part,
             "scenarios": [scenario.name for scenario in scenarios],
-            "endings": {run.name: dict(Counter(kind.name for kind in run.endings)) for run in runs},
+            "endings": {
+                driver: dict(Counter(kind.name for kind in run.endings))
+                for driver, run in drivers.items()
+            },
             "intervals": "95 %, bootstrap over recordings",
         },
-        rollouts={run.name: tuple(run.rollouts[i] for i in kept) for run in runs},
+        rollouts={driver: tuple(run.rollouts[i] for i in kept) for driver, run in drivers.items()},
         maps={
             scenarios[i].recording_name: recordings[scenarios[i].recording].road_map for i in kept
         },

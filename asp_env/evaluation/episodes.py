@@ -1,5 +1,6 @@
 """Driving many episodes at once, and what is kept of them."""
 
+import dataclasses
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -97,7 +98,13 @@ def _decide(
     scene = world.scene()
     scene = scene.with_targets(_near(scene, running))
     future = _recorded_future(world, scene, horizon) if predictor.privileged else None
-    forecast = fill_missing(predictor.predict(scene, future), scene)
+    forecast = predictor.predict(scene, future)
+    forecast = dataclasses.replace(  # all plan equally far, whatever their predictor can
+        forecast,
+        states=forecast.states[:, :, :horizon],
+        actions=forecast.actions[:, :, :horizon],
+    )
+    forecast = fill_missing(forecast, scene)
     return Said(running=running, forecast=forecast, plan=planner.plan(scene, forecast))
 
 

@@ -13,7 +13,7 @@ from rich.progress import track
 
 from asp_env.data.clock import DEFAULT_DT_S, ticks
 from asp_env.data.forecast import Forecast
-from asp_env.data.predictor import Predictor, load_predictor
+from asp_env.data.predictor import Predictor
 from asp_env.data.scene import Scene
 from asp_env.data.snippets import (
     Future,
@@ -25,6 +25,7 @@ from asp_env.data.snippets import (
 from asp_env.data.source import Recordings, open_data
 from asp_env.errors import AspEnvError
 from asp_env.evaluation import intervals
+from asp_env.evaluation.entrants import load_predictors
 from asp_env.evaluation.output import Row, output_folder, write_manifest, write_metrics
 from asp_env.evaluation.report import ForecastExamples, write_report
 from asp_env.evaluation.tables import open_loop_tables
@@ -100,15 +101,7 @@ def evaluate(config: Evaluate) -> OpenLoop:
     """Runs every predictor on every snippet to be judged."""
     recordings = open_data(config.data)
     horizon = ticks(config.horizon, config.dt)
-    predictors = [
-        load_predictor(name, horizon=horizon, dt_s=config.dt) for name in config.predictors
-    ]
-    for predictor, name in zip(predictors, config.predictors, strict=True):
-        if predictor.horizon < horizon:
-            raise AspEnvError(
-                f"{name} forecasts {predictor.horizon * config.dt:g} s, less than --horizon "
-                f"{config.horizon:g}"
-            )
+    predictors = load_predictors(config.predictors, horizon=horizon, dt_s=config.dt)
     allowed, part = ticks_to_judge(
         recordings, predictors, config.part, dt_s=config.dt, horizon_s=config.horizon
     )
@@ -205,9 +198,10 @@ def _rows(
             if not keep.any():
                 continue
             estimates = {each.metric: intervals.mean(each.values[keep], groups[keep])}
-            if each.metric == "FDE" and reference and each.name != REFERENCE:
+            compared = each.metric == "FDE" and reference and each.name != REFERENCE
+            if compared and (standard := reference[each.selection][keep]).any():
                 estimates["FDE / constant velocity"] = intervals.ratio(
-                    each.values[keep], reference[each.selection][keep], groups[keep]
+                    each.values[keep], standard, groups[keep]
                 )
             rows += [
                 Row(

@@ -5,6 +5,7 @@ from collections.abc import Sequence
 from rich import box
 from rich.table import Table
 
+from asp_env.evaluation.entrants import short_names
 from asp_env.evaluation.output import Row
 
 OPEN_LOOP = {"FDE": "FDE m", "FDE / constant velocity": "FDE / const. vel."}
@@ -21,10 +22,11 @@ DRIVING_SHORT = {
 
 def open_loop_tables(rows: Sequence[Row]) -> list[Table]:
     """Predictor by metric, a table for every subset and selection."""
+    short = short_names([row.predictor for row in rows])
     groups: dict[tuple[str, str], dict[str, dict[str, Row]]] = {}
     for row in rows:
         members = groups.setdefault((row.subset, row.selection), {})
-        members.setdefault(_short(row.predictor), {})[row.metric] = row
+        members.setdefault(short[row.predictor], {})[row.metric] = row
     tables = []
     for (subset, selection), members in groups.items():
         table = _table(f"{subset} targets, {selection}, 95 % intervals over recordings")
@@ -36,9 +38,10 @@ def open_loop_tables(rows: Sequence[Row]) -> list[Table]:
 def driving_table(rows: Sequence[Row]) -> Table:
     """Driver by metric; the expert, which is the noise floor, first."""
     table = _table("driving, mean per episode, 95 % interval over recordings")
+    short = short_names([row.predictor for row in rows])
     members: dict[str, dict[str, Row]] = {}
     for row in rows:
-        name = " + ".join(part for part in (row.planner, _short(row.predictor)) if part)
+        name = " + ".join(part for part in (row.planner, short[row.predictor]) if part)
         members.setdefault(name, {})[row.metric] = row
     _fill(table, "driver", members, DRIVING, DRIVING_SHORT)
     return table
@@ -63,10 +66,6 @@ def _fill(
         slim = (_cell(metrics.get(metric), interval=False) for metric in without)
         count = max(row.n for row in metrics.values())
         table.add_row(name, *wide, *slim, str(count))
-
-
-def _short(predictor: str) -> str:
-    return predictor.partition(":")[0]
 
 
 def _cell(row: Row | None, *, interval: bool) -> str:
