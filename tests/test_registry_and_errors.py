@@ -5,7 +5,6 @@ from importlib.metadata import EntryPoint
 import pytest
 
 from asp_env import registry
-from asp_env.data.predictor import load_predictor
 from asp_env.errors import (
     AspEnvError,
     CheckpointError,
@@ -99,17 +98,3 @@ def test_plug_whose_package_is_missing(monkeypatch: pytest.MonkeyPatch) -> None:
     line = one_line(caught.value)
     assert line.startswith("planner 'far' needs the package 'no_such_package', which is not")
     assert "pip install" in line
-
-
-def test_load_predictor() -> None:
-    """A name is looked up and made for the horizon and time step of the scenes to come."""
-    predictor = load_predictor("constant-velocity", horizon=10, dt_s=0.2)
-    assert (predictor.name, predictor.horizon, predictor.dt_s) == ("constant-velocity", 10, 0.2)
-    assert not predictor.privileged
-    assert predictor.trained_on is None
-
-
-def test_load_predictor_by_a_wrong_name() -> None:
-    """What stands behind the colon plays no part in looking for the name."""
-    with pytest.raises(AspEnvError, match=r"'constant-velocty' \(did you mean 'constant-vel"):
-        load_predictor("constant-velocty:runs/1", horizon=10, dt_s=0.2)

@@ -75,7 +75,7 @@ def test_counted_by_hand() -> None:
 
 
 def test_long_horizon() -> None:
-    """With 6 s ahead the last one is tick 69: 19 for each; for the motorcycle tick 40: 36 and 39."""
+    """With 6 s ahead the last one is tick 69: 19 for each; the motorcycle has 36 and 39."""
     index = index_snippets([make_recording()], dt_s=0.2, horizon_s=6.0)
     assert np.bincount(index.track, minlength=10).tolist() == [19] * 6 + [2, 0, 0, 0]
 

@@ -1,0 +1,197 @@
+"""Rollouts come back as they were saved, or not at all."""
+
+import dataclasses
+import json
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from asp_env.data.rollout import Rollout
+from asp_env.data.scenario import Scenario
+from asp_env.errors import DataError
+
+
+def make_rollout() -> Rollout:
+    """Three ticks of two agents, two plans, and three forecasts."""
+    rng = np.random.default_rng(0)
+    return Rollout(
+        scenario=Scenario(
+            source="sample:intersection",
+            recording=1,
+            recording_name="01",
+            start_tick=15,
+            length=2,
+            ego_id=7,
+            seed=3,
+            tags=("left", "standing-start"),
+        ),
+        dt_s=0.2,
+        states=rng.normal(size=(3, 2, 4)).astype(np.float32),
+        valid=np.array([(True, True), (True, False), (True, False)]),
+        log_states=rng.normal(size=(3, 2, 4)).astype(np.float32),
+        log_valid=np.ones((3, 2), dtype=bool),
+        sizes=np.array([(4.5, 1.8), (12, 2.5)], dtype=np.float32),
+        classes=np.array([0, 3], dtype=np.int32),
+        ids=np.array([7, -1], dtype=np.int64),
+        route=rng.normal(size=(5, 2)).astype(np.float32),
+        plans=rng.normal(size=(2, 4, 2)).astype(np.float32),
+        forecast_states=rng.normal(size=(3, 3, 4, 2)).astype(np.float32),
+        forecast_log_probs=np.log(rng.dirichlet(np.ones(3), size=3)),
+        forecast_slots=np.array([0, 1, 1]),
+        forecast_ticks=np.array([0, 0, 1]),
+        events=np.zeros((3, 2), dtype=bool),
+        event_names=("collision", "off-road"),
+    )
+
+
+def refused(path: Path) -> str:
+    """What is said of a file that is no rollout: one line that names it."""
+    with pytest.raises(DataError) as caught:
+        Rollout.load(path)
+    (line,) = str(caught.value).splitlines()
+    assert line.startswith(f"{path}: ")
+    return line
+
+
+def test_round_trip(tmp_path: Path) -> None:
+    """Every field comes back, bit for bit and of its type; nothing else is left in the folder."""
+    rollout, path = make_rollout(), tmp_path / "0.npz"
+    rollout.save(path)
+    again = Rollout.load(path)
+    for field in dataclasses.fields(Rollout):
+        mine, its = getattr(rollout, field.name), getattr(again, field.name)
+        if isinstance(mine, np.ndarray):
+            assert mine.dtype == its.dtype
+            np.testing.assert_array_equal(mine, its)
+        else:
+            assert mine == its
+    assert list(tmp_path.iterdir()) == [path]
+
+
+def test_without_plans_and_forecasts(tmp_path: Path) -> None:
+    """An episode in which nobody planned or forecast keeps its empty arrays."""
+    rollout = dataclasses.replace(
+        make_rollout(),
+        plans=np.zeros((0, 0, 2), dtype=np.float32),
+        forecast_states=np.zeros((0, 0, 0, 2), dtype=np.float32),
+        forecast_log_probs=np.zeros((0, 0)),
+        forecast_slots=np.zeros(0, dtype=np.int64),
+        forecast_ticks=np.zeros(0, dtype=np.int64),
+    )
+    rollout.save(tmp_path / "0.npz")
+    assert Rollout.load(tmp_path / "0.npz").plans.shape == (0, 0, 2)
+
+
+def test_saving_again(tmp_path: Path) -> None:
+    """The same rollout gives the same bytes, and replaces what stood there."""
+    path = tmp_path / "0.npz"
+    path.write_text("something older")
+    make_rollout().save(path)
+    first = path.read_bytes()
+    make_rollout().save(path)
+    assert path.read_bytes() == first
+
+
+def test_header_is_plain_json(tmp_path: Path) -> None:
+    """The header can be read without this package."""
+    make_rollout().save(tmp_path / "0.npz")
+    with np.load(tmp_path / "0.npz", allow_pickle=False) as file:
+        header = json.loads(file["header"].tobytes())
+    assert header["format"] == 1
+    assert header["scenario"]["ego_id"] == 7
+    assert header["event_names"] == ["collision", "off-road"]
+
+
+def _text(path: Path) -> None:
+    path.write_text("recordingId,trackId\n0,1\n")
+
+
+def _one_array(path: Path) -> None:
+    with path.open("wb") as file:
+        np.save(file, np.zeros(3))
+
+
+def _other_arrays(path: Path) -> None:
+    np.savez_compressed(path, weights=np.zeros(3))
+
+
+def _pickle(path: Path) -> None:
+    np.savez_compressed(path, header=np.array([{"format": 1}], dtype=object))
+
+
+def _header(**changes: object) -> Callable[[Path], None]:
+    """Damage to the header: a field changed, or left out where the change is None."""
+
+    def write(path: Path) -> None:
+        make_rollout().save(path)
+        with np.load(path) as file:
+            arrays = {name: file[name] for name in file.files}
+        header = {**json.loads(arrays.pop("header").tobytes()), **changes}
+        kept = {name: value for name, value in header.items() if value is not None}
+        text = np.frombuffer(json.dumps(kept).encode(), dtype=np.uint8)
+        np.savez_compressed(path, header=text, **arrays)
+
+    return write
+
+
+def _missing_array(path: Path) -> None:
+    make_rollout().save(path)
+    with np.load(path) as file:
+        arrays = {name: file[name] for name in file.files if name != "states"}
+    np.savez_compressed(path, **arrays)
+
+
+@pytest.mark.parametrize(
+    "write",
+    [
+        Path.touch,
+        Path.mkdir,
+        _text,
+        _one_array,
+        _other_arrays,
+        _pickle,
+        _missing_array,
+        _header(scenario=None),
+        _header(dt_s=None),
+        _header(scenario={"tags": []}),
+        _header(scenario="left"),
+        _header(scenario={"tags": [], "colour": "red"}),
+    ],
+)
+def test_what_is_no_rollout(tmp_path: Path, write: Callable[[Path], None]) -> None:
+    """An empty file, a folder, a table, other arrays, pickles, a header with holes."""
+    path = tmp_path / "0.npz"
+    write(path)
+    assert "not a rollout that can be read" in refused(path)
+
+
+def test_missing(tmp_path: Path) -> None:
+    """A file that is not there is named."""
+    assert "No such file" in refused(tmp_path / "0.npz")
+
+
+def test_other_format(tmp_path: Path) -> None:
+    """A rollout of another format says which."""
+    path = tmp_path / "0.npz"
+    _header(format=2)(path)
+    assert refused(path) == f"{path}: rollout format 2, expected 1"
+
+
+def test_cut_and_flipped(tmp_path: Path) -> None:
+    """A file cut short is refused; with any one bit wrong it is refused or reads as a rollout."""
+    path = tmp_path / "0.npz"
+    make_rollout().save(path)
+    content = path.read_bytes()
+    for length in range(0, len(content), 97):
+        path.write_bytes(content[:length])
+        refused(path)
+    results = set()
+    for at in range(0, len(content), 11):
+        path.write_bytes(content[:at] + bytes([content[at] ^ 1 << at % 8]) + content[at + 1 :])
+        try:
+            results.add(type(Rollout.load(path)))
+        except DataError:
+            results.add(DataError)
+    assert results == {Rollout, DataError}
