@@ -18,7 +18,7 @@ from asp_env.errors import AspEnvError
 from asp_env.render.frames import draw_frame
 from asp_env.sim.drivers import make_driver
 from asp_env.sim.observation import Observer
-from asp_env.sim.reward import RewardWeights, reward_terms, weighted_sum
+from asp_env.sim.reward import reward_terms, weighted_sum, weights_from
 from asp_env.sim.simulation import Simulation, ending
 from asp_env.sim.world import Ending
 from asp_env.views import make_view
@@ -27,7 +27,7 @@ METADATA = {"render_modes": ["rgb_array"], "render_fps": 5}
 FAILURES = (Ending.COLLISION, Ending.OFF_ROAD)
 
 
-class ReplayEnv(gymnasium.Env[dict[str, Any], Shaped[np.ndarray, " 2"]]):
+class ReplayEnv(gymnasium.Env[dict[str, Any], Any]):
     """Drive one vehicle of a drone recording; the traffic around it is replayed or reacts.
 
     ## Action space
@@ -103,7 +103,7 @@ width m |
         self._simulation = Simulation(
             self.recordings, make_driver(traffic), num_episodes=1, dt_s=dt_s, history=history
         )
-        self._weights = RewardWeights(**(reward_weights or {}))
+        self._weights = weights_from(reward_weights or {})
         self._running = False
         self.observation_space = self._observer.space
         self.action_space = spaces.Box(-1.0, 1.0, (2,), dtype=np.float32)
@@ -122,7 +122,8 @@ width m |
             raise AspEnvError(f"reset option {sorted(unknown)[0]!r}: expected 'scenario'")
         drawn = int(self.np_random.integers(len(self.scenarios)))
         number = (options or {}).get("scenario", drawn)
-        if not 0 <= number < len(self.scenarios):
+        whole = isinstance(number, int | np.integer)
+        if not (whole and 0 <= number < len(self.scenarios)):
             raise AspEnvError(
                 f"scenario {number}: expected 0 to {len(self.scenarios) - 1} for this data"
             )
@@ -133,10 +134,8 @@ width m |
         scene = self.scene()
         return self._observe(scene), self._info()
 
-    def step(
-        self, action: Shaped[np.ndarray, " 2"]
-    ) -> tuple[dict[str, Any], float, bool, bool, dict[str, Any]]:
-        """One tick.
+    def step(self, action: Any) -> tuple[dict[str, Any], float, bool, bool, dict[str, Any]]:
+        """One tick; the action is moved to the nearest one in the space.
 
         Raises:
             gymnasium.error.ResetNeeded: the episode is over, or none has begun.
@@ -144,9 +143,7 @@ width m |
         """
         if not self._running:
             raise gymnasium.error.ResetNeeded("the episode is over: call reset before step")
-        given = np.asarray(action, dtype=np.float32)
-        if given.shape != (2,) or not np.isfinite(given).all():
-            raise AspEnvError(f"action {action!r}: expected two finite numbers in [-1, 1]")
+        given = _two_numbers(action)
         limits = np.array([MAX_ACCELERATION_MPS2, MAX_STEERING_RAD], dtype=np.float32)
         world = self._simulation.world
         states_before, before = world.ego_states(), self._events
@@ -165,15 +162,22 @@ width m |
         return self._observe(self.scene()), reward, terminated, truncated, info
 
     def scene(self) -> Scene:
-        """All that may be known now, for a predictor in anybody's loop; the ego is slot 0."""
+        """All that may be known now, for a predictor in anybody's loop; the ego is slot 0.
+
+        Raises:
+            gymnasium.error.ResetNeeded: no episode has begun.
+        """
+        if self._simulation.world.scenarios[0] is None:
+            raise gymnasium.error.ResetNeeded("no episode has begun: call reset first")
         return self._simulation.world.scene()
 
     def render(self) -> Shaped[np.ndarray, "h w 3"] | None:  # pyright: ignore
         """An RGB picture of the scene from above, in mode `rgb_array`."""
         if self.render_mode is None:
             return None
+        scene = self.scene()
         recording = self.recordings[int(self._simulation.world.episodes.recording[0])]
-        return draw_frame(self.scene(), background=recording.background)
+        return draw_frame(scene, background=recording.background)
 
     def _observe(self, scene: Scene) -> dict[str, Any]:
         observed = self._observer.observe(scene, self._events)
@@ -192,3 +196,15 @@ width m |
             "at_fault": bool(events.at_fault[0]),
             "off_road_m": float(events.off_road_m[0]),
         }
+
+
+def _two_numbers(action: Any) -> Shaped[np.ndarray, " 2"]:
+    try:
+        given = np.asarray(action, dtype=np.float32)
+    except (TypeError, ValueError):
+        raise AspEnvError("action: expected two finite numbers in [-1, 1]") from None
+    if given.shape != (2,):
+        raise AspEnvError(f"action of shape {given.shape}: expected two numbers in [-1, 1]")
+    if not np.isfinite(given).all():
+        raise AspEnvError(f"action {given.tolist()}: expected finite numbers in [-1, 1]")
+    return given

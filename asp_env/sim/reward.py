@@ -1,11 +1,14 @@
 """Reward as named terms, weighted and summed."""
 
-from dataclasses import asdict, dataclass
+import math
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass, fields
 
 import numpy as np
 from jaxtyping import Float
 
 from asp_env.dynamics import MAX_ACCELERATION_MPS2
+from asp_env.errors import AspEnvError, unknown_name
 from asp_env.metrics.drivable import OFF_ROAD_M
 from asp_env.sim.world import Events
 
@@ -24,6 +27,21 @@ class RewardWeights:
     """-1 when the ego touches anybody in a way that it answers for."""
     off_road: float = 1.0
     """-1 for every second in which a corner of the ego is over 0.3 m outside the drivable area."""
+
+
+def weights_from(given: Mapping[str, float]) -> RewardWeights:
+    """The default weights with some replaced.
+
+    Raises:
+        AspEnvError: a name is unknown, or a value is no finite number.
+    """
+    known = [field.name for field in fields(RewardWeights)]
+    for name, value in given.items():
+        if name not in known:
+            raise unknown_name("reward weight", name, known)
+        if not (isinstance(value, int | float) and math.isfinite(value)):
+            raise AspEnvError(f"reward weight {name} {value}: expected a finite number")
+    return RewardWeights(**{name: float(value) for name, value in given.items()})
 
 
 def reward_terms(

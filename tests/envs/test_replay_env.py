@@ -1,0 +1,256 @@
+"""`asp_env/Replay-v0` as its users meet it."""
+
+import copy
+import hashlib
+import itertools
+import subprocess
+import sys
+
+import gymnasium
+import numpy as np
+import pytest
+from gymnasium.utils.env_checker import check_env
+from stable_baselines3.common.env_checker import check_env as check_env_sb3
+
+import asp_env
+from asp_env.envs.replay import ReplayEnv
+
+PARTS = ("raster", "actions", "state")
+SUBSETS = [names for n in (1, 2, 3) for names in itertools.combinations(PARTS, n)]
+SMALL = (90, 60)
+
+
+def _make(crossing: str, **options) -> ReplayEnv:
+    return ReplayEnv(crossing, **({"raster_px": SMALL} | options))
+
+
+def _digest(value: object, into) -> None:
+    """Feeds every bit of an observation, a reward or an info to a hash."""
+    if isinstance(value, dict):
+        for name in sorted(value):
+            into.update(str(name).encode())
+            _digest(value[name], into)
+    elif isinstance(value, np.ndarray):
+        into.update(f"{value.dtype}{value.shape}".encode() + value.tobytes())
+    else:
+        into.update(repr(value).encode())
+
+
+def _trace(env: gymnasium.Env, *, seed: int = 5, steps: int = 60) -> str:
+    """A hash of all that an environment returns over several episodes."""
+    seen = hashlib.sha256()
+    env.action_space.seed(seed)
+    _digest(env.reset(seed=seed), seen)
+    for _ in range(steps):
+        told = env.step(env.action_space.sample())
+        for part in told:
+            _digest(part, seen)
+        if told[2] or told[3]:
+            _digest(env.reset(), seen)
+    return seen.hexdigest()
+
+
+@pytest.mark.parametrize("names", SUBSETS, ids="-".join)
+def test_passes_the_checkers_without_a_warning(crossing, names):
+    """gymnasium's on the environment, stable-baselines3's behind `FlatParts`; warnings are errors.
+
+    stable-baselines3 warns of tables such as the action history, and of nothing else.
+    """
+    made = gymnasium.make(
+        "asp_env/Replay-v0",
+        data=crossing,
+        observations=names,
+        raster_px=SMALL,
+        render_mode="rgb_array",
+    )
+    env = made.unwrapped
+    check_env(env, skip_close_check=True)
+    check_env_sb3(asp_env.FlatParts(env))
+    if "actions" not in names:
+        check_env_sb3(env)
+
+
+def test_the_spaces_are_those_of_the_contract(crossing):
+    """Raster uint8 (12, 360, 240), actions float32 (15, 2), finite bounds, actions in ±1."""
+    env = gymnasium.make("asp_env/Replay-v0", data=crossing)
+    space = env.observation_space
+    assert isinstance(space, gymnasium.spaces.Dict)
+    assert set(space) == {"raster", "actions", "state"}
+    assert (space["raster"].shape, space["raster"].dtype) == ((12, 360, 240), np.uint8)
+    assert (space["actions"].shape, space["actions"].dtype) == ((15, 2), np.float32)
+    for box in space.values():
+        assert isinstance(box, gymnasium.spaces.Box)
+        assert box.is_bounded()
+    assert env.action_space == gymnasium.spaces.Box(-1, 1, (2,), np.float32)
+    obs, _ = env.reset(seed=0)
+    assert obs in space
+    assert set(np.unique(obs["raster"])) == {0, 255}
+
+
+def test_two_instances_agree_bit_for_bit(crossing):
+    """Same seed, same 60 actions, with other environments made and stepped in between."""
+    first = _make(crossing)
+    expected = _trace(first)
+    other = _make(crossing, traffic="idm", observations=("state",))
+    _trace(other, seed=77)
+    second = _make(crossing)
+    assert _trace(second) == expected
+    assert _trace(first) == expected
+    assert _trace(first, seed=6) != expected
+
+
+def test_another_process_agrees_bit_for_bit(crossing):
+    """The hash over 60 steps is the same in a fresh interpreter."""
+    script = (
+        "import sys; from tests.envs.test_replay_env import _make, _trace;"
+        "print(_trace(_make(sys.argv[1], traffic='idm')))"
+    )
+    done = subprocess.run(
+        [sys.executable, "-c", script, crossing], capture_output=True, text=True, check=True
+    )
+    assert done.stdout.strip() == _trace(_make(crossing, traffic="idm"))
+
+
+def test_a_copy_goes_on_in_the_same_way(crossing):
+    """A deep copy in the middle of an episode and its original see the same from there on."""
+    env = _make(crossing, traffic="idm")
+    env.reset(seed=3, options={"scenario": 1})
+    for _ in range(5):
+        env.step(np.zeros(2, dtype=np.float32))
+    twin = copy.deepcopy(env)
+    seen = [hashlib.sha256(), hashlib.sha256()]
+    for into, each in zip(seen, (env, twin), strict=True):
+        for _ in range(10):
+            for part in each.step(np.array([0.2, 0.02], dtype=np.float32)):
+                _digest(part, into)
+        _digest(each.reset(), into)
+    assert seen[0].hexdigest() == seen[1].hexdigest()
+
+
+def test_standing_still_by_hand(crossing):
+    """Full brakes from 8 m/s: 1 m/s less per tick, at rest after 1.6 s and 6.4 m of 120 m."""
+    env = _make(crossing, observations=("state",))
+    env.reset(options={"scenario": 0})
+    total = 0.0
+    for step in range(1, 11):
+        obs, reward, terminated, truncated, info = env.step(np.array([-1.0, 0.0]))
+        assert obs["state"][0] == pytest.approx(max(8 - step, 0), abs=1e-3)
+        assert not (terminated or truncated)
+        total += reward
+    assert info["progress"] == pytest.approx(6.4 / 120, abs=1e-3)
+    assert info["ending"] == "RUNNING"
+    # eight ticks of 5 m/s² cost 0.01·½ each
+    assert total == pytest.approx(6.4 / 120 - 8 * 0.005, abs=1e-3)
+
+
+def test_driving_on_reaches_the_goal(crossing):
+    """Scenario 5 is a motorcycle that goes on at its speed: 35 ticks, progress 1, terminated."""
+    env = _make(crossing, observations=("state",))
+    env.reset(options={"scenario": 5})
+    rewards = []
+    while True:
+        _, reward, terminated, truncated, info = env.step(np.zeros(2))
+        rewards.append(reward)
+        if terminated or truncated:
+            break
+    assert (terminated, truncated, info["ending"]) == (True, False, "GOAL")
+    assert len(rewards) == 35
+    assert sum(rewards) == pytest.approx(1.0, abs=1e-4)
+    with pytest.raises(gymnasium.error.ResetNeeded):
+        env.step(np.zeros(2))
+
+
+def test_running_out_of_data_is_a_truncation(crossing):
+    """Standing for the 75 ticks of scenario 0, away from everybody: truncated at the 75th."""
+    env = _make(crossing, observations=("state",))
+    env.reset(options={"scenario": 1})
+    for step in range(1, 76):
+        _, _, terminated, truncated, info = env.step(np.array([-1.0, 0.0]))
+        assert not terminated
+        assert truncated == (step == 75)
+    assert info["ending"] == "OUT_OF_DATA"
+
+
+def test_leaving_the_road_terminates(crossing):
+    """Hard left from the lane: `OFF_ROAD`, more than 2 m outside, and a cost on the way."""
+    env = _make(crossing, observations=("state",))
+    env.reset(options={"scenario": 1})
+    costs = 0.0
+    while True:
+        _, _, terminated, truncated, info = env.step(np.array([0.0, -0.6]))
+        costs += info["reward_terms"]["off_road"]
+        if terminated or truncated:
+            break
+    assert info["ending"] == "OFF_ROAD"
+    assert info["off_road_m"] > 2.0
+    assert costs <= -0.2
+
+
+def test_actions_out_of_range_are_clipped(crossing):
+    """Ten times the range does what the range does."""
+    envs = [_make(crossing, observations=("state",)) for _ in range(2)]
+    for env, scale in zip(envs, (1.0, 10.0), strict=True):
+        env.reset(options={"scenario": 0})
+        obs = env.step(np.array([1.0, -1.0]) * scale)[0]
+        assert obs["state"][0] == pytest.approx(8 + 1, abs=1e-3)
+    assert envs[0].scene().states.tobytes() == envs[1].scene().states.tobytes()
+
+
+def test_reset_takes_the_scenario_or_draws_one(crossing):
+    """The option decides; without one the seed does, and unseeded resets go on from there."""
+    env = _make(crossing, observations=("state",))
+    names = [scenario.name for scenario in env.scenarios]
+    for number, name in enumerate(names):
+        assert env.reset(options={"scenario": number})[1]["scenario"] == name
+    drawn = [env.reset(seed=1)[1]["scenario"], *(env.reset()[1]["scenario"] for _ in range(30))]
+    again = [env.reset(seed=1)[1]["scenario"], *(env.reset()[1]["scenario"] for _ in range(30))]
+    assert drawn == again
+    assert set(drawn) == set(names)
+
+
+def test_a_scene_for_anybodys_predictor(crossing):
+    """The scene behind the wrappers: one situation, the ego in slot 0, its tick the env's."""
+    env = gymnasium.make("asp_env/Replay-v0", data=crossing, observations=("state",))
+    env.reset(options={"scenario": 2})
+    env.step(np.zeros(2, dtype=np.float32))
+    inner = env.unwrapped
+    assert isinstance(inner, ReplayEnv)
+    scene = inner.scene()
+    assert scene.states.shape[0] == 1
+    assert scene.ids[0, 0] == inner.scenarios[2].ego_id
+    assert scene.tick.tolist() == [inner.scenarios[2].start_tick + 1]
+
+
+def test_renders_an_rgb_array(crossing):
+    """uint8 (H, W, 3) with more than one colour, the same for the same state; else nothing."""
+    env = _make(crossing, render_mode="rgb_array")
+    env.reset(seed=0)
+    picture = env.render()
+    assert picture is not None
+    assert picture.dtype == np.uint8
+    assert picture.ndim == 3
+    assert picture.shape[2] == 3
+    assert len(np.unique(picture.reshape(-1, 3), axis=0)) > 3
+    assert np.array_equal(picture, env.render())
+    silent = _make(crossing)
+    silent.reset(seed=0)
+    assert silent.render() is None
+
+
+def test_closing_twice_is_fine(crossing):
+    """The second close does nothing."""
+    env = gymnasium.make("asp_env/Replay-v0", data=crossing)
+    env.reset(seed=0)
+    env.close()
+    env.close()
+
+
+def test_the_default_needs_no_torch():
+    """`gym.make` with no argument makes, resets and steps on shipped data without torch."""
+    script = (
+        "import sys, gymnasium as gym, asp_env;"
+        "env = gym.make('asp_env/Replay-v0'); env.reset(seed=0);"
+        "env.step(env.action_space.sample());"
+        "assert not {'torch', 'lightning', 'sumolib', 'predictors', 'scenarios'} & set(sys.modules)"
+    )
+    subprocess.run([sys.executable, "-W", "error", "-c", script], check=True)
