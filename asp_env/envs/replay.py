@@ -171,8 +171,8 @@ width m |
             raise gymnasium.error.ResetNeeded("no episode has begun: call reset first")
         return self._simulation.world.scene()
 
-    def render(self) -> Shaped[np.ndarray, "h w 3"] | None:  # pyright: ignore
-        """An RGB picture of the scene from above, in mode `rgb_array`."""
+    def render(self) -> Any:
+        """An RGB picture uint8 (H, W, 3) from above in mode `rgb_array`, else None."""
         if self.render_mode is None:
             return None
         scene = self.scene()

@@ -11,7 +11,7 @@ from asp_env.errors import AspEnvError
 @pytest.mark.parametrize(
     ("options", "what"),
     [
-        ({"observations": ("raster", "stat")}, r"unknown observation 'stat' \(did you mean 'state'"),
+        ({"observations": ("stat",)}, r"unknown observation 'stat' \(did you mean 'state'"),
         ({"observations": ()}, "no observation given"),
         ({"view": "chaufeurnet"}, r"unknown view 'chaufeurnet' \(did you mean 'chauffeurnet'"),
         ({"raster_px": (90, 61)}, "square pixels"),

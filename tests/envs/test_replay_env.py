@@ -5,6 +5,7 @@ import hashlib
 import itertools
 import subprocess
 import sys
+from typing import Any
 
 import gymnasium
 import numpy as np
@@ -20,8 +21,8 @@ SUBSETS = [names for n in (1, 2, 3) for names in itertools.combinations(PARTS, n
 SMALL = (90, 60)
 
 
-def _make(crossing: str, **options) -> ReplayEnv:
-    return ReplayEnv(crossing, **({"raster_px": SMALL} | options))
+def _make(crossing: str, **options: Any) -> ReplayEnv:
+    return ReplayEnv(crossing, **{"raster_px": SMALL, **options})
 
 
 def _digest(value: object, into) -> None:
@@ -52,7 +53,7 @@ def _trace(env: gymnasium.Env, *, seed: int = 5, steps: int = 60) -> str:
 
 @pytest.mark.parametrize("names", SUBSETS, ids="-".join)
 def test_passes_the_checkers_without_a_warning(crossing, names):
-    """gymnasium's on the environment, stable-baselines3's behind `FlatParts`; warnings are errors.
+    """Gymnasium's on the environment, stable-baselines3's behind `FlatParts`; warnings are errors.
 
     stable-baselines3 warns of tables such as the action history, and of nothing else.
     """
@@ -131,11 +132,12 @@ def test_standing_still_by_hand(crossing):
     """Full brakes from 8 m/s: 1 m/s less per tick, at rest after 1.6 s and 6.4 m of 120 m."""
     env = _make(crossing, observations=("state",))
     env.reset(options={"scenario": 0})
-    total = 0.0
+    total, info = 0.0, {}
     for step in range(1, 11):
         obs, reward, terminated, truncated, info = env.step(np.array([-1.0, 0.0]))
         assert obs["state"][0] == pytest.approx(max(8 - step, 0), abs=1e-3)
-        assert not (terminated or truncated)
+        assert not terminated
+        assert not truncated
         total += reward
     assert info["progress"] == pytest.approx(6.4 / 120, abs=1e-3)
     assert info["ending"] == "RUNNING"
@@ -164,6 +166,7 @@ def test_running_out_of_data_is_a_truncation(crossing):
     """Standing for the 75 ticks of scenario 0, away from everybody: truncated at the 75th."""
     env = _make(crossing, observations=("state",))
     env.reset(options={"scenario": 1})
+    info = {}
     for step in range(1, 76):
         _, _, terminated, truncated, info = env.step(np.array([-1.0, 0.0]))
         assert not terminated
@@ -226,7 +229,6 @@ def test_renders_an_rgb_array(crossing):
     env = _make(crossing, render_mode="rgb_array")
     env.reset(seed=0)
     picture = env.render()
-    assert picture is not None
     assert picture.dtype == np.uint8
     assert picture.ndim == 3
     assert picture.shape[2] == 3
