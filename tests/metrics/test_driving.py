@@ -134,6 +134,8 @@ def test_short_drive() -> None:
     )
     assert math.isnan(found["comfort"])
     assert found["progress"] == pytest.approx(0.72)
+    for name in ("no collision", "no at-fault collision", "on road", "TTC"):
+        assert found[name] == 1
     assert found["score"] == pytest.approx((5 * 0.72 + 5) / 10)
 
 
