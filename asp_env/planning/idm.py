@@ -6,6 +6,7 @@ from jaxtyping import Float, Int
 from asp_env.data.forecast import Forecast
 from asp_env.data.scene import Scene
 from asp_env.dynamics import rollout
+from asp_env.errors import AspEnvError
 from asp_env.metrics.route import route_coordinates
 from asp_env.planning.planner import Plan
 from asp_env.sim.idm import IDM, follow_paths, speed_limits
@@ -26,8 +27,14 @@ class RouteLimits:
         self._limits = np.zeros((0, 0), dtype=np.float32)
 
     def of(self, scene: Scene) -> tuple[Float[np.ndarray, "b p"], Int[np.ndarray, " b"]]:
-        """(wanted speed m/s at each route point, number of points) of each situation."""
+        """(wanted speed m/s at each route point, number of points) of each situation.
+
+        Raises:
+            AspEnvError: a situation has no route.
+        """
         counts = scene.route_valid.sum(axis=1)
+        if (counts < 2).any():
+            raise AspEnvError("a planner needs the ego's route: take the scene from a world")
         same = np.array_equal(self._routes, scene.route) and np.array_equal(self._counts, counts)
         if not same:
             limits = np.zeros(scene.route.shape[:2], dtype=np.float32)

@@ -1,0 +1,130 @@
+"""The sampling planner: gets on, gives way, and weighs what is probable."""
+
+import numpy as np
+import pytest
+
+from asp_env.data.classes import AgentClass
+from asp_env.planning.idm import DESIRED_MPS
+from asp_env.planning.sampling import SamplingPlanner, Weights
+from tests.builders import DRIVES, Drive, make_recording
+from tests.planning.situations import (
+    STEPS,
+    approach,
+    close_loop,
+    straight_on,
+    two_modes,
+    wide_map,
+)
+from tests.sim.worlds import car, scenario, simulate
+
+
+def _gain(states: np.ndarray) -> float:
+    """How far east a plan leads, metres."""
+    return float(states[-1, 0] - states[0, 0])
+
+
+def test_reaches_the_wanted_speed_on_an_empty_road():
+    """From 8 m/s to town speed, 13.9 m/s, within 7 s, in the lane, no faster than that."""
+    states = close_loop(SamplingPlanner(), approach(speed_mps=8.0), 35)
+    assert states[-1, 3] == pytest.approx(DESIRED_MPS, abs=0.5)
+    assert states[:, 3].max() < DESIRED_MPS + 0.3
+    assert states[:, 1] == pytest.approx(-1.75, abs=0.1)
+    assert (np.diff(states[:, 3]) / 0.2).max() < 1.5
+
+
+def test_stops_for_a_standing_car_on_its_route():
+    """From 10 m/s, 40 m before the car: comes to rest behind it without touching it."""
+    simulation = approach(car(-15.0, 0.0))
+    states = close_loop(SamplingPlanner(), simulation, 60)
+    assert states[-1, 3] < 0.3
+    assert 4.5 < -15.0 - states[-1, 0] < 16.0
+    assert not simulation.world.events().collision.any()
+
+
+def test_a_late_hard_brake_is_better_than_a_collision():
+    """At 10 m/s, 15 m between the bumpers: 5 m/s² stops after 10 m, and that is what it does."""
+    simulation = approach(car(-60 + 4.5 + 15, 0.0))
+    states = close_loop(SamplingPlanner(), simulation, 25)
+    assert states[-1, 3] < 0.5
+    assert not simulation.world.events().collision.any()
+
+
+@pytest.mark.parametrize("x_m", [-40.0, -30.0])
+def test_probable_crossings_count_more(x_m):
+    """Somebody who crosses with 90 % makes it slower than one who does with 1 %, who costs little.
+
+    The other mode stands beside the road.
+    """
+    walker = Drive(kind=AgentClass.PEDESTRIAN, start=(x_m, -9.0, np.pi / 2, 0.0), appears_s=0.2)
+    scene = approach(walker).world.scene()
+    cross = np.zeros((STEPS, 4), dtype=np.float32)
+    cross[:] = (x_m, -1.75, np.pi / 2, 0.0)
+    planner = SamplingPlanner()
+    free = planner.plan(scene, straight_on(scene)).states[0]
+    rare = planner.plan(scene, two_modes(scene, cross, 0.01)).states[0]
+    likely = planner.plan(scene, two_modes(scene, cross, 0.9)).states[0]
+    assert _gain(free) - _gain(rare) < 0.3 * (_gain(free) - _gain(likely))
+    assert _gain(likely) < _gain(free) - 3
+
+
+def test_a_mode_without_probability_does_not_count():
+    """A crossing with probability 0 gives the plan of an empty crossing, bit for bit."""
+    walker = Drive(kind=AgentClass.PEDESTRIAN, start=(-30.0, -9.0, np.pi / 2, 0.0), appears_s=0.2)
+    scene = approach(walker).world.scene()
+    cross = np.tile(np.array([-30.0, -1.75, 1.57, 0.0], dtype=np.float32), (STEPS, 1))
+    planner = SamplingPlanner()
+    with np.errstate(divide="ignore"):
+        never = planner.plan(scene, two_modes(scene, cross, 0.0))
+    assert never.states.tobytes() == planner.plan(scene, straight_on(scene)).states.tobytes()
+
+
+def test_swerves_where_there_is_room_but_not_off_the_road():
+    """A box that sticks 0.4 m into its way: it goes round on open ground, not over the curb.
+
+    The ego's side is at y = -3.3, the curb at -3.5, the box reaches down to y = -1.9.
+    """
+    lanes = {}
+    for name, road_map in (("open", wide_map()), ("curb", None)):
+        simulation = approach(car(-35.0, 0.0, y_m=-1.0), y_m=-2.4, road_map=road_map)
+        scene = simulation.world.scene()
+        plan = SamplingPlanner().plan(scene, straight_on(scene))
+        lanes[name] = float(plan.states[0, :, 1].min())
+    assert lanes["open"] < -2.8
+    assert lanes["curb"] > -2.4 - 0.5
+
+
+def test_somebody_behind_is_not_fled_from():
+    """A faster car behind in the lane changes nothing: who runs into the rear answers for it."""
+    empty = approach().world.scene()
+    planner = SamplingPlanner()
+    alone = planner.plan(empty, straight_on(empty)).states
+    chased = approach(car(-115.0, 14.0)).world.scene()
+    assert chased.states[0, 1, -1, 0] < chased.states[0, 0, -1, 0] - 4.5
+    assert planner.plan(chased, straight_on(chased)).states.tobytes() == alone.tobytes()
+
+
+def test_slows_down_for_a_bend():
+    """A quarter turn of 12 m radius: about √(2.5·12) = 5.5 m/s in it.
+
+    It stays within 1.3 m: the 0.8 m that it may choose to keep beside the route, and what pure
+    pursuit cuts of the bend.
+    """
+    recording = make_recording(drives=(DRIVES[2],), duration_s=20.0, road_map=wide_map())
+    simulation = simulate(recording, scenario(1, length=60))
+    states = close_loop(SamplingPlanner(), simulation, 50)
+    path = recording.track(0)[:, :2]
+    on_log = states[:, 0] > path[:, 0].min()
+    away = np.hypot(*(path[:, None] - states[None, on_log, :2]).transpose(2, 0, 1)).min(axis=0)
+    assert away.max() < 1.3
+    turning = np.abs(np.diff(np.unwrap(states[:, 2]))) / 0.2 > 0.2
+    assert turning.any()
+    assert states[1:, 3][turning].max() < 6.3
+
+
+def test_weights_decide():
+    """Without any weight on touching or closeness it drives on into the standing car."""
+    scene = approach(car(-40.0, 0.0)).world.scene()
+    forecast = straight_on(scene)
+    careless = SamplingPlanner(Weights(collision=0.0, closeness=0.0))
+    assert _gain(careless.plan(scene, forecast).states[0]) > 25
+    assert _gain(SamplingPlanner().plan(scene, forecast).states[0]) < 20
