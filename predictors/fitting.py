@@ -8,6 +8,8 @@ import platform
 import shutil
 import sys
 import warnings
+from collections.abc import Iterator
+from contextlib import contextmanager
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any
@@ -151,8 +153,19 @@ def _fit(module: Fit, config: TrainingConfig, out: Path) -> KeepBest:
             reload_dataloaders_every_n_epochs=1,
             log_every_n_steps=50,
         )
-        trainer.fit(module, ckpt_path=str(state) if state.exists() else None)
+        with _threads(config.threads):
+            trainer.fit(module, ckpt_path=str(state) if state.exists() else None)
     return best
+
+
+@contextmanager
+def _threads(count: int | None) -> Iterator[None]:
+    before = torch.get_num_threads()
+    torch.set_num_threads(before if count is None else count)
+    try:
+        yield
+    finally:
+        torch.set_num_threads(before)
 
 
 def _epochs_done(state: Path) -> int:

@@ -40,6 +40,8 @@ class TrainingConfig:
     """`plateau` divides the learning rate by 5 after 3 epochs without improvement; `one-cycle`
     raises it over the first tenth of all steps and lowers it along a cosine to zero."""
     precision: Literal["32-true", "bf16-mixed"] = "32-true"
+    threads: int | None = None
+    """Threads of torch within one operation; None leaves its own choice."""
 
     def __post_init__(self) -> None:
         """Checks the numbers.
@@ -53,6 +55,7 @@ class TrainingConfig:
             "snippets_per_epoch",
             "max_snippets",
             "max_validation_snippets",
+            "threads",
         ):
             value = getattr(self, field)
             if value is not None and value < 1:
@@ -93,15 +96,16 @@ def ffw_asp_cpu(*, view: str, horizon_s: float) -> TrainingConfig:
         height_px=90,
         width_px=60,
         horizon_s=horizon_s,
-        standing_share=0.2,
+        standing_share=0.5,
         epochs=8,
-        snippets_per_epoch=20_000,
+        snippets_per_epoch=15_000,
         max_validation_snippets=2_000,
         batch_size=64,
-        learning_rate=2e-3,
+        learning_rate=4e-3,
         weight_decay=1e-2,
         schedule="one-cycle",
         precision="bf16-mixed",
+        threads=1,
     )
 
 
