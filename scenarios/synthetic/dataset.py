@@ -48,7 +48,8 @@ def synthesize(
         recordings: how many.
         minutes: length of each.
         seed: same seed, same bytes; another seed, other places and other traffic.
-        noise: whether to write measured instead of true tracks; the truth goes to `truth/`.
+        noise: whether to write measured instead of true tracks; the truth goes to
+            `truth/XX_trueTracks.csv`, which no reader takes for a recording.
         locations: how many places; by default one for three recordings.
         compress: whether to write tracks as `.csv.gz`.
         progress: whether to show a progress bar.
@@ -59,12 +60,12 @@ def synthesize(
     """
     if site not in SITES:
         raise unknown_name("site", site, SITES)
-    places = locations or max(1, recordings // RECORDINGS_PER_LOCATION)
-    if recordings < 1 or not minutes * 60.0 >= 1.0 or seed < 0 or places > recordings:
+    places = max(1, recordings // RECORDINGS_PER_LOCATION) if locations is None else locations
+    if not 1 <= places <= recordings or not minutes * 60.0 >= 1.0 or seed < 0:
         raise AspEnvError(
             f"{recordings} recordings of {minutes} minutes at {places} locations with seed {seed} "
-            "cannot be made: at least one recording of a second and more, no more locations than "
-            "recordings, and a seed of 0 or above"
+            "cannot be made: at least one recording of a second and more, at least one location "
+            "and no more than recordings, and a seed of 0 or above"
         )
     with _written_aside(out) as folder, tempfile.TemporaryDirectory() as scratch:
         made: dict[int, Place] = {}
@@ -123,7 +124,7 @@ def _write_recording(
         moving = tracks_in_view(place, motions, users, num_frames=num_frames, noise=rng)
         seen = parked + moving
         (folder / "truth").mkdir(exist_ok=True)
-        write_tracks(folder / "truth" / f"{recording:02d}_tracks{suffix}", recording, true)
+        write_tracks(folder / "truth" / f"{recording:02d}_trueTracks{suffix}", recording, true)
     lat, lon = place.lat_lon_deg
     meta = Meta(
         recording=recording,

@@ -7,8 +7,8 @@ import numpy as np
 from scenarios.synthetic.site import Arm, Site
 
 VEHICLES_PER_HOUR = {
-    "crossroads": (700.0, 950.0),
-    "t-junction": (700.0, 950.0),
+    "crossroads": (850.0, 1150.0),
+    "t-junction": (800.0, 1050.0),
     "roundabout": (1000.0, 1350.0),
     "two-lane-roundabout": (1050.0, 1400.0),
 }

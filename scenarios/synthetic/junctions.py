@@ -62,6 +62,8 @@ def _junction(
         edges.append(edge_xml(f"out{i}", f"k{i}", f"e{i}", far, **road))
         others = [j for j in range(len(angles_rad)) if j != i]
         connections += [connection_xml(f"app{i}", f"exit{j}") for j in others]
+        connections.append(connection_xml(f"in{i}", f"app{i}"))
+        connections.append(connection_xml(f"exit{i}", f"out{i}"))
         if with_crossing[i]:
             connections.append(crossing_xml(f"k{i}", (f"in{i}", f"out{i}")))
         weight = rng.uniform(0.8, 1.2) * (1.5 if is_main else 1.0)

@@ -3,10 +3,11 @@
 import numpy as np
 from jaxtyping import Float
 
-Polyline = Float[np.ndarray, "n 2"]
+Polyline = Float[np.ndarray, "_ 2"]
+"""Points one after the other, metres."""
 
 
-def arc_lengths(line: Polyline) -> Float[np.ndarray, " n"]:
+def arc_lengths(line: Float[np.ndarray, "n 2"]) -> Float[np.ndarray, " n"]:
     """Distance of every point from the first along the line, metres."""
     steps = np.hypot(*np.diff(line, axis=0).T)
     return np.concatenate([[0.0], np.cumsum(steps)])
@@ -24,7 +25,7 @@ def dense(line: Polyline, spacing_m: float) -> Polyline:
     return evenly(line, max(2, round(float(arc_lengths(line)[-1]) / spacing_m) + 1))
 
 
-def normals(line: Polyline) -> Polyline:
+def normals(line: Float[np.ndarray, "n 2"]) -> Float[np.ndarray, "n 2"]:
     """Unit vectors to the left at every point; at a corner the mean of both sides."""
     steps = np.diff(line, axis=0)
     steps = steps / np.hypot(*steps.T)[:, None]
@@ -33,7 +34,9 @@ def normals(line: Polyline) -> Polyline:
     return np.stack([-ahead[:, 1], ahead[:, 0]], axis=1)
 
 
-def offset(line: Polyline, left_m: float | Float[np.ndarray, " n"]) -> Polyline:
+def offset(
+    line: Float[np.ndarray, "n 2"], left_m: float | Float[np.ndarray, " n"]
+) -> Float[np.ndarray, "n 2"]:
     """The line moved to the left, by one distance or by one for each point."""
     return line + normals(line) * np.asarray(left_m).reshape(-1, 1)
 

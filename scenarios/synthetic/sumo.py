@@ -63,7 +63,6 @@ class Movements:
     times_s: Float[np.ndarray, " rows"]
     points: Float[np.ndarray, "rows 2"]
     """Middle of the front bumper; for pedestrians the middle of the body."""
-    collisions: int
 
 
 def _program(name: str) -> tuple[str, dict[str, str]]:
@@ -187,20 +186,12 @@ def simulate(folder: Path, routes: str, *, seconds: float, seed: int) -> Movemen
         "--fcd-output.attributes", "x,y",
         "--output.format", "csv",
         "--precision", "4",
-        "--collision-output", folder / "collisions.csv",
-        "--collision.check-junctions", "true",
         "--collision.action", "warn",
         "--time-to-teleport", "-1",
         "--xml-validation", "never",
         "--no-step-log", "true",
     )  # fmt: skip
-    rows = pd.concat(
-        [
-            pd.read_csv(folder / f"{who}.csv", sep=";", header=0, names=["time", "name", "x", "y"])
-            for who in ("vehicles", "people")
-            if (folder / f"{who}.csv").stat().st_size
-        ]
-    ).dropna()
+    rows = pd.concat([_positions(folder / f"{who}.csv") for who in ("vehicles", "people")])
     names, user = np.unique(rows["name"].to_numpy(dtype=str), return_inverse=True)
     rows = rows.iloc[np.lexsort((rows["time"], user))]
     starts = np.concatenate([[0], np.cumsum(np.bincount(user, minlength=len(names)))])
@@ -209,12 +200,13 @@ def simulate(folder: Path, routes: str, *, seconds: float, seed: int) -> Movemen
         starts=starts,
         times_s=rows["time"].to_numpy(dtype=np.float64),
         points=rows[["x", "y"]].to_numpy(dtype=np.float64),
-        collisions=_count_lines(folder / "collisions.csv"),
     )
 
 
-def _count_lines(path: Path) -> int:
-    if not path.exists():
-        return 0
+def _positions(path: Path) -> pd.DataFrame:
+    columns = ["time", "name", "x", "y"]
     with path.open() as lines:
-        return max(0, sum(1 for _ in lines) - 1)
+        nobody = lines.readline().count(";") < len(columns) - 1
+    if nobody:
+        return pd.DataFrame({column: [] for column in columns})
+    return pd.read_csv(path, sep=";", header=0, names=columns).dropna()

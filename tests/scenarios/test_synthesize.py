@@ -1,0 +1,187 @@
+"""The command, the source and the samples: determinism and faults."""
+
+import hashlib
+import subprocess
+import sys
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+import pytest
+
+from asp_env import registry
+from asp_env.data.source import load
+from asp_env.errors import AspEnvError, MissingExtraError
+from scenarios.synthetic import Synthesize, open_source, plugs, synthesize
+
+SAMPLES = Path(__file__).parents[2] / "asp_env" / "samples"
+
+
+def contents(folder: Path) -> dict[str, str]:
+    """A hash of every file below a folder, by relative path."""
+    return {
+        str(path.relative_to(folder)): hashlib.sha256(path.read_bytes()).hexdigest()
+        for path in sorted(folder.rglob("*"))
+        if path.is_file()
+    }
+
+
+def test_same_seed_same_bytes_in_another_process(short: Path, tmp_path: Path) -> None:
+    """Another process writes the same files, byte for byte."""
+    script = (
+        "from pathlib import Path; from scenarios.synthetic import synthesize; "
+        f"synthesize(Path({str(tmp_path / 'again')!r}), site='intersection', recordings=1, "
+        "minutes=0.1, seed=7)"
+    )
+    subprocess.run([sys.executable, "-c", script], check=True, cwd=Path(__file__).parents[2])
+    assert contents(tmp_path / "again") == contents(short)
+    assert len(contents(short)) == 5
+
+
+def test_another_seed_is_another_place(short: Path, tmp_path: Path) -> None:
+    """Map, picture and tracks of seed 8 differ from those of seed 7."""
+    synthesize(tmp_path / "b", site="intersection", recordings=1, minutes=0.1, seed=8)
+    ours, theirs = contents(tmp_path / "b"), contents(short)
+    assert ours.keys() == theirs.keys()
+    assert not set(ours.values()) & set(theirs.values())
+
+
+def test_noise_keeps_the_truth(short: Path, tmp_path: Path) -> None:
+    """With noise the truth is what comes without, and the measured tracks are centimetres off."""
+    Synthesize(
+        out=tmp_path / "n", site="intersection", recordings=1, minutes=0.1, seed=7, noise=True
+    ).run()
+    truth = tmp_path / "n" / "truth" / "00_trueTracks.csv"
+    assert truth.read_bytes() == (short / "data" / "00_tracks.csv").read_bytes()
+    true, measured = pd.read_csv(truth), pd.read_csv(tmp_path / "n" / "data" / "00_tracks.csv")
+    error = np.hypot(measured.xCenter - true.xCenter, measured.yCenter - true.yCenter)
+    assert 0.005 < error.mean() < 0.1
+    assert error.max() < 0.5
+    assert len(load(tmp_path / "n")) == 1
+
+
+def test_recordings_share_places(tmp_path: Path) -> None:
+    """Three recordings are made at one place, which has one map and one picture."""
+    synthesize(tmp_path / "c", site="roundabout", recordings=3, minutes=0.05, seed=0)
+    files = contents(tmp_path / "c")
+    assert len([name for name in files if name.endswith(".osm")]) == 1
+    assert len({files[name] for name in files if name.endswith(".png")}) == 1
+    assert len({files[name] for name in files if name.endswith("_tracks.csv")}) == 3
+    assert {recording.location for recording in load(tmp_path / "c")} == {"0"}
+
+
+def test_an_unknown_site_lists_those_known(tmp_path: Path) -> None:
+    """One line that names what there is; nothing is written."""
+    with pytest.raises(AspEnvError, match="'motorway': known are intersection, roundabout"):
+        Synthesize(out=tmp_path / "x", site="motorway").run()
+    with pytest.raises(AspEnvError, match="known are intersection, roundabout"):
+        open_source("motorway")
+    assert not list(tmp_path.iterdir())
+
+
+def test_a_folder_with_something_in_it_is_refused(tmp_path: Path) -> None:
+    """What is there stays as it is."""
+    (tmp_path / "mine.txt").write_text("mine")
+    with pytest.raises(AspEnvError, match="not an empty folder"):
+        synthesize(tmp_path, site="intersection", recordings=1, minutes=0.05, seed=0)
+    with pytest.raises(AspEnvError, match="not an empty folder"):
+        synthesize(tmp_path / "mine.txt", site="intersection", recordings=1, minutes=1.0, seed=0)
+    assert contents(tmp_path).keys() == {"mine.txt"}
+
+
+def test_an_unwritable_place_is_refused(tmp_path: Path) -> None:
+    """A file in the way of the folder: one line."""
+    (tmp_path / "file").touch()
+    with pytest.raises(AspEnvError, match="cannot write to") as caught:
+        synthesize(tmp_path / "file" / "out", site="roundabout", recordings=1, minutes=1.0, seed=0)
+    assert "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize(
+    ("recordings", "minutes", "seed", "locations"),
+    [
+        (0, 1.0, 0, None),
+        (1, 0.0, 0, None),
+        (1, float("nan"), 0, None),
+        (1, 1.0, -1, None),
+        (2, 1.0, 0, 3),
+        (2, 1.0, 0, -1),
+    ],
+)
+def test_impossible_numbers_are_refused(
+    tmp_path: Path, recordings: int, minutes: float, seed: int, locations: int | None
+) -> None:
+    """No recordings, no time, a negative seed, or more places than recordings: one line."""
+    with pytest.raises(AspEnvError, match="cannot be made"):
+        synthesize(
+            tmp_path / "x",
+            site="intersection",
+            recordings=recordings,
+            minutes=minutes,
+            seed=seed,
+            locations=locations,
+        )
+    assert not list(tmp_path.iterdir())
+
+
+def test_nothing_half_written_stays(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Without SUMO the error names the extra, and no folder is left."""
+    monkeypatch.setitem(sys.modules, "sumo", None)
+    with pytest.raises(MissingExtraError, match=r"asp-env\[synthetic\]"):
+        synthesize(tmp_path / "x", site="intersection", recordings=1, minutes=1.0, seed=0)
+    assert not list(tmp_path.iterdir())
+
+
+def stand_in(marker: str) -> Callable[..., None]:
+    """Writes one file instead of traffic."""
+
+    def write(out: Path, **_: object) -> None:
+        out.mkdir(parents=True)
+        (out / "marker").write_text(marker)
+
+    return write
+
+
+def test_the_source_is_made_once(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The second call finds what the first one made; nothing else is left in the cache."""
+    monkeypatch.setenv("ASP_ENV_CACHE", str(tmp_path))
+    monkeypatch.setattr(plugs, "synthesize", stand_in("first"))
+    folder = open_source("roundabout")
+    monkeypatch.setattr(plugs, "synthesize", stand_in("second"))
+    assert open_source("roundabout") == folder
+    assert (folder / "marker").read_text() == "first"
+    assert [path.name for path in folder.parent.iterdir()] == [folder.name]
+
+
+def test_the_slower_of_two_takes_what_the_faster_made(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """If the folder appears meanwhile, it is kept and used."""
+    monkeypatch.setenv("ASP_ENV_CACHE", str(tmp_path))
+
+    def overtaken(out: Path, **_: object) -> None:
+        stand_in("slower")(out)
+        stand_in("faster")(tmp_path / "synthetic" / f"intersection-{plugs.SOURCE_VERSION}")
+
+    monkeypatch.setattr(plugs, "synthesize", overtaken)
+    folder = open_source("intersection")
+    assert (folder / "marker").read_text() == "faster"
+    assert [path.name for path in folder.parent.iterdir()] == [folder.name]
+
+
+def test_the_registry_knows_command_and_source() -> None:
+    """`asp-env synthesize` and DATA `synthetic:` lead here."""
+    assert registry.find("commands", "synthesize") is Synthesize
+    assert registry.find("sources", "synthetic") is open_source
+
+
+@pytest.mark.parametrize("name", ["intersection", "roundabout"])
+def test_samples_ship(name: str) -> None:
+    """Two minutes of all classes, read without a repair; both together take under 4 MB."""
+    (recording,) = load(f"sample:{name}")
+    assert recording.num_frames == 3000
+    assert len(np.unique(recording.classes)) == 7
+    assert recording.parked.any()
+    assert recording.repairs == recording.road_map.repairs == ()
+    assert sum(path.stat().st_size for path in SAMPLES.rglob("*") if path.is_file()) < 4_000_000
