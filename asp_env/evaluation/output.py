@@ -49,15 +49,17 @@ def output_folder(out: Path) -> Iterator[Path]:
     """
     if out.exists() and not (out.is_dir() and not any(out.iterdir())):
         raise AspEnvError(f"{out}: exists already; choose another --out or remove it")
-    aside = out.parent / f".{out.name}.{os.getpid()}.partial"
+    home = next(folder for folder in out.absolute().parents if folder.exists())
+    aside = home / f".{out.name}.{os.getpid()}.partial"
     try:
-        aside.mkdir(parents=True)
+        aside.mkdir()
     except OSError as error:
         raise AspEnvError(
             f"{out}: cannot be written ({error.strerror}); choose another --out"
         ) from error
     try:
         yield aside
+        out.parent.mkdir(parents=True, exist_ok=True)
         if out.exists():
             out.rmdir()
         aside.replace(out)

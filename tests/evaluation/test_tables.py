@@ -1,0 +1,80 @@
+"""Tables for terminals, and the short names in them."""
+
+import io
+
+from rich.console import Console
+from rich.table import Table
+
+from asp_env.evaluation.entrants import short_names
+from asp_env.evaluation.output import Row
+from asp_env.evaluation.tables import driving_table, open_loop_tables
+
+
+def _printed(table: Table) -> list[str]:
+    out = io.StringIO()
+    Console(file=out, width=80).print(table)
+    return out.getvalue().splitlines()
+
+
+def _row(metric: str, value: float, **fields) -> Row:
+    known = {"data": "d", "n": 12, "low": value - 0.1, "high": value + 0.1}
+    return Row(metric=metric, value=value, **(known | fields))
+
+
+def test_open_loop_has_a_table_for_every_subset_and_selection():
+    """Two subsets and two selections are four tables with a line for each predictor."""
+    rows = [
+        _row("FDE", 1.0, predictor=name, subset=subset, selection=selection)
+        for name in ("constant-velocity", "ffw-asp:runs/a")
+        for subset in ("all", "moving")
+        for selection in ("most-probable", "best-of-3")
+    ]
+    tables = open_loop_tables(rows)
+    assert len(tables) == 4
+    lines = _printed(tables[0])
+    assert "all targets, most-probable" in lines[0]
+    assert [line.split()[0] for line in lines[-2:]] == ["constant-velocity", "ffw-asp"]
+    assert "1.00 [0.90, 1.10]" in lines[-1]
+
+
+def test_driving_table_keeps_the_order_and_80_columns():
+    """A line for each driver as they came, empty where a metric is missing."""
+    rows = [
+        _row("score", 0.9, planner="expert"),
+        _row("score", 0.5, planner="sampling", predictor="oracle"),
+        _row("comfort", 0.25, planner="sampling", predictor="oracle", n=9),
+    ]
+    lines = _printed(driving_table(rows))
+    assert max(len(line) for line in lines) <= 80
+    assert lines[-2].split()[0] == "expert"
+    assert "0.25" not in lines[-2]
+    assert "sampling + oracle" in lines[-1]
+    assert "0.25" in lines[-1]
+    assert lines[-1].split()[-1] == "12"
+
+
+def test_two_runs_of_one_predictor_are_two_lines():
+    """They are told apart by their folders, and neither hides the other."""
+    rows = [
+        _row("score", value, planner="sampling", predictor=f"ffw-asp:runs/{name}")
+        for name, value in (("a", 0.25), ("b", 0.75))
+    ]
+    lines = _printed(driving_table(rows))
+    assert "ffw-asp a" in lines[-2]
+    assert "0.25" in lines[-2]
+    assert "ffw-asp b" in lines[-1]
+    assert "0.75" in lines[-1]
+
+
+def test_no_interval_without_bounds():
+    """One recording: the value alone."""
+    rows = [_row("score", 0.9, planner="expert", low=None, high=None)]
+    assert "[" not in _printed(driving_table(rows))[-1]
+
+
+def test_short_names_are_as_short_as_they_can_be():
+    """The name alone, with its folder, or with the whole way to it."""
+    assert short_names(["oracle", "mtp:runs/1"]) == {"oracle": "oracle", "mtp:runs/1": "mtp"}
+    assert short_names(["mtp:a/1", "mtp:a/2/"]) == {"mtp:a/1": "mtp 1", "mtp:a/2/": "mtp 2"}
+    assert short_names(["mtp:a/1", "mtp:/b/1"]) == {"mtp:a/1": "mtp a-1", "mtp:/b/1": "mtp b-1"}
+    assert short_names(["oracle", "oracle"]) == {"oracle": "oracle"}
