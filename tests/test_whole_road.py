@@ -8,6 +8,7 @@ import pytest
 
 from asp_env.cli import main
 from asp_env.data.rollout import Rollout
+from tests.real_data import real_data
 
 
 @pytest.fixture(scope="module")
@@ -72,3 +73,22 @@ def test_a_finished_folder_is_not_overwritten(
     assert main(["synthesize", str(traffic)]) == 2
     assert len(capsys.readouterr().err.strip().splitlines()) == 2
     assert sorted(path.stat().st_mtime_ns for path in run.rglob("*")) == before
+
+
+@pytest.mark.data
+def test_the_same_road_on_real_recordings(tmp_path: Path) -> None:
+    """Inspect, train on time blocks, judge and drive on the blocks that are left."""
+    data = str(real_data("karlsruhe"))
+    run = tmp_path / "run"
+    options = ["--split", "blocks", "--epochs", "1", "--max-snippets", "64", "--out", str(run)]
+    named = ["--predictors", "constant-velocity", f"ffw-asp:{run}"]
+    assert main(["inspect", data]) == 0
+    assert main(["train", "ffw-asp", data, *options]) == 0
+    assert main(["evaluate", data, *named, "--out", str(tmp_path / "judged")]) == 0
+    assert main(["drive", data, *named, "--out", str(tmp_path / "driven")]) == 0
+    judged = json.loads((tmp_path / "judged" / "manifest.json").read_text())
+    assert 0 < judged["snippets"] < 200  # a tenth of 1,343, less what lies at the blocks' borders
+    expert = [row for row in _rows(tmp_path / "driven") if row["planner"] == "expert"]
+    by_metric = {row["metric"]: float(row["value"]) for row in expert}
+    assert by_metric["no at-fault collision"] == 1.0
+    assert by_metric["log divergence"] == 0.0

@@ -59,7 +59,7 @@ def num_ticks(recording: Recording, dt_s: float) -> int:
 
 def unseen_ticks(
     recordings: Recordings, trained_on: Sequence[TrainedOn], dt_s: float
-) -> list[Bool[np.ndarray, " ticks"]]:
+) -> list[Bool[np.ndarray, " _"]]:
     """Of each recording, the ticks that none of some predictors learned from or was selected on."""
     unseen = []
     for recording, content in zip(recordings, recordings.hashes(), strict=True):

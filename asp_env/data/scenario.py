@@ -72,7 +72,7 @@ def find_scenarios(
     source: str,
     dt_s: float,
     history: int,
-    allowed: Sequence[Bool[np.ndarray, " ticks"]] | None = None,
+    allowed: Sequence[Bool[np.ndarray, " _"]] | None = None,
 ) -> ScenarioSet:
     """Every stretch of a vehicle's track that is worth driving.
 

@@ -31,8 +31,8 @@ PIPED_WIDTH = 160
 class Drifts:
     """How far the actions of one or more recordings' snippets drift, per horizon."""
 
-    metres: Mapping[float, Float[np.ndarray, " n"]]
-    moving: Mapping[float, Bool[np.ndarray, " n"]]
+    metres: Mapping[float, Float[np.ndarray, " _"]]
+    moving: Mapping[float, Bool[np.ndarray, " _"]]
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -22,7 +22,7 @@ def ticks_to_judge(
     *,
     dt_s: float,
     horizon_s: float,
-) -> tuple[list[Bool[np.ndarray, " ticks"]], str]:
+) -> tuple[list[Bool[np.ndarray, " _"]], str]:
     """The ticks of each recording that may be judged on, and in words which they are.
 
     `auto`: what no predictor has learned from or was selected on. `train`, `validation` and `test`:
@@ -43,7 +43,7 @@ def ticks_to_judge(
     return chosen, f"{part} of the split by recording"
 
 
-def keep_within(index: SnippetIndex, allowed: Sequence[Bool[np.ndarray, " ticks"]]) -> SnippetIndex:
+def keep_within(index: SnippetIndex, allowed: Sequence[Bool[np.ndarray, " _"]]) -> SnippetIndex:
     """The snippets whose every tick is allowed.
 
     Raises:

@@ -155,7 +155,8 @@ def _states(
     course = np.arctan2(velocity_y, velocity_x)
     heading = np.where(known, course[last_moving], heading)
     along = velocity_x * np.cos(heading) + velocity_y * np.sin(heading)
-    speed = np.where(vulnerable, total, along)
+    # the bicycle's speed is that of the box's centre, which slips sideways in bends
+    speed = np.where(vulnerable, total, np.copysign(total, along))
     states = np.stack([measured[:, 0], measured[:, 1], wrap_angle(heading), speed], axis=-1)
     return states.astype(np.float32)
 
