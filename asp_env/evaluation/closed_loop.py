@@ -29,6 +29,7 @@ from asp_env.evaluation.unseen import PartChoice, nothing_left, ticks_to_judge
 from asp_env.metrics.driving import driving_metrics
 from asp_env.metrics.masked import Masked
 from asp_env.planning.planner import Planner, load_planner
+from asp_env.sim.drivers import make_driver
 from asp_env.sim.world import Ending
 
 EPISODES_AT_ONCE = 64
@@ -102,6 +103,7 @@ class ClosedLoop:
 
 def drive(config: Drive) -> ClosedLoop:
     """Drives with every predictor, the expert first."""
+    make_driver(config.traffic)  # an unknown name is refused before anything is computed
     recordings = open_data(config.data)
     horizon, history = ticks(config.horizon, config.dt), ticks(HISTORY_S, config.dt)
     predictors = load_predictors(config.predictors, horizon=horizon, dt_s=config.dt)
