@@ -52,6 +52,8 @@ class Episodes:
     route_valid: Bool[np.ndarray, "b p"]
     on_route: Float[np.ndarray, "b 3"]
     """The ego's arc length m, offset to the left m, and the route's heading rad there."""
+    contacts: Int[np.ndarray, "b a"]
+    """`Contact` of the ego with each agent; one that lasts keeps the class of its first tick."""
     goal_m: Float[np.ndarray, " b"]
     recording: Int[np.ndarray, " b"]
     start_tick: Int[np.ndarray, " b"]
@@ -168,6 +170,7 @@ class ReplayWorld:
             route=route,
             route_valid=route_valid,
             on_route=route_coordinates(route, route_valid, states[:, now, EGO], np.zeros(1)),
+            contacts=ego_contacts(states[:, now], recording.sizes[tracks][None], valid[:, now]),
             goal_m=goal,
             recording=np.full(1, scenario.recording),
             start_tick=np.full(1, scenario.start_tick),
@@ -216,6 +219,16 @@ class ReplayWorld:
         near = np.maximum(data.on_route[:, 0], 0.0)
         on_route = route_coordinates(data.route, data.route_valid, self.ego_states(), near)
         data.on_route[rows] = on_route[rows]
+        self._judge_contacts()
+
+    def _judge_contacts(self) -> None:
+        """Brings contacts up to now. As in nuPlan, whose fault one is shows when it begins."""
+        data, rows = self.episodes, np.arange(len(self))
+        states = np.ascontiguousarray(data.states[rows, self.now])
+        valid = np.ascontiguousarray(data.valid[rows, self.now])
+        found = ego_contacts(states, data.sizes, valid)
+        lasts = (found > 0) & (data.contacts > 0)
+        data.contacts = np.where(lasts, data.contacts, found)
 
     def scene(self) -> Scene:
         """All that may be known now; targets are all present agents but the ego."""
@@ -256,17 +269,14 @@ class ReplayWorld:
     def events(self) -> Events:
         """What holds now."""
         data = self.episodes
-        rows = np.arange(len(self))
-        states = np.ascontiguousarray(data.states[rows, self.now])
-        valid = np.ascontiguousarray(data.valid[rows, self.now])
-        egos = states[:, EGO]
+        egos = self.ego_states()
         maps, map_index = self.maps()
         outside = np.zeros(len(self), dtype=np.float32)
         for number, road_map in enumerate(maps):
             here = map_index == number
             outside[here] = off_road_m(road_map, egos[here], data.sizes[here, EGO])
         return Events(
-            contacts=ego_contacts(states, data.sizes, valid),
+            contacts=data.contacts.copy(),
             off_road_m=outside,
             route_m=data.on_route[:, 0].copy(),
             route_offset_m=data.on_route[:, 1].copy(),
@@ -303,6 +313,7 @@ def _allocate(num_episodes: int, *, agents: int, ticks: int, points: int) -> Epi
         route=np.zeros((b, p, 2), dtype=np.float32),
         route_valid=np.zeros((b, p), dtype=bool),
         on_route=np.zeros((b, 3)),
+        contacts=np.zeros((b, a), dtype=np.int8),
         goal_m=np.zeros(b),
         recording=np.zeros(b, dtype=np.int64),
         start_tick=np.zeros(b, dtype=np.int64),

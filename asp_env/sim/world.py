@@ -31,7 +31,7 @@ class Events:
     """What holds now in each of B episodes."""
 
     contacts: Int[np.ndarray, "b a"]
-    """`Contact` of the ego with each agent."""
+    """`Contact` of the ego with each agent; one that lasts keeps the class of its first tick."""
     off_road_m: Float[np.ndarray, " b"]
     """How far the ego's outermost corner lies outside the drivable area."""
     route_m: Float[np.ndarray, " b"]

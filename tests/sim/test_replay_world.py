@@ -185,6 +185,31 @@ def test_hit_from_behind_is_not_the_egos_fault():
     assert events.at_fault.tolist() == [False]
 
 
+def test_whose_fault_a_contact_is_shows_when_it_begins():
+    """A replayed car drives into the standing ego; moving off inside it is no new collision.
+
+    Alone the last state would be a front of the ego in somebody. After the ego is out of it and
+    stands, the next one that comes is judged anew.
+    """
+    followers = (car(-95.0, 6.0), car(-120.0, 6.0))
+    recording = make_recording(drives=(car(-84.0, 6.0), *followers), duration_s=14.0)
+    simulation = simulate(recording, scenario(length=50))
+    drive(simulation, [(-5.0, 0.0)] * 9)
+    classes = []
+    while not simulation.world.events().collision[0]:
+        drive(simulation, [(0.0, 0.0)])
+    while simulation.world.events().collision[0]:
+        classes.append(int(simulation.world.events().contacts[0, 1]))
+        assert not simulation.world.events().at_fault[0]
+        drive(simulation, [(1.0, 0.0)])
+    assert set(classes) == {Contact.EGO_STANDS}
+    assert len(classes) > 5
+    drive(simulation, [(-5.0, 0.0)] * 3)
+    while not simulation.world.events().collision[0]:
+        drive(simulation, [(0.0, 0.0)])
+    assert simulation.world.events().contacts[0].tolist() == [0, 0, Contact.EGO_STANDS]
+
+
 def test_off_road_by_hand():
     """Road edge at y = -3.5; a car of 1.8 m at y = -3.5 sticks out by 0.9 m, at -2.5 not at all."""
     for y_m, outside_m in ((-2.5, 0.0), (-3.5, 0.9)):
