@@ -55,7 +55,7 @@ class Fit(pl.LightningModule):
         self._validation = validation
         self._errors: list[dict[str, np.ndarray]] = []
         count = len(training.snippets)
-        self._per_epoch = config.snippets_per_epoch or count
+        self._per_epoch = min(config.snippets_per_epoch or count, count)
         self._steps = config.epochs * -(-self._per_epoch // config.batch_size)
 
     def train_dataloader(self) -> Iterable[tuple[Batch, Labels]]:

@@ -32,7 +32,7 @@ class TrainingConfig:
     """Standing targets are at most this share of the training snippets."""
     epochs: int = 10
     snippets_per_epoch: int | None = None
-    """None: all of them. A number makes the time of a run independent of the data's size."""
+    """At most; None shows all of them in every epoch. Bounds the time of a run on much data."""
     batch_size: int = 32
     learning_rate: float = 1e-4
     weight_decay: float = 0.0
