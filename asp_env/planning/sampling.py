@@ -12,7 +12,7 @@ from numba import njit
 from asp_env.data.forecast import Forecast
 from asp_env.data.scene import Scene
 from asp_env.dynamics import MAX_ACCELERATION_MPS2, forward, wrap_angle
-from asp_env.metrics.boxes import overlaps
+from asp_env.metrics.boxes import STANDING_MPS, overlaps
 from asp_env.metrics.drivable import OFF_ROAD_M, off_road_m
 from asp_env.metrics.route import project, route_coordinates
 from asp_env.planning.idm import RouteLimits
@@ -50,6 +50,9 @@ MARGIN_M = 0.4
 HEADWAY_S = 0.5
 """And the ego's is lengthened ahead by this time at its speed."""
 
+NEVER, EXCUSED = -1, -2
+"""In place of the step of a touch."""
+
 
 class SamplingPlanner:
     """The cheapest of 90 ways along the ego's route.
@@ -58,7 +61,7 @@ class SamplingPlanner:
     bends allows, and steers by pure pursuit of the route or of a line 0.8 m beside it; the bicycle
     model makes its states. Its danger is the probability, over the forecast's modes, to touch
     anybody: a touch counts with the probability of its mode, agents count as independent, and one
-    who runs into the ego's rear does not count.
+    who runs into the ego's rear, or into the standing ego, does not count.
     """
 
     name = "sampling"
@@ -185,7 +188,10 @@ def _control(state, arc, lengths, profiles, later, dt_s, routes, counts, limits,
 @njit(cache=True)
 @no_type_check
 def _first_touch(plan, size, other, other_size, margin):
-    """The first step at which the boxes overlap, -1 for never; rear-end hits do not count."""
+    """The first step at which the boxes overlap, `NEVER`, or `EXCUSED`.
+
+    Excused, as in nuPlan, is who is hit in the rear, or is hit while standing.
+    """
     for t in range(len(plan)):
         x, y, heading, speed = plan[t]
         lead = HEADWAY_S * max(speed, 0.0) if margin > 0.0 else 0.0
@@ -196,10 +202,10 @@ def _first_touch(plan, size, other, other_size, margin):
             other[t, 0], other[t, 1], other[t, 2], other_size[0], other_size[1],
         ):  # fmt: skip
             ahead = (other[t, 0] - x) * math.cos(heading) + (other[t, 1] - y) * math.sin(heading)
-            if ahead < -0.5 * size[0]:
-                return -1
+            if ahead < -0.5 * size[0] or (margin == 0.0 and abs(speed) <= STANDING_MPS):
+                return EXCUSED
             return t
-    return -1
+    return NEVER
 
 
 @njit(cache=True)
@@ -214,9 +220,10 @@ def _weigh(plans, sizes, others, probabilities, other_sizes, starts, touched, cl
                 for m in range(others.shape[1]):
                     p = probabilities[n, m]
                     at = _first_touch(plans[b, c], sizes[b], others[n, m], other_sizes[n], MARGIN_M)
-                    if at < 0:
+                    if at == NEVER:
                         continue
-                    near += p * (1.0 - 0.5 * at / steps)
+                    if at >= 0:
+                        near += p * (1.0 - 0.5 * at / steps)
                     at = _first_touch(plans[b, c], sizes[b], others[n, m], other_sizes[n], 0.0)
                     if at >= 0:
                         hit += p * (1.0 - 0.5 * at / steps)

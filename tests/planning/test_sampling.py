@@ -103,6 +103,34 @@ def test_somebody_behind_is_not_fled_from():
     assert planner.plan(chased, straight_on(chased)).states.tobytes() == alone.tobytes()
 
 
+def test_stands_while_somebody_walks_into_it():
+    """A pedestrian who will touch the standing ego whatever it does: it waits, and is not at fault.
+
+    Moving off would be touching first.
+    """
+    walker = Drive(kind=AgentClass.PEDESTRIAN, start=(2.6, -6.0, np.pi / 2, 0.0), appears_s=0.2)
+    queue = car(0.0, 0.0, (4.0, 0, 0), (10.0, 1.0, 0), appears_s=0.2)
+    recording = make_recording(drives=(queue, walker), duration_s=16.0)
+    scene = simulate(recording, scenario(1, start=17, length=60)).world.scene()
+    forecast = straight_on(scene)
+    planner = SamplingPlanner()
+    assert planner.plan(scene, forecast).actions[0, 0, 0] > 0.5
+    along = np.linspace(-2.95, -1.5, STEPS, dtype=np.float32)
+    forecast.states[0, 0, :, 0], forecast.states[0, 0, :, 1] = 2.0, along
+    plan = planner.plan(scene, forecast)
+    assert plan.actions[0, 0, 0] == 0.0
+    assert plan.states[0, :, 3].max() < 0.1
+
+
+def test_does_not_move_into_the_car_it_stands_behind():
+    """0.3 m from bumper to bumper is within the margin from the start; touching still counts."""
+    queue = (car(0.0, 0.0, (5.0, 0, 0), (9.0, 1.0, 0), appears_s=0.2), car(4.8, 0.0))
+    recording = make_recording(drives=queue, duration_s=16.0)
+    scene = simulate(recording, scenario(1, start=17, length=60)).world.scene()
+    plan = SamplingPlanner().plan(scene, straight_on(scene))
+    assert plan.states[0, -1, 0] < 0.3
+
+
 def test_slows_down_for_a_bend():
     """A quarter turn of 12 m radius: about √(2.5·12) = 5.5 m/s in it.
 
