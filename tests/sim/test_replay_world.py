@@ -8,9 +8,12 @@ import pytest
 
 from asp_env.data.classes import AgentClass
 from asp_env.data.recording import Recording
+from asp_env.data.scenario import find_scenarios
+from asp_env.data.source import open_data
 from asp_env.errors import AspEnvError
 from asp_env.metrics.boxes import Contact
 from tests.builders import Drive, make_recording
+from tests.real_data import real_data
 from tests.sim.worlds import (
     DT_S,
     HISTORY,
@@ -337,3 +340,18 @@ def test_earlier_scenes_are_not_written_to():
     drive(simulation, [(1.0, 0.1)] * 2)
     for name, array in arrays.items():
         assert array.tobytes() == kept[name].tobytes(), name
+
+
+@pytest.mark.data
+def test_real_recordings_are_repeated_bit_for_bit():
+    """Every scenario of the Karlsruhe recordings under `log`: states and presence are the log's."""
+    recordings = open_data(real_data("karlsruhe"))
+    found = list(find_scenarios(recordings, source="", dt_s=DT_S, history=HISTORY))
+    assert len(found) > 20
+    simulation = simulate(list(recordings), found)
+    replay(simulation, max(each.length for each in found))
+    episodes = simulation.world.episodes
+    assert np.array_equal(episodes.valid, episodes.log_valid)
+    assert episodes.states.tobytes() == episodes.log_states.tobytes()
+    events = simulation.world.events()
+    assert events.route_m == pytest.approx(events.goal_m, abs=0.5)
