@@ -3,15 +3,13 @@
 import csv
 import re
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from pathlib import Path, PurePath
 
 from asp_env.errors import DataError
+from asp_env.evaluation.output import Row
 
-COLUMNS = (
-    "data", "predictor", "trained_on", "view", "preset", "chaining", "planner", "traffic",
-    "latency_ticks", "horizon_s", "selection", "subset", "metric", "value", "low", "high", "n",
-)  # fmt: skip
+COLUMNS = tuple(field.name for field in fields(Row))
 DETAILS = ("trained_on", "view", "preset", "chaining", "traffic", "latency_ticks")
 """Columns that tell rows of one predictor or planner apart, where they differ."""
 PRIVILEGED = frozenset({"oracle", "expert"})
