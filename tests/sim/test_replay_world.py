@@ -1,13 +1,11 @@
 """What happens in a world of replayed recordings, step by step."""
 
-import dataclasses
 import math
 
 import numpy as np
 import pytest
 
 from asp_env.data.classes import AgentClass
-from asp_env.data.recording import Recording
 from asp_env.data.scenario import find_scenarios
 from asp_env.data.source import open_data
 from asp_env.errors import AspEnvError
@@ -261,85 +259,6 @@ def test_a_loop_that_ends_at_its_start_is_not_cut_short():
     for _ in range(3):
         drive(simulation, [(0.0, 0.0)])
         assert simulation.world.events().route_m[0] == pytest.approx(-0.3, abs=0.05)
-
-
-def test_a_scene_shows_what_there_is():
-    """Shapes of the contract: 15 past ticks and now, actions between them, targets but the ego."""
-    recording = make_recording()
-    simulation = simulate(recording, [scenario(1, length=20), scenario(3, start=30)])
-    drive(simulation, [(0.0, 0.0)] * 2)
-    scene = simulation.world.scene()
-    agents = scene.ids.shape[1]
-    assert scene.states.shape == (2, agents, 16, 4)
-    assert scene.actions.shape == (2, agents, 15, 2)
-    assert scene.tick.tolist() == [17, 32]
-    assert scene.dt_s == DT_S
-    present = {(b, a) for b, a in np.argwhere(scene.valid[..., -1]).tolist() if a}
-    assert {(b, a) for b, a in scene.targets.tolist()} == present
-    absent = ~scene.valid.any(axis=-1)
-    assert absent.any()
-    assert (scene.ids[absent] == -1).all()
-    assert not scene.sizes[absent].any()
-    assert not scene.states[~scene.valid].any()
-
-
-def test_actions_of_a_scene_are_inferred_from_its_states():
-    """After a step with 2 m/s² the last action of the ego is 2 m/s², whoever drove it."""
-    simulation = simulate(on_road(), scenario())
-    drive(simulation, [(2.0, 0.1)])
-    action = simulation.world.scene().actions[0, 0, -1]
-    assert action == pytest.approx([2.0, 0.1], abs=2e-3)
-
-
-def _with_other_future(recording: Recording, frame: int, keep: int) -> Recording:
-    """The recording with everybody's rows but one track's changed behind a frame."""
-    states = recording.states.copy()
-    for track in range(len(recording)):
-        first = int(recording.first_frames[track])
-        rows = states[recording.starts[track] : recording.starts[track + 1]]
-        if track != keep:
-            rows[max(frame + 1 - first, 0) :, :3] += 7.0
-    return dataclasses.replace(recording, states=states)
-
-
-@pytest.mark.parametrize("traffic", ["log", "idm"])
-def test_a_scene_holds_no_future(traffic):
-    """Other tracks' rows behind the present frame can be anything: the scene is the same bits."""
-    recording = make_recording()
-    steps, start = 8, HISTORY
-    changed = _with_other_future(recording, frame=5 * start, keep=0)
-    scenes = []
-    for each in (recording, changed):
-        scenes.append(simulate(each, scenario(1, start=start), traffic).world.scene())
-    for field in dataclasses.fields(scenes[0]):
-        before, after = (getattr(scene, field.name) for scene in scenes)
-        if isinstance(before, np.ndarray):
-            assert before.tobytes() == after.tobytes(), field.name
-    if traffic == "log":
-        late = _with_other_future(recording, frame=5 * (start + steps), keep=0)
-        pair = [simulate(each, scenario(1, start=start)) for each in (recording, late)]
-        for each in pair:
-            replay(each, steps)
-        first, second = (each.world.scene() for each in pair)
-        assert first.states.tobytes() == second.states.tobytes()
-
-
-def test_earlier_scenes_are_not_written_to():
-    """Steps and resets leave the arrays of a scene that was handed out before as they were."""
-    simulation = simulate(make_recording(), scenario(1))
-    scene, events = simulation.world.scene(), simulation.world.events()
-    arrays = {
-        (kind, field.name): getattr(given, field.name)
-        for kind, given in (("scene", scene), ("events", events))
-        for field in dataclasses.fields(given)
-        if isinstance(getattr(given, field.name), np.ndarray)
-    }
-    kept = {name: array.copy() for name, array in arrays.items()}
-    drive(simulation, [(1.0, 0.1)] * 3)
-    simulation.reset([scenario(3, start=20)], [np.random.default_rng(1)])
-    drive(simulation, [(1.0, 0.1)] * 2)
-    for name, array in arrays.items():
-        assert array.tobytes() == kept[name].tobytes(), name
 
 
 @pytest.mark.data
