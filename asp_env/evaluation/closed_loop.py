@@ -23,7 +23,7 @@ from asp_env.evaluation import intervals
 from asp_env.evaluation.entrants import load_predictors, short_names
 from asp_env.evaluation.episodes import drive_episodes
 from asp_env.evaluation.output import Row, output_folder, write_manifest, write_metrics
-from asp_env.evaluation.report import write_report
+from asp_env.evaluation.report import check_report_possible, write_report
 from asp_env.evaluation.tables import driving_table
 from asp_env.evaluation.unseen import PartChoice, nothing_left, ticks_to_judge
 from asp_env.metrics.driving import driving_metrics
@@ -67,6 +67,7 @@ class Drive:
 
     def run(self) -> None:
         """Drives, writes the folder, prints the table; the expert stands first."""
+        check_report_possible()
         with output_folder(self.out) as folder:
             result = drive(self)
             write_metrics(folder, result.rows)

@@ -11,7 +11,7 @@ from asp_env import registry
 from asp_env.evaluation.closed_loop import Drive, drive, save_rollouts
 from asp_env.evaluation.open_loop import Evaluate, evaluate
 from asp_env.evaluation.output import output_folder, write_manifest, write_metrics
-from asp_env.evaluation.report import write_report
+from asp_env.evaluation.report import check_report_possible, write_report
 from asp_env.evaluation.tables import driving_table, open_loop_tables
 
 SITE = "intersection"
@@ -40,6 +40,7 @@ class Demo:
 
     def run(self) -> None:
         """Runs every step that is not done yet, then writes the results anew."""
+        check_report_possible()
         console = Console()
         training, held_out = self.out / "traffic", self.out / "held-out"
         for folder, what in ((training, TRAINING), (held_out, HELD_OUT)):
@@ -64,7 +65,6 @@ class Demo:
                 data=str(held_out),
                 out=self.out,
                 predictors=("oracle", "constant-velocity", trained),
-                traffic="idm",
                 scenarios=SCENARIOS,
             )
         )

@@ -27,7 +27,7 @@ from asp_env.errors import AspEnvError
 from asp_env.evaluation import intervals
 from asp_env.evaluation.entrants import load_predictors
 from asp_env.evaluation.output import Row, output_folder, write_manifest, write_metrics
-from asp_env.evaluation.report import ForecastExamples, write_report
+from asp_env.evaluation.report import ForecastExamples, check_report_possible, write_report
 from asp_env.evaluation.tables import open_loop_tables
 from asp_env.evaluation.unseen import PartChoice, keep_within, ticks_to_judge
 from asp_env.metrics.open_loop import SELECTIONS, errors_over_time, moving, open_loop_errors
@@ -64,6 +64,7 @@ class Evaluate:
 
     def run(self) -> None:
         """Evaluates, writes the folder, prints the table."""
+        check_report_possible()
         with output_folder(self.out) as folder:
             result = evaluate(self)
             write_metrics(folder, result.rows)

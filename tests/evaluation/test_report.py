@@ -1,6 +1,5 @@
 """The report: what it says, that it works in a browser, and that it asks no network."""
 
-import builtins
 import json
 import re
 import shutil
@@ -193,14 +192,7 @@ def test_examples_that_do_not_belong_together_are_refused() -> None:
 def test_without_plotly_the_extra_is_named(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """One line that says what to install."""
     write_tables(tmp_path, metric_rows()[:1])
-    real = builtins.__import__
-
-    def without(name: str, *args: Any, **kwargs: Any) -> Any:
-        if name.startswith("plotly"):
-            raise ModuleNotFoundError(name=name)
-        return real(name, *args, **kwargs)
-
-    monkeypatch.setattr(builtins, "__import__", without)
+    monkeypatch.setattr("asp_env.evaluation.report.page.find_spec", lambda name: None)
     with pytest.raises(MissingExtraError, match=r"'plotly'.*asp-env\[report\]"):
         write_report(tmp_path, title="x")
 

@@ -5,6 +5,7 @@ import os
 from collections.abc import Mapping
 from html import escape
 from importlib.resources import files
+from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
@@ -23,6 +24,16 @@ from asp_env.evaluation.report.tables import tables
 
 ASSETS = files("asp_env.evaluation.report") / "assets"
 SCRIPTS = ("draw.js", "pictures.js", "replay.js", "page.js")
+
+
+def check_report_possible() -> None:
+    """For commands that work for minutes before they write their report.
+
+    Raises:
+        MissingExtraError: plotly is not installed.
+    """
+    if find_spec("plotly") is None:
+        raise MissingExtraError("plotly", "report", "a report")
 
 
 def write_report(
@@ -50,12 +61,10 @@ def write_report(
         MissingExtraError: plotly is not installed.
         DataError: a file is missing or damaged, or a rollout's map was not given.
     """
-    try:
-        from plotly.offline import get_plotlyjs
+    check_report_possible()
+    from plotly.offline import get_plotlyjs
 
-        from asp_env.evaluation.report import plots
-    except ModuleNotFoundError as error:
-        raise MissingExtraError("plotly", "report", "a report") from error
+    from asp_env.evaluation.report import plots
 
     results = read_results(out / "metrics.csv")
     colour = plots.colours(results.predictors)
