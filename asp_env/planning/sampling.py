@@ -37,7 +37,7 @@ class Weights:
     """Times the square of the step in acceleration from the last tick, (m/s²)²."""
     off_road: float = 50.0
     """Where a corner leaves the road by more than nuPlan's tolerance."""
-    offset: float = 0.3
+    offset: float = 3.0
     """Times the mean distance from the route, m."""
 
 
@@ -52,6 +52,18 @@ HEADWAY_S = 0.5
 
 NEVER, EXCUSED = -1, -2
 """In place of the step of a touch."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class _Ways:
+    """C candidates for each of B egos over T ticks."""
+
+    actions: Float[np.ndarray, "b c t 2"]
+    states: Float[np.ndarray, "b c t 4"]
+    gained_m: Float[np.ndarray, "b c"]
+    """Arc length along the route from the first to the last action."""
+    aside_m: Float[np.ndarray, "b c"]
+    """Mean distance from the route."""
 
 
 class SamplingPlanner:
@@ -79,12 +91,11 @@ class SamplingPlanner:
         """The cheapest candidate of each situation; the first of equals."""
         steps = forecast.states.shape[2]
         limits, counts = self._limits.of(scene)
-        actions, states, arcs = self._roll_out(scene, limits, counts, steps)
-        touched, close = self._danger(scene, forecast, states)
-        cost = self._cost(scene, actions, states, arcs, touched, close)
-        best = cost.argmin(axis=1)
+        ways = self._roll_out(scene, limits, counts, steps)
+        touched, close = self._danger(scene, forecast, ways.states)
+        best = self._cost(scene, ways, touched, close).argmin(axis=1)
         rows = np.arange(len(best))
-        return Plan(actions=actions[rows, best], states=states[rows, best])
+        return Plan(actions=ways.actions[rows, best], states=ways.states[rows, best])
 
     def _roll_out(
         self,
@@ -92,9 +103,7 @@ class SamplingPlanner:
         limits: Float[np.ndarray, "b p"],
         counts: Int[np.ndarray, " b"],
         steps: int,
-    ) -> tuple[
-        Float[np.ndarray, "b c t 2"], Float[np.ndarray, "b c t 4"], Float[np.ndarray, "b c t"]
-    ]:
+    ) -> _Ways:
         shape = (len(counts), len(self._profiles))
         egos = np.ascontiguousarray(scene.states[:, EGO, -1])
         lengths = np.maximum(scene.sizes[:, EGO, 0], 0.1)
@@ -103,16 +112,17 @@ class SamplingPlanner:
         arc = np.repeat(start[:, :1], shape[1], axis=1)
         actions = np.zeros((*shape, steps, 2), dtype=np.float32)
         states = np.zeros((*shape, steps, 4), dtype=np.float32)
-        arcs = np.zeros((*shape, steps))
+        offset, aside = np.zeros(shape), np.zeros(shape)
         switch = round(SWITCH_S / scene.dt_s)
         for k in range(steps):
             _control(
-                state, arc, lengths, self._profiles, k >= switch, scene.dt_s,
+                state, arc, offset, lengths, self._profiles, k >= switch, scene.dt_s,
                 scene.route, counts, limits, actions[:, :, k],
             )  # fmt: skip
             state = forward(state, actions[:, :, k], lengths[:, None], scene.dt_s)
-            states[:, :, k], arcs[:, :, k] = state, arc
-        return actions, states, arcs
+            states[:, :, k] = state
+            aside += np.abs(offset) / steps
+        return _Ways(actions=actions, states=states, gained_m=arc - start[:, :1], aside_m=aside)
 
     def _danger(
         self, scene: Scene, forecast: Forecast, states: Float[np.ndarray, "b c t 4"]
@@ -137,43 +147,41 @@ class SamplingPlanner:
     def _cost(
         self,
         scene: Scene,
-        actions: Float[np.ndarray, "b c t 2"],
-        states: Float[np.ndarray, "b c t 4"],
-        arcs: Float[np.ndarray, "b c t"],
+        ways: _Ways,
         touched: Float[np.ndarray, "b c"],
         close: Float[np.ndarray, "b c"],
     ) -> Float[np.ndarray, "b c"]:
         weights = self.weights
         before = scene.actions[:, EGO, -1, 0][:, None]
-        speeds = states[..., 3]
-        turned = wrap_angle(np.diff(states[..., 2], axis=-1))
+        speeds = ways.states[..., 3]
+        turned = wrap_angle(np.diff(ways.states[..., 2], axis=-1))
         lateral = speeds[..., 1:] * turned / scene.dt_s
-        strain = (actions[..., 0] ** 2).mean(axis=-1) + (lateral**2).mean(axis=-1)
-        outside = np.zeros(arcs.shape)
+        strain = (ways.actions[..., 0] ** 2).mean(axis=-1) + (lateral**2).mean(axis=-1)
+        outside = np.zeros(speeds.shape)
         for b, index in enumerate(scene.map_index):
-            size = np.broadcast_to(scene.sizes[b, EGO], (*arcs.shape[1:], 2))
-            outside[b] = off_road_m(scene.maps[int(index)], states[b], size)
+            size = np.broadcast_to(scene.sizes[b, EGO], (*speeds.shape[1:], 2))
+            outside[b] = off_road_m(scene.maps[int(index)], ways.states[b], size)
         # who is off the road already is not punished for staying there
         leaves = outside.max(axis=-1) > np.maximum(OFF_ROAD_M, outside[..., 0])
         return (
             weights.collision * touched
             + weights.closeness * close
-            - weights.progress * (arcs[..., -1] - arcs[..., 0])
+            - weights.progress * ways.gained_m
             + weights.comfort * strain
-            + weights.change * np.minimum((actions[..., 0, 0] - before) ** 2, 25.0)
+            + weights.change * np.minimum((ways.actions[..., 0, 0] - before) ** 2, 25.0)
             + weights.off_road * leaves
-            + weights.offset * np.abs(self._profiles[:, 2])
+            + weights.offset * ways.aside_m
         )
 
 
 @njit(cache=True)
 @no_type_check
-def _control(state, arc, lengths, profiles, later, dt_s, routes, counts, limits, actions):
+def _control(state, arc, offset, lengths, profiles, later, dt_s, routes, counts, limits, actions):
     for b in range(state.shape[0]):
         for c in range(state.shape[1]):
             x, y, heading, speed = state[b, c]
-            along, _, _ = project(routes[b], counts[b], x, y, max(arc[b, c], 0.0), 10.0)
-            arc[b, c] = along
+            along, left, _ = project(routes[b], counts[b], x, y, max(arc[b, c], 0.0), 10.0)
+            arc[b, c], offset[b, c] = along, left
             wanted = profiles[c, 1] if later else profiles[c, 0]
             at = min(max(int(along + 0.5), 0), counts[b] - 1)
             most = max((limits[b, at] - speed) / dt_s, -2.5)

@@ -192,7 +192,7 @@ def test_examples_that_do_not_belong_together_are_refused() -> None:
 def test_without_plotly_the_extra_is_named(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """One line that says what to install."""
     write_tables(tmp_path, metric_rows()[:1])
-    monkeypatch.setattr("asp_env.evaluation.report.page.find_spec", lambda name: None)
+    monkeypatch.setattr("asp_env.evaluation.report.page.find_spec", lambda _: None)
     with pytest.raises(MissingExtraError, match=r"'plotly'.*asp-env\[report\]"):
         write_report(tmp_path, title="x")
 
