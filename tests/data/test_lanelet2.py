@@ -1,7 +1,6 @@
 """Lanelet2 maps: frame, direction, topology, and what is mended."""
 
 import math
-import os
 from collections.abc import Mapping, Sequence
 from itertools import pairwise
 from pathlib import Path
@@ -15,13 +14,10 @@ from asp_env.data.readers.lanelet2 import Origin, project, read_lanelet2
 from asp_env.data.road_map import LineType, RoadMap
 from asp_env.data.source import open_data
 from tests.data.levelx_files import ORIGIN_M, osm, two_lane_road
+from tests.real_data import real_data
 
 ORIGIN = Origin(x_m=ORIGIN_M[0], y_m=ORIGIN_M[1], longitude_deg=6.1, latitude_deg=50.5)
 ROAD = {"type": "lanelet", "subtype": "road"}
-KARLSRUHE = (
-    Path(os.environ.get("ASP_ENV_TEST_DATA", Path(__file__).parents[3] / "shared" / "data"))
-    / "karlsruhe"
-)
 
 Ways = dict[str, tuple[Sequence[tuple[float, float]], Mapping[str, str]]]
 Lanelets = dict[str, tuple[Mapping[str, str], Mapping[str, str]]]
@@ -293,14 +289,13 @@ def test_repairs(tmp_path: Path, old: str, new: str, lanes: int, repair: str) ->
 
 
 @pytest.mark.data
-@pytest.mark.skipif(not KARLSRUHE.is_dir(), reason=f"no real recordings in {KARLSRUHE}")
 @pytest.mark.parametrize("location", ["1", "2"])
 def test_real_cars_drive_along_their_lanes(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, location: str
 ) -> None:
     """Of cars over 2 m/s within 2 m of a lane, 98 % have one there that runs their way (±30°)."""
     monkeypatch.setenv("ASP_ENV_CACHE", str(tmp_path))
-    found = [each for each in open_data(KARLSRUHE) if each.location == location]
+    found = [each for each in open_data(real_data("karlsruhe")) if each.location == location]
     lanes = found[0].road_map.lanes
     points, courses = [], []
     for lane in (lanes[i] for i in range(len(lanes))):
