@@ -38,6 +38,8 @@ SAVED_ROLLOUTS = 6
 """So many scenarios' rollouts are kept to look at, of every driver."""
 
 EXPERT = "expert"
+REFERENCE = "constant-velocity"
+"""Scores are also given as differences to those with this predictor, paired by scenario."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -135,7 +137,8 @@ def drive(config: Drive) -> ClosedLoop:
             )
             for entrant in entrants
         ]  # fmt: skip
-    rows = [row for run in runs for row in _rows(config, run, scenarios)]
+    reference = next((run for run in runs if run.predictor == REFERENCE), None)
+    rows = [row for run in runs for row in _rows(config, run, reference, scenarios)]
     short = short_names(config.predictors)
     drivers = {
         f"{run.planner} + {short[run.predictor]}" if run.predictor else run.planner: run
@@ -222,10 +225,16 @@ def _drive_all(
     )
 
 
-def _rows(config: Drive, run: _Run, scenarios: Sequence[Scenario]) -> list[Row]:
+def _rows(
+    config: Drive, run: _Run, reference: _Run | None, scenarios: Sequence[Scenario]
+) -> list[Row]:
     groups = np.array([scenario.recording for scenario in scenarios])
+    values = dict(run.metrics)
+    if reference is not None and run is not reference:
+        gain = run.metrics["score"].value - reference.metrics["score"].value
+        values[f"score - {REFERENCE}"] = Masked(value=gain, valid=run.metrics["score"].valid)
     rows = []
-    for metric, found in run.metrics.items():
+    for metric, found in values.items():
         if not found.valid.any():
             continue
         estimate = intervals.mean(found.value[found.valid], groups[found.valid])

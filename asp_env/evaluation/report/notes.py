@@ -49,12 +49,18 @@ NOTES = {
         "higher",
         "No fault times on road times (5 progress + 5 TTC + 2 comfort) / 12, as in NAVSIM's PDMS.",
     ),
+    "score - constant-velocity": _note(
+        "Score - CV",
+        "%",
+        "higher",
+        "Score less that of the same planner with constant velocity; paired interval.",
+    ),
     "no at-fault collision": _note(
         "No fault",
         "%",
         "higher",
-        "Drives in which the ego hit nobody standing, nobody at its front, nobody while between "
-        "lanes; being hit from behind by replayed traffic is no fault.",
+        "Drives in which the ego hit nobody standing, nobody at its front and nobody at its side; "
+        "being hit from behind, or while standing, is no fault.",
     ),
     "no collision": _note(
         "No contact", "%", "higher", "Drives in which the ego's box met nobody else's at all."
