@@ -8,21 +8,30 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 from numba import njit
 
+from asp_env.dynamics.bicycle import AXLE_SHARE_OF_LENGTH
+
 STANDING_MPS = 0.05
 """At or below this speed nuPlan calls a vehicle stopped."""
+
+BEHIND_RAD = math.radians(150.0)
+"""Beyond this angle to the ego's heading, seen from its rear axle, somebody is behind it."""
 
 TTC_STEP_S = 0.1
 TTC_HORIZON_S = 3.0
 
 
 class Contact(IntEnum):
-    """How the ego's box meets another one, in nuPlan's order of precedence."""
+    """How the ego's box meets another one; of several that hold, the first, as in nuPlan.
+
+    `REAR` is a contact with somebody behind (`is_behind`), `FRONT` one that reaches the line of the
+    ego's front bumper, `SIDE` any other.
+    """
 
     NONE = 0
     EGO_STANDS = 1
     OTHER_STANDS = 2
-    FRONT = 3
-    REAR = 4
+    REAR = 3
+    FRONT = 4
     SIDE = 5
 
 
@@ -63,6 +72,16 @@ def overlaps(x, y, heading, length, width, x_o, y_o, heading_o, length_o, width_
 
 @njit(cache=True)
 @no_type_check
+def is_behind(x, y, heading, length, x_o, y_o):
+    """Whether a centre lies over 150° off a vehicle's heading, seen from its rear axle (nuPlan)."""
+    cos, sin = math.cos(heading), math.sin(heading)
+    dx = x_o - x + AXLE_SHARE_OF_LENGTH * length * cos
+    dy = y_o - y + AXLE_SHARE_OF_LENGTH * length * sin
+    return cos * dx + sin * dy < math.cos(BEHIND_RAD) * math.hypot(dx, dy)
+
+
+@njit(cache=True)
+@no_type_check
 def _contact(ego, size, other, other_size):
     x, y, heading, speed = ego[0], ego[1], ego[2], ego[3]
     xo, yo, ho, lo, wo = other[0], other[1], other[2], other_size[0], other_size[1]
@@ -72,12 +91,12 @@ def _contact(ego, size, other, other_size):
         return Contact.EGO_STANDS.value
     if abs(other[3]) <= STANDING_MPS:
         return Contact.OTHER_STANDS.value
+    if is_behind(x, y, heading, size[0], xo, yo):
+        return Contact.REAR.value
     dx, dy = 0.5 * size[0] * math.cos(heading), 0.5 * size[0] * math.sin(heading)
     # a bumper is a box without depth
     if overlaps(x + dx, y + dy, heading, 0.0, size[1], xo, yo, ho, lo, wo):
         return Contact.FRONT.value
-    if overlaps(x - dx, y - dy, heading, 0.0, size[1], xo, yo, ho, lo, wo):
-        return Contact.REAR.value
     return Contact.SIDE.value
 
 
@@ -141,7 +160,10 @@ def time_to_collision(
     """Seconds until the ego (slot 0) meets anybody if all keep heading and speed; else infinity.
 
     nuPlan's rule: steps of 0.1 s up to 3 s; a standing ego has no time to collision. Agents that
-    the ego already touches, and those behind its rear bumper, are left out.
+    the ego touches now, and those whose centre is behind its rear bumper, are left out; everybody
+    else counts. That is stricter than nuPlan, where only those within 30° ahead count everywhere,
+    those beside only at intersections or while the ego is between lanes, and who has ever touched
+    the ego not at all.
     """
     out = np.zeros(len(states), dtype=np.float64)
     _ttc(states, sizes, valid, touching, out)

@@ -12,7 +12,7 @@ from numba import njit
 from asp_env.data.forecast import Forecast
 from asp_env.data.scene import Scene
 from asp_env.dynamics import MAX_ACCELERATION_MPS2, forward, wrap_angle
-from asp_env.metrics.boxes import STANDING_MPS, overlaps
+from asp_env.metrics.boxes import STANDING_MPS, is_behind, overlaps
 from asp_env.metrics.drivable import OFF_ROAD_M, off_road_m
 from asp_env.metrics.route import project, route_coordinates
 from asp_env.planning.idm import RouteLimits
@@ -198,7 +198,7 @@ def _control(state, arc, offset, lengths, profiles, later, dt_s, routes, counts,
 def _first_touch(plan, size, other, other_size, margin):
     """The first step at which the boxes overlap, `NEVER`, or `EXCUSED`.
 
-    Excused, as in nuPlan, is who is hit in the rear, or is hit while standing.
+    Excused, as in nuPlan, is who is hit by somebody behind, or is hit while standing.
     """
     for t in range(len(plan)):
         x, y, heading, speed = plan[t]
@@ -209,8 +209,9 @@ def _first_touch(plan, size, other, other_size, margin):
             cx, cy, heading, length, size[1] + 2.0 * margin,
             other[t, 0], other[t, 1], other[t, 2], other_size[0], other_size[1],
         ):  # fmt: skip
-            ahead = (other[t, 0] - x) * math.cos(heading) + (other[t, 1] - y) * math.sin(heading)
-            if ahead < -0.5 * size[0] or (margin == 0.0 and abs(speed) <= STANDING_MPS):
+            if is_behind(x, y, heading, size[0], other[t, 0], other[t, 1]):
+                return EXCUSED
+            if margin == 0.0 and abs(speed) <= STANDING_MPS:
                 return EXCUSED
             return t
     return NEVER

@@ -53,7 +53,13 @@ def seconds(*others: State, ego: State = EGO, touching: tuple[bool, ...] = ()) -
         (3.5, 1.9, CAR, Contact.FRONT),  # only our front left corner
         (-3.5, 0.0, CAR, Contact.REAR),
         (0.0, 1.8, (1.0, 2.0), Contact.SIDE),  # 1 m long beside our doors
-        (0.0, 0.0, (6.0, 1.0), Contact.FRONT),  # front and rear at once: the front decides
+        (0.0, 0.0, (6.0, 1.0), Contact.FRONT),  # from end to end of us
+        (-3.5, 1.3, CAR, Contact.REAR),  # 1.3 / 2.3 m: 150.5° off our heading
+        (-3.5, 1.35, CAR, Contact.SIDE),  # 149.6°
+        (-3.5, -1.35, CAR, Contact.SIDE),
+        (-3.0, 1.7, CAR, Contact.SIDE),  # cut in on from behind: 136.6°
+        (-2.2, 0.5, (9.0, 1.0), Contact.REAR),  # 153°: behind decides before the front it reaches
+        (-1.9, 0.5, (9.0, 1.0), Contact.FRONT),  # 144.5°
         (3.99, 0.0, CAR, Contact.FRONT),
         (4.01, 0.0, CAR, Contact.NONE),
         (0.0, 2.01, CAR, Contact.NONE),
@@ -63,7 +69,10 @@ def seconds(*others: State, ego: State = EGO, touching: tuple[bool, ...] = ()) -
 def test_contact(
     x: float, y: float, size: tuple[float, float], expected: Contact, at: State
 ) -> None:
-    """Our front is at 2 m, our sides at 1 m; turning and moving the scene changes nothing."""
+    """Our front is at 2 m, our sides at 1 m, our rear axle at -1.2 m.
+
+    Turning and moving the scene changes nothing.
+    """
     assert contacts((x, y, 0.0, 5.0), size=size, at=at) == [expected]
 
 

@@ -103,6 +103,24 @@ def test_somebody_behind_is_not_fled_from():
     assert planner.plan(chased, straight_on(chased)).states.tobytes() == alone.tobytes()
 
 
+def test_somebody_who_cuts_in_from_behind_is_given_way():
+    """Beside the ego's rear it counts, straight behind it does not: the contact would be a side.
+
+    Boxes of 4.5 m and 1.8 m, rear axle at -1.35 m: 3 m back and 1.7 m aside is 134° off the
+    heading, without the 1.7 m it is 180°.
+    """
+    scene = approach(car(-95.0, 10.0, y_m=1.75)).world.scene()
+    planner = SamplingPlanner()
+    alone = planner.plan(scene, straight_on(scene)).states
+    plans = {}
+    for aside_m in (0.0, 1.7):
+        cut = alone[0] - np.array([3.0, -aside_m, 0.0, 0.0], dtype=np.float32)
+        cut[:5] = straight_on(scene).states[0, 0, :5]
+        plans[aside_m] = planner.plan(scene, two_modes(scene, cut, 0.9)).states
+    assert plans[0.0].tobytes() == alone.tobytes()
+    assert plans[1.7][0, -1, 1] < alone[0, -1, 1] - 0.3
+
+
 def test_stands_while_somebody_walks_into_it():
     """A pedestrian who will touch the standing ego whatever it does: it waits, and is not at fault.
 
