@@ -23,8 +23,16 @@ from predictors.samples import Batches, epoch_rows
 SELECTED_BY = "validation FDE moving"
 """Of the most probable mode, metres: the epoch with the lowest is kept."""
 
+VALIDATION_LOSS = "validation loss"
+"""What the schedule `plateau` watches."""
+
 WARM_UP = 0.1
 """Share of all steps in which `one-cycle` raises the learning rate."""
+
+
+PLATEAU_FACTOR, PLATEAU_PATIENCE, PLATEAU_THRESHOLD = 0.2, 2, 1e-4
+"""`plateau`: what the learning rate is multiplied by, after how many epochs more than these in
+which the validation loss has not fallen by this share."""
 
 
 def one_cycle(step: int, steps: int) -> float:
@@ -81,16 +89,33 @@ class Fit(pl.LightningModule):
             weight_decay=self.config.weight_decay,
         )
         if self.config.schedule == "plateau":
-            plateau = ReduceLROnPlateau(optimizer, factor=0.2, patience=2)
+            plateau = ReduceLROnPlateau(
+                optimizer,
+                factor=PLATEAU_FACTOR,
+                patience=PLATEAU_PATIENCE,
+                threshold=PLATEAU_THRESHOLD,
+            )
             return {
                 "optimizer": optimizer,
-                "lr_scheduler": {"scheduler": plateau, "monitor": "validation loss"},
+                "lr_scheduler": {"scheduler": plateau, "monitor": VALIDATION_LOSS},
             }
         cycle = LambdaLR(optimizer, lambda step: one_cycle(step, self._steps))
         return {
             "optimizer": optimizer,
             "lr_scheduler": {"scheduler": cycle, "interval": "step"},
         }
+
+    def lr_scheduler_step(self, scheduler: Any, metric: Any) -> None:
+        """Steps the schedule where Lightning does; `plateau` has its step before, in `KeepBest`."""
+        del metric
+        if not isinstance(scheduler, ReduceLROnPlateau):
+            scheduler.step()
+
+    def step_plateau(self, loss: float) -> None:
+        """Tells the schedule `plateau` an epoch's validation loss; other schedules do not care."""
+        scheduler = self.lr_schedulers()
+        if isinstance(scheduler, ReduceLROnPlateau):
+            scheduler.step(loss)
 
     def training_step(self, sample: tuple[Batch, Labels]) -> Tensor:
         """The loss of one batch.
@@ -119,7 +144,7 @@ class Fit(pl.LightningModule):
         modes = self.network(batch)
         count = len(labels.states)
         terms: dict[str, Tensor] = self.network.loss(modes, labels)
-        self.log("validation loss", terms["loss"], batch_size=count)
+        self.log(VALIDATION_LOSS, terms["loss"], batch_size=count)
         truth = labels.states[..., :2].cpu().numpy()
         valid = np.ones(truth.shape[:2], dtype=bool)
         now = np.zeros((count, 4), dtype=np.float32)
@@ -168,6 +193,9 @@ class KeepBest(pl.Callback):
             self.best_value, self.best_epoch = value, trainer.current_epoch
             network: nn.Module = pl_module.get_submodule("network")
             save_weights(network.state_dict(), self._best_path)
+        # Lightning would take this step after the state is saved, and a resumed run would lack it.
+        if isinstance(pl_module, Fit):
+            pl_module.step_plateau(float(trainer.callback_metrics[VALIDATION_LOSS]))
         trainer.save_checkpoint(self._state_path)
 
 
@@ -184,6 +212,6 @@ class TellEpochs(pl.Callback):
         sys.stderr.write(
             f"epoch {trainer.current_epoch + 1}/{trainer.max_epochs}: training loss "
             f"{float(found['training loss']):.3f}, validation loss "
-            f"{float(found['validation loss']):.3f}, {SELECTED_BY} "
+            f"{float(found[VALIDATION_LOSS]):.3f}, {SELECTED_BY} "
             f"{float(found[SELECTED_BY]):.2f} m\n"
         )

@@ -7,12 +7,14 @@ import lightning.pytorch as pl
 import numpy as np
 import pytest
 import torch
+from lightning.pytorch.core.optimizer import LightningOptimizer
 from safetensors.torch import load_file
 
 from asp_env.data.predictor import load_predictor
 from asp_env.data.snippets import gather_scene, index_snippets
 from asp_env.data.source import open_data
 from asp_env.errors import AspEnvError
+from predictors import lightning_parts
 from predictors.fitting import train
 from predictors.lightning_parts import Fit, TellEpochs, one_cycle
 from predictors.recipes import TrainingConfig, recipe
@@ -62,24 +64,46 @@ KILLS = {
 def test_killed_run_ends_with_the_same_weights(
     kill: str, schedule: str, data: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Two epochs, a kill, and two more give the weights of four in a row, bit for bit."""
+    """Two epochs, a kill, and two more give the weights of four in a row, bit for bit.
+
+    On the plateau no epoch counts as better: the second and every later one divides the rate by 5.
+    """
+    monkeypatch.setattr(lightning_parts, "PLATEAU_PATIENCE", 0)
+    monkeypatch.setattr(lightning_parts, "PLATEAU_THRESHOLD", 0.99)
+    rates: list[float] = []
+    last: list[dict[str, torch.Tensor]] = []
+    monkeypatch.setattr(Fit, "on_train_epoch_start", lambda self: rates.append(rate_of(self)))
+    monkeypatch.setattr(Fit, "on_train_end", lambda self: last.append(self.network.state_dict()))
     config = tiny_config(schedule=schedule, learning_rate=0.01)
     with monkeypatch.context() as patched:
         patched.setattr(*KILLS[kill])
         with pytest.raises(Killed):
             train(config, data, tmp_path / "killed")
     assert not (tmp_path / "killed" / "config.json").exists()
+    del rates[2:]
     train(config, data, tmp_path / "killed")
+    resumed_rates = rates.copy()
+    rates.clear()
     train(config, data, tmp_path / "whole")
-    resumed = load_file(tmp_path / "killed" / "weights.safetensors")
-    whole = load_file(tmp_path / "whole" / "weights.safetensors")
-    assert resumed.keys() == whole.keys()
-    for name, tensor in whole.items():
-        assert torch.equal(resumed[name], tensor), name
+    if schedule == "plateau":
+        assert rates == pytest.approx([0.01, 0.01, 0.002, 0.0004])
+    assert resumed_rates == rates
+    of_run = [load_file(tmp_path / run / "weights.safetensors") for run in ("killed", "whole")]
+    for resumed, whole in (last, of_run):
+        assert resumed.keys() == whole.keys()
+        for name, tensor in whole.items():
+            assert torch.equal(resumed[name], tensor), name
     known = [
         json.loads((tmp_path / run / "config.json").read_text()) for run in ("killed", "whole")
     ]
     assert known[0] == known[1]
+
+
+def rate_of(module: Fit) -> float:
+    """The learning rate at this moment."""
+    optimizer = module.optimizers()
+    assert isinstance(optimizer, LightningOptimizer)
+    return float(optimizer.param_groups[0]["lr"])
 
 
 def test_other_seed_gives_other_weights(data: str, finished: Path, tmp_path: Path) -> None:
