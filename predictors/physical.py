@@ -1,5 +1,6 @@
 """Forecasters without weights: the first rows of every table, and the oracle."""
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 
 import numpy as np
@@ -27,6 +28,11 @@ class ConstantVelocity:
     privileged: bool = False
     trained_on: TrainedOn | None = None
     history: int = 0
+
+    @property
+    def about(self) -> Mapping[str, str]:
+        """Nothing: it is not trained."""
+        return {}
 
     @classmethod
     def from_name(cls, argument: str, *, horizon: int, dt_s: float) -> "ConstantVelocity":
@@ -70,6 +76,11 @@ class ConstantTurnRate:
         """The ticks that 0.6 s span, at least one."""
         return max(1, round(TURN_OVER_S / self.dt_s))
 
+    @property
+    def about(self) -> Mapping[str, str]:
+        """Nothing: it is not trained."""
+        return {}
+
     @classmethod
     def from_name(cls, argument: str, *, horizon: int, dt_s: float) -> "ConstantTurnRate":
         """The predictor for any horizon and time step; it takes no argument.
@@ -107,7 +118,9 @@ class ConstantTurnRate:
 class Oracle:
     """The recorded future as a single mode: what a perfect forecast would be worth.
 
-    Its actions are those inferred from the recording, which may exceed the limits of actions.
+    It forecasts agents of any class. Where the recording has a gap the states in between are
+    interpolated, and behind its end the last speed and heading are kept. The actions are those
+    inferred from the states, which may exceed the limits of actions.
     """
 
     horizon: int
@@ -116,6 +129,11 @@ class Oracle:
     privileged: bool = True
     trained_on: TrainedOn | None = None
     history: int = 0
+
+    @property
+    def about(self) -> Mapping[str, str]:
+        """Nothing: it is not trained."""
+        return {}
 
     @classmethod
     def from_name(cls, argument: str, *, horizon: int, dt_s: float) -> "Oracle":
@@ -128,7 +146,7 @@ class Oracle:
         return cls(horizon=horizon, dt_s=dt_s)
 
     def predict(self, scene: Scene, future: Future | None = None) -> Forecast:
-        """Repeats the future of targets that are recorded for the whole horizon.
+        """Repeats the future of targets that are there now and at one tick to come at least.
 
         Raises:
             AspEnvError: the scene has another time step, or there is no future of this horizon.
@@ -140,11 +158,13 @@ class Oracle:
                 f"oracle needs the recorded future of {self.horizon} ticks and was given {given}: "
                 "it works on recordings only"
             )
-        states = future.states[:, : self.horizon]
-        valid = seen_for(scene, 0) & future.valid[:, : self.horizon].all(axis=-1)
-        lengths = scene.sizes[scene.targets[:, 0], scene.targets[:, 1], 0]
-        lengths = np.where(valid, lengths, 1).astype(np.float32)[:, None]
-        before = np.concatenate([scene.target_states[:, None], states[:, :-1]], axis=1)
+        at = (scene.targets[:, 0], scene.targets[:, 1])
+        known = future.valid[:, : self.horizon]
+        valid = scene.valid[at][:, -1] & known.any(axis=-1)
+        now = np.where(valid[:, None], scene.target_states, 0)
+        states = _filled(now, future.states[:, : self.horizon], known, self.dt_s)
+        lengths = np.where(valid, scene.sizes[at][:, 0], 1).astype(np.float32)[:, None]
+        before = np.concatenate([now[:, None], states[:, :-1]], axis=1)
         actions = inverse(before, states, lengths, self.dt_s)
         return _one_mode(scene, states, actions, valid)
 
@@ -168,6 +188,38 @@ def seen_for(scene: Scene, history: int) -> Bool[np.ndarray, " t"]:
 def _refuse_argument(name: str, argument: str) -> None:
     if argument:
         raise AspEnvError(f"predictor {name} takes no argument, {argument!r} was given: use {name}")
+
+
+def _filled(
+    now: Float[np.ndarray, "t 4"],
+    future: Float[np.ndarray, "t steps 4"],
+    known: Bool[np.ndarray, "t steps"],
+    dt_s: float,
+) -> Float[np.ndarray, "t steps 4"]:
+    """The future where it is known, bit for bit; between along a line, behind straight on."""
+    steps = future.shape[1]
+    ticks = np.arange(steps + 1)
+    there = np.concatenate([np.ones((len(known), 1), dtype=bool), known], axis=1)
+    states = np.concatenate([now[:, None], future], axis=1).astype(np.float64)
+    states = np.where(there[..., None], states, 0)
+    last = np.maximum.accumulate(np.where(there, ticks, 0), axis=1)
+    following = np.where(there, ticks, steps + 1)[:, ::-1]
+    following = np.minimum.accumulate(following, axis=1)[:, ::-1]
+    inside = (following <= steps)[..., None]
+    rows = np.arange(len(states))[:, None]
+    before, after = states[rows, last], states[rows, np.minimum(following, steps)]
+
+    span = after - before
+    span[..., 2] = wrap_angle(span[..., 2])
+    share = (ticks - last) / np.maximum(following - last, 1)
+    between = before + share[..., None] * span
+    way_m = before[..., 3] * (ticks - last) * dt_s
+    behind = before.copy()
+    behind[..., 0] += way_m * np.cos(before[..., 2])
+    behind[..., 1] += way_m * np.sin(before[..., 2])
+    filled = np.where(inside, between, behind)
+    filled[..., 2] = wrap_angle(filled[..., 2])
+    return np.where(known[..., None], future, filled[:, 1:]).astype(np.float32)
 
 
 def _one_mode(

@@ -1,5 +1,7 @@
 """Forecasts without weights, against numbers worked out by hand."""
 
+import math
+
 import numpy as np
 import pytest
 
@@ -69,6 +71,81 @@ def test_oracle_returns_the_recorded_future() -> None:
     forecast = Oracle(horizon=15, dt_s=0.2).predict(scene, future)
     np.testing.assert_array_equal(forecast.states[:, 0], future.states)
     assert forecast.valid.all()
+
+
+def one_target(
+    kind: AgentClass, now: tuple[float, float, float, float]
+) -> tuple[Scene, np.ndarray, np.ndarray]:
+    """One agent in that state; and a future of 15 ticks of NaN of which nothing is known."""
+    recordings = [make_recording(drives=(EAST,), duration_s=10.0)]
+    index = index_snippets(recordings, dt_s=0.2, horizon_s=3.0).select(np.array([0]))
+    scene = gather_scene(recordings, index)
+    scene.states[0, 0] = now
+    scene.classes[0, 0] = kind
+    states = np.full((1, 15, 4), np.nan, dtype=np.float32)
+    return scene, states, np.zeros((1, 15), dtype=bool)
+
+
+def test_oracle_goes_on_where_the_recording_ends() -> None:
+    """A car brakes at 2 m/s² from 10 m/s for 14 ticks: then 4.4 m/s and 0.88 m more.
+
+    After k ticks it has 10 - 0.4k m/s and went 2k - 0.04k² m: 20.16 m after 14, 21.04 m after 15.
+    """
+    scene, states, valid = one_target(AgentClass.CAR, (0.0, 0.0, 0.0, 10.0))
+    k = np.arange(1, 15)
+    states[0, :14] = np.stack([2 * k - 0.04 * k**2, 0 * k, 0 * k, 10 - 0.4 * k], axis=-1)
+    valid[0, :14] = True
+    forecast = Oracle(horizon=15, dt_s=0.2).predict(scene, Future(states=states, valid=valid))
+    assert forecast.valid.tolist() == [True]
+    np.testing.assert_array_equal(forecast.states[0, 0, :14], states[0, :14])
+    np.testing.assert_allclose(forecast.states[0, 0, 14], [21.04, 0, 0, 4.4], atol=1e-5)
+    np.testing.assert_allclose(forecast.actions[0, 0, :14, 0], -2.0, atol=1e-3)
+    assert forecast.actions[0, 0, 14, 0] == pytest.approx(0.0, abs=1e-3)
+
+
+def test_oracle_knows_that_a_pedestrian_stops() -> None:
+    """North at 1 m/s for three ticks, then standing at 0.6 m: there it stays, seen or not."""
+    north = math.pi / 2
+    scene, states, valid = one_target(AgentClass.PEDESTRIAN, (5.0, 0.0, north, 1.0))
+    states[0, :5, 0] = 5.0
+    states[0, :5, 1] = [0.2, 0.4, 0.6, 0.6, 0.6]
+    states[0, :5, 2] = north
+    states[0, :5, 3] = [1.0, 1.0, 0.0, 0.0, 0.0]
+    valid[0, :5] = True
+    forecast = Oracle(horizon=15, dt_s=0.2).predict(scene, Future(states=states, valid=valid))
+    assert forecast.valid.tolist() == [True]
+    np.testing.assert_array_equal(forecast.states[0, 0, :5], states[0, :5])
+    np.testing.assert_allclose(forecast.states[0, 0, 5:], [[5.0, 0.6, north, 0.0]] * 10, atol=1e-6)
+
+
+def test_oracle_bridges_a_gap_the_short_way_round() -> None:
+    """Known at ticks 1 and 5 alone: a quarter of the way each tick, through ±π, then straight on.
+
+    From (0, 0) at 3.1 rad and 4 m/s to (-4, 2) at -3.1 rad and 8 m/s: half-way it is at (-2, 1),
+    ±π, 6 m/s, and after tick 5 it goes 1.6 m a tick towards -3.1 rad.
+    """
+    scene, states, valid = one_target(AgentClass.BICYCLE, (0.8, 0.0, 3.1, 4.0))
+    states[0, 0] = (0.0, 0.0, 3.1, 4.0)
+    states[0, 4] = (-4.0, 2.0, -3.1, 8.0)
+    valid[0, [0, 4]] = True
+    forecast = Oracle(horizon=15, dt_s=0.2).predict(scene, Future(states=states, valid=valid))
+    found = forecast.states[0, 0]
+    np.testing.assert_allclose(found[1, [0, 1, 3]], [-1.0, 0.5, 5.0], atol=1e-6)
+    np.testing.assert_allclose(found[2, [0, 1, 3]], [-2.0, 1.0, 6.0], atol=1e-6)
+    assert abs(found[2, 2]) == pytest.approx(math.pi, abs=1e-5)
+    ahead = [-4 + 16 * math.cos(3.1), 2 - 16 * math.sin(3.1), -3.1, 8.0]
+    np.testing.assert_allclose(found[14], ahead, atol=1e-5)
+
+
+def test_oracle_leaves_out_whom_it_knows_nothing_of() -> None:
+    """Not there now, or recorded at no tick to come: not forecast."""
+    scene, states, valid = one_target(AgentClass.CAR, (0.0, 0.0, 0.0, 10.0))
+    oracle = Oracle(horizon=15, dt_s=0.2)
+    assert not oracle.predict(scene, Future(states=states, valid=valid)).valid.any()
+    states[0], valid[0] = 1.0, True
+    assert oracle.predict(scene, Future(states=states, valid=valid)).valid.all()
+    scene.valid[0, 0, -1] = False
+    assert not oracle.predict(scene, Future(states=states, valid=valid)).valid.any()
 
 
 def test_oracle_without_a_future_is_refused() -> None:
