@@ -1,6 +1,7 @@
 """A trained predictor's folder: `config.json` and `weights.safetensors`. Nothing is unpickled."""
 
 import dataclasses
+import hashlib
 import json
 import os
 from pathlib import Path
@@ -20,6 +21,9 @@ from predictors.learned import AbstractNetwork, Learned, LearnedPlug, NetworkSha
 CONFIG = "config.json"
 WEIGHTS = "weights.safetensors"
 FORMAT = 1
+
+HASH_DIGITS = 16
+"""Hexadecimal digits of the weights' SHA-256 that tables show."""
 
 
 def save_learned(
@@ -41,7 +45,8 @@ def save_learned(
         shape: what the network was made for, with the normaliser.
         view: what it looks at.
         weights: the network's state.
-        provenance: what it was trained on and how; no times of day.
+        provenance: what it was trained on (`trained_on`) and how (`config`, with its `preset`
+            if it has one); no times of day.
     """
     config = {
         "format": FORMAT,
@@ -78,6 +83,7 @@ def load_learned(plug: LearnedPlug, argument: str, *, dt_s: float) -> Learned:
         )
     try:
         shape, view, network, trained_on = _build(plug, config)
+        preset = config["provenance"].get("config", {}).get("preset")
     except (KeyError, TypeError, ValueError, RuntimeError) as error:
         raise CheckpointError(
             f"{folder / CONFIG} does not describe a {plug.name}: {_brief(error)}"
@@ -88,7 +94,20 @@ def load_learned(plug: LearnedPlug, argument: str, *, dt_s: float) -> Learned:
             f"the scenes have {dt_s:g} s"
         )
     _load_weights(network, folder / WEIGHTS)
-    return Learned(name=plug.name, network=network, view=view, shape=shape, trained_on=trained_on)
+    about = {
+        "trained_on": trained_on.source,
+        "view": view.name,
+        **({} if preset is None else {"preset": str(preset)}),
+        "weights": hashlib.sha256((folder / WEIGHTS).read_bytes()).hexdigest()[:HASH_DIGITS],
+    }
+    return Learned(
+        name=plug.name,
+        network=network,
+        view=view,
+        shape=shape,
+        trained_on=trained_on,
+        about=about,
+    )
 
 
 def read_config(folder: Path) -> dict[str, Any]:

@@ -2,6 +2,8 @@
 
 import dataclasses
 from abc import ABC, abstractmethod
+from collections.abc import Mapping
+from types import MappingProxyType
 from typing import Any, NamedTuple, Protocol, final, runtime_checkable
 
 import numpy as np
@@ -92,15 +94,22 @@ class Learned:
         view: PictureView,
         shape: NetworkShape,
         trained_on: TrainedOn,
+        about: Mapping[str, str],
     ) -> None:
-        """The network sees what `view` draws."""
+        """The network sees what `view` draws; `about` is what tables tell of its training."""
         self.name = name
         self.view = view
         self.dt_s = shape.dt_s
         self.history = shape.history
         self.horizon = shape.horizon
         self.trained_on: TrainedOn | None = trained_on
+        self._about = MappingProxyType(dict(about))
         self._network = network.eval()
+
+    @property
+    def about(self) -> Mapping[str, str]:
+        """Source of the training data, view, preset, and a hash of the weights."""
+        return self._about
 
     def predict(self, scene: Scene, future: Future | None = None) -> Forecast:
         """Forecasts the targets of predicted classes seen for the whole history; reads no future.

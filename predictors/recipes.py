@@ -17,6 +17,8 @@ class TrainingConfig:
     """Everything that decides the weights, but the data's content."""
 
     predictor: str
+    preset: str
+    """Name of the recipe that it comes from; tables show it."""
     network: NetworkConfig
     view: str
     height_px: int
@@ -70,6 +72,7 @@ def ffw_asp_paper(*, view: str, horizon_s: float) -> TrainingConfig:
     """asp-env train ffw-asp DATA --preset paper: the network and schedule of the paper."""
     return TrainingConfig(
         predictor="ffw-asp",
+        preset="paper",
         network=FFWASPConfig(),
         view=view,
         height_px=360,
@@ -79,9 +82,10 @@ def ffw_asp_paper(*, view: str, horizon_s: float) -> TrainingConfig:
 
 
 def ffw_asp_cpu(*, view: str, horizon_s: float) -> TrainingConfig:
-    """asp-env train ffw-asp DATA --preset cpu: four minutes on two cores."""
+    """asp-env train ffw-asp DATA --preset cpu: minutes on two cores."""
     return TrainingConfig(
         predictor="ffw-asp",
+        preset="cpu",
         network=FFWASPConfig(
             encoder="small",
             features=256,

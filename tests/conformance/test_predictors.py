@@ -103,13 +103,16 @@ def test_probabilities_sum_to_one(predictor: Predictor) -> None:
 
 @every
 def test_only_whom_it_can_forecast_is_valid(predictor: Predictor) -> None:
-    """Absent agents and other classes are not valid and their rows are zeros."""
+    """Absent agents and other classes are not valid and their rows are zeros.
+
+    A privileged predictor repeats what was recorded, whatever the class.
+    """
     scene, future = everybody()
     forecast = ask(predictor, scene, future)
     at = (scene.targets[:, 0], scene.targets[:, 1])
     seen = scene.valid[at][:, scene.history - predictor.history :].all(axis=-1)
     known = np.isin(scene.classes[at], [int(kind) for kind in PREDICTED])
-    np.testing.assert_array_equal(forecast.valid, seen & known)
+    np.testing.assert_array_equal(forecast.valid, seen & (known | predictor.privileged))
     assert 0 < forecast.valid.sum() < len(forecast.valid)
     assert not forecast.states[~forecast.valid].any()
     assert not forecast.actions[~forecast.valid].any()
@@ -159,6 +162,16 @@ def test_targets_do_not_influence_each_other(predictor: Predictor) -> None:
         alone = ask(predictor, scene.with_targets(scene.targets[rows]), some)
         np.testing.assert_allclose(alone.states, together.states[rows], atol=1e-5, rtol=1e-6)
         np.testing.assert_allclose(alone.log_probs, together.log_probs[rows], atol=1e-5)
+
+
+@every
+def test_what_it_tells_of_itself_cannot_be_changed(predictor: Predictor) -> None:
+    """Trained ones name data, view, preset and weights, others nothing; nobody can set it."""
+    fields = {"trained_on", "view", "preset", "weights"} if predictor.trained_on else set()
+    assert set(predictor.about) == fields
+    assert all(predictor.about.values())
+    with pytest.raises(AttributeError):
+        vars(type(predictor))["about"].__set__(predictor, {})
 
 
 @every

@@ -1,5 +1,6 @@
 """Damaged, foreign and unfitting checkpoints: one line each."""
 
+import hashlib
 import json
 import pickle
 from collections.abc import Callable
@@ -111,6 +112,23 @@ def test_other_time_step_is_refused(run: Path) -> None:
 def test_predictor_keeps_the_horizon_it_was_trained_for(run: Path) -> None:
     """Asked for 30 ticks, a predictor of 15 forecasts 15."""
     assert load_predictor(f"ffw-asp:{run}", horizon=30, dt_s=0.2).horizon == 15
+
+
+def test_about_names_what_tables_show(run: Path) -> None:
+    """Source, view, preset, and 16 digits that change with the weights; no preset, no entry."""
+    about = load_predictor(f"ffw-asp:{run}", horizon=15, dt_s=0.2).about
+    content = (run / "weights.safetensors").read_bytes()
+    assert dict(about) == {
+        "trained_on": "nothing",
+        "view": "chauffeurnet",
+        "preset": "tiny",
+        "weights": hashlib.sha256(content).hexdigest()[:16],
+    }
+    other = save_random(run.with_name("other"), seed=1)
+    assert load_predictor(f"ffw-asp:{other}", horizon=15, dt_s=0.2).about != about
+    known = json.loads((run / "config.json").read_text())["provenance"]["trained_on"]
+    change(run, provenance={"trained_on": known})
+    assert "preset" not in load_predictor(f"ffw-asp:{run}", horizon=15, dt_s=0.2).about
 
 
 def test_state_of_a_run_survives_the_disk(tmp_path: Path) -> None:

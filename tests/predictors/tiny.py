@@ -59,6 +59,9 @@ def save_random(folder: Path, *, seed: int = 0) -> Path:
         shape=shape,
         view=view,
         weights=network.state_dict(),
-        provenance={"trained_on": {"source": "nothing", "split": "recording", "parts": {}}},
+        provenance={
+            "trained_on": {"source": "nothing", "split": "recording", "parts": {}},
+            "config": {"preset": "tiny"},
+        },
     )
     return folder
