@@ -26,7 +26,7 @@ def make_encoder(name: EncoderName, shape: tuple[int, int, int], features: int) 
 class SmallEncoder(nn.Module):
     """Four convolutions of stride 2 and a linear layer that keeps apart what lies where.
 
-    About 40 M multiplications for 12x90x60, against 250 M of ResNet18.
+    About 30.7 M multiplications for 12x90x60 and 256 features.
     """
 
     def __init__(self, shape: tuple[int, int, int], features: int) -> None:

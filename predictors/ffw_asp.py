@@ -97,7 +97,7 @@ class FFWASPNetwork(AbstractNetwork):
         """The modes of every target."""
         device = batch.raster.device.type
         dtype = torch.bfloat16 if torch.is_autocast_enabled(device) else torch.float32
-        # Bytes are moved to channels-last before they grow into floats: a seventh of the time.
+        # Bytes are moved to channels-last before they grow into floats: there is less to move.
         pixels = batch.raster.contiguous(memory_format=torch.channels_last).to(dtype)
         z = self.norm(self.encoder(pixels * (1 / 255)).float())
         with torch.autocast(device, enabled=False):

@@ -12,6 +12,7 @@ from jaxtyping import Bool, Int
 from asp_env.data.recording import Recording
 from asp_env.data.snippets import SnippetIndex, gather_future, gather_scene
 from asp_env.dynamics import MAX_ACCELERATION_MPS2, MAX_STEERING_RAD, inverse
+from asp_env.errors import AspEnvError
 from asp_env.metrics.open_loop import moving
 from asp_env.views import PictureView
 from predictors.batch import Batch, Labels, make_batch, make_labels
@@ -30,9 +31,8 @@ MIN_ACTION_RANGE = (0.5, 0.05)
 class Batches:
     """Batches of snippets, drawn by a thread while the network works on the one before.
 
-    Drawing releases the interpreter's lock, and takes about a tenth of the time that a small
-    network's step takes, so that processes of their own would only add copies. The order is given,
-    hence the batches are the same whenever it is.
+    Drawing releases the interpreter's lock, so that processes of their own would only add copies.
+    The order is given, hence the batches are the same whenever it is.
     """
 
     def __init__(
@@ -113,6 +113,9 @@ def choose_snippets(
             they are at most this share of what remains; 1 keeps them all.
         max_snippets: how many to keep at most, at random; all of them if None.
         seed: of what is left out.
+
+    Raises:
+        AspEnvError: none is left.
     """
     rng = np.random.default_rng(seed)
     keep = np.arange(len(snippets))
@@ -125,6 +128,12 @@ def choose_snippets(
         keep = np.sort(np.concatenate([going, standing]))
     if max_snippets is not None and len(keep) > max_snippets:
         keep = np.sort(rng.choice(keep, max_snippets, replace=False))
+    if not len(keep):
+        raise AspEnvError(
+            f"none of the {len(snippets)} snippets to learn from moves, and standing ones may be a "
+            f"share of {standing_share:g} at most: give recordings with traffic that moves, or "
+            "train with a standing_share of 1, as the preset paper does"
+        )
     return snippets.select(keep)
 
 

@@ -10,11 +10,12 @@ import torch
 from lightning.pytorch.core.optimizer import LightningOptimizer
 from safetensors.torch import load_file
 
+from asp_env.data.parts import Split, snippet_parts
 from asp_env.data.predictor import load_predictor
-from asp_env.data.snippets import gather_scene, index_snippets
-from asp_env.data.source import open_data
+from asp_env.data.snippets import SnippetIndex, gather_scene, index_snippets
+from asp_env.data.source import Recordings, open_data
 from asp_env.errors import AspEnvError
-from predictors import lightning_parts
+from predictors import fitting, lightning_parts
 from predictors.fitting import train
 from predictors.lightning_parts import Fit, TellEpochs, one_cycle
 from predictors.recipes import TrainingConfig, recipe
@@ -135,6 +136,8 @@ def test_checkpoint_says_what_it_learned_from(data: str, finished: Path) -> None
     assert config["normaliser"]["action_range"][0] >= 0.5
     assert "torch" in config["provenance"]["versions"]
     predictor = load_predictor(f"ffw-asp:{finished}", horizon=15, dt_s=0.2)
+    assert predictor.about["trained_on"] == data
+    assert predictor.about["preset"] == "cpu"
     assert predictor.trained_on is not None
     assert predictor.trained_on.split == "recording"
     assert dict(predictor.trained_on.parts) == known["parts"]
@@ -179,6 +182,22 @@ def test_too_few_recordings_leave_no_folder(tmp_path: Path) -> None:
     data = write_data(tmp_path / "data", recordings=1)
     with pytest.raises(AspEnvError, match="--split blocks"):
         train(tiny_config(), data, tmp_path / "run")
+    assert not (tmp_path / "run").exists()
+
+
+def test_nothing_to_select_on_is_one_line(
+    data: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A split that leaves no snippet for validation is refused before anything is written."""
+
+    def all_to_train(recordings: Recordings, index: SnippetIndex, split: Split) -> object:
+        _, trained_on = snippet_parts(recordings, index, split)
+        return np.full(len(index), "train"), trained_on
+
+    monkeypatch.setattr(fitting, "snippet_parts", all_to_train)
+    with pytest.raises(AspEnvError, match="no snippet is left for validation") as caught:
+        train(tiny_config(), data, tmp_path / "run")
+    assert "\n" not in str(caught.value)
     assert not (tmp_path / "run").exists()
 
 

@@ -9,6 +9,7 @@ from hypothesis import strategies as st
 
 from asp_env.data.classes import AgentClass
 from asp_env.data.snippets import gather_future, gather_scene, index_snippets
+from asp_env.errors import AspEnvError
 from asp_env.views import make_view
 from predictors.samples import (
     Batches,
@@ -66,6 +67,21 @@ def test_standing_targets_are_held_back() -> None:
     kept = choose_snippets(recordings, index, standing_share=0.2, max_snippets=None, seed=0)
     assert np.sum(kept.track == 0) == going
     assert np.sum(kept.track == 1) == going // 4
+    every = choose_snippets(recordings, index, standing_share=1.0, max_snippets=None, seed=0)
+    assert len(every) == len(index)
+
+
+def test_traffic_that_never_moves_is_refused() -> None:
+    """With a share of 0.5 for standing ones and none that moves, nothing would be left."""
+    recordings = [make_recording(drives=(EAST, WAITING), duration_s=16.0)]
+    index = index_snippets(recordings, dt_s=0.2, horizon_s=3.0)
+    index = index.select(index.track == 1)
+    assert len(index) > 0
+    with pytest.raises(
+        AspEnvError, match=rf"none of the {len(index)} snippets .* 0\.5 at"
+    ) as caught:
+        choose_snippets(recordings, index, standing_share=0.5, max_snippets=None, seed=0)
+    assert "\n" not in str(caught.value)
     every = choose_snippets(recordings, index, standing_share=1.0, max_snippets=None, seed=0)
     assert len(every) == len(index)
 
