@@ -8,6 +8,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 from numba import njit
 
+from asp_env.data.classes import AgentClass
 from asp_env.dynamics.bicycle import AXLE_SHARE_OF_LENGTH
 
 STANDING_MPS = 0.05
@@ -38,6 +39,12 @@ class Contact(IntEnum):
 AT_FAULT = (Contact.OTHER_STANDS, Contact.FRONT, Contact.SIDE)
 """Contacts the ego answers for. nuPlan counts a side contact only while the ego is in several
 lanes; here it always counts, which is stricter."""
+
+TOWING = (
+    *(AgentClass.CAR, AgentClass.VAN, AgentClass.TRUCK),
+    *(AgentClass.BUS, AgentClass.TRUCK_BUS),
+)
+"""Classes that may have a trailer of their own."""
 
 
 @njit(cache=True, inline="always")
@@ -119,6 +126,17 @@ def ego_contacts(
     out = np.zeros(valid.shape, dtype=np.int8)
     _contacts(states, sizes, valid, out)
     return out
+
+
+def touching_trailers(
+    states: Float[np.ndarray, "b a 4"],
+    sizes: Float[np.ndarray, "b a 2"],
+    classes: Int[np.ndarray, "b a"],
+    valid: Bool[np.ndarray, "b a"],
+) -> Bool[np.ndarray, "b a"]:
+    """Trailers whose box overlaps that of the ego (slot 0), if the ego's class may tow one."""
+    trailers = (classes == AgentClass.TRAILER) & np.isin(classes[:, :1], TOWING)
+    return trailers & (ego_contacts(states, sizes, valid) > 0)
 
 
 @njit(cache=True)

@@ -12,7 +12,7 @@ from numba import njit
 from asp_env.data.forecast import Forecast
 from asp_env.data.scene import Scene
 from asp_env.dynamics import MAX_ACCELERATION_MPS2, forward, wrap_angle
-from asp_env.metrics.boxes import STANDING_MPS, is_behind, overlaps
+from asp_env.metrics.boxes import STANDING_MPS, is_behind, overlaps, touching_trailers
 from asp_env.metrics.drivable import OFF_ROAD_M, off_road_m
 from asp_env.metrics.route import project, route_coordinates
 from asp_env.planning.idm import RouteLimits
@@ -73,7 +73,8 @@ class SamplingPlanner:
     bends allows, and steers by pure pursuit of the route or of a line 0.8 m beside it; the bicycle
     model makes its states. Its danger is the probability, over the forecast's modes, to touch
     anybody: a touch counts with the probability of its mode, agents count as independent, and one
-    who runs into the ego's rear, or into the standing ego, does not count.
+    who runs into the ego's rear, or into the standing ego, does not count. A trailer that the ego
+    touches now is taken for its own.
     """
 
     name = "sampling"
@@ -127,7 +128,13 @@ class SamplingPlanner:
     def _danger(
         self, scene: Scene, forecast: Forecast, states: Float[np.ndarray, "b c t 4"]
     ) -> tuple[Float[np.ndarray, "b c"], Float[np.ndarray, "b c"]]:
-        spoken = forecast.valid
+        own = touching_trailers(
+            np.ascontiguousarray(scene.states[:, :, -1]),
+            scene.sizes,
+            scene.classes,
+            np.ascontiguousarray(scene.valid[:, :, -1]),
+        )
+        spoken = forecast.valid & ~own[forecast.targets[:, 0], forecast.targets[:, 1]]
         targets = forecast.targets[spoken]
         order = np.argsort(targets[:, 0], kind="stable")
         starts = np.searchsorted(targets[order, 0], np.arange(len(states) + 1))

@@ -17,7 +17,7 @@ from asp_env.data.scene import Scene, infer_actions
 from asp_env.data.snippets import gather_window
 from asp_env.dynamics import forward
 from asp_env.errors import AspEnvError
-from asp_env.metrics.boxes import ego_contacts
+from asp_env.metrics.boxes import ego_contacts, touching_trailers
 from asp_env.metrics.drivable import off_road_m
 from asp_env.metrics.route import route_coordinates
 from asp_env.sim.world import EGO, Events
@@ -54,6 +54,8 @@ class Episodes:
     """The ego's arc length m, offset to the left m, and the route's heading rad there."""
     contacts: Int[np.ndarray, "b a"]
     """`Contact` of the ego with each agent; one that lasts keeps the class of its first tick."""
+    own_trailer: Bool[np.ndarray, "b a"]
+    """Trailers that touch the ego at the first tick: its own, with which it has no contact."""
     goal_m: Float[np.ndarray, " b"]
     recording: Int[np.ndarray, " b"]
     start_tick: Int[np.ndarray, " b"]
@@ -152,6 +154,9 @@ class ReplayWorld:
         ]
         route = route_along(ahead, beyond_m=BEYOND_M)[None]
         route_valid = np.ones(route.shape[:2], dtype=bool)
+        start = states[:, now], recording.sizes[tracks][None]
+        classes = recording.classes[tracks][None].astype(np.int32)
+        own_trailer = touching_trailers(*start, classes, valid[:, now])
         driven_m = np.full(1, path_length(states[0, now:, EGO, :2]))
         goal = route_coordinates(route, route_valid, states[:, -1, EGO], driven_m)[:, 0]
         simulated, present = states.copy(), valid.copy()
@@ -163,14 +168,15 @@ class ReplayWorld:
             log_valid=valid,
             gone=np.zeros((1, len(tracks)), dtype=bool),
             sizes=recording.sizes[tracks][None],
-            classes=recording.classes[tracks][None].astype(np.int32),
+            classes=classes,
             ids=recording.track_ids[tracks][None].astype(np.int64),
             parked=recording.parked[tracks][None],
             tracks=tracks[None],
             route=route,
             route_valid=route_valid,
             on_route=route_coordinates(route, route_valid, states[:, now, EGO], np.zeros(1)),
-            contacts=ego_contacts(states[:, now], recording.sizes[tracks][None], valid[:, now]),
+            contacts=ego_contacts(*start, valid[:, now] & ~own_trailer),
+            own_trailer=own_trailer,
             goal_m=goal,
             recording=np.full(1, scenario.recording),
             start_tick=np.full(1, scenario.start_tick),
@@ -226,7 +232,7 @@ class ReplayWorld:
         data, rows = self.episodes, np.arange(len(self))
         states = np.ascontiguousarray(data.states[rows, self.now])
         valid = np.ascontiguousarray(data.valid[rows, self.now])
-        found = ego_contacts(states, data.sizes, valid)
+        found = ego_contacts(states, data.sizes, valid & ~data.own_trailer)
         lasts = (found > 0) & (data.contacts > 0)
         data.contacts = np.where(lasts, data.contacts, found)
 
@@ -314,6 +320,7 @@ def _allocate(num_episodes: int, *, agents: int, ticks: int, points: int) -> Epi
         route_valid=np.zeros((b, p), dtype=bool),
         on_route=np.zeros((b, 3)),
         contacts=np.zeros((b, a), dtype=np.int8),
+        own_trailer=np.zeros((b, a), dtype=bool),
         goal_m=np.zeros(b),
         recording=np.zeros(b, dtype=np.int64),
         start_tick=np.zeros(b, dtype=np.int64),

@@ -31,7 +31,10 @@ class Events:
     """What holds now in each of B episodes."""
 
     contacts: Int[np.ndarray, "b a"]
-    """`Contact` of the ego with each agent; one that lasts keeps the class of its first tick."""
+    """`Contact` of the ego with each agent; one that lasts keeps the class of its first tick.
+
+    With a trailer that touches the ego at the first tick, its own, there is none.
+    """
     off_road_m: Float[np.ndarray, " b"]
     """How far the ego's outermost corner lies outside the drivable area."""
     route_m: Float[np.ndarray, " b"]

@@ -8,8 +8,16 @@ import pytest
 from hypothesis import assume, given
 from hypothesis.strategies import SearchStrategy
 
+from asp_env.data.classes import AgentClass
 from asp_env.data.geometry import box_corners, from_frame
-from asp_env.metrics.boxes import AT_FAULT, Contact, ego_contacts, overlaps, time_to_collision
+from asp_env.metrics.boxes import (
+    AT_FAULT,
+    Contact,
+    ego_contacts,
+    overlaps,
+    time_to_collision,
+    touching_trailers,
+)
 
 CAR = (4.0, 2.0)
 State = tuple[float, float, float, float]
@@ -109,6 +117,28 @@ def test_each_agent_by_itself() -> None:
     expected = [Contact.FRONT, Contact.NONE, Contact.REAR]
     assert contacts(*others) == expected
     assert contacts(*others[::-1]) == expected[::-1]
+
+
+@pytest.mark.parametrize(
+    ("ego", "other", "x", "expected"),
+    [
+        (AgentClass.TRUCK, AgentClass.TRAILER, -3.5, True),
+        (AgentClass.CAR, AgentClass.TRAILER, -3.5, True),
+        (AgentClass.TRUCK, AgentClass.TRAILER, -4.01, False),
+        (AgentClass.TRUCK, AgentClass.VAN, -3.5, False),
+        (AgentClass.PEDESTRIAN, AgentClass.TRAILER, -3.5, False),
+        (AgentClass.TRAILER, AgentClass.TRAILER, -3.5, False),
+    ],
+)
+def test_touching_trailers(ego: AgentClass, other: AgentClass, x: float, expected: bool) -> None:
+    """A trailer, 4 m long as the ego, within it; only of who may tow, standing or not."""
+    for speed in (0.0, 5.0):
+        states = placed((x, 0.0, 0.0, speed), ego=(0.0, 0.0, 0.0, speed))
+        sizes, valid = np.array([[CAR, CAR]]), np.ones((1, 2), dtype=bool)
+        found = touching_trailers(states, sizes, np.array([[ego, other]]), valid)
+        assert found.tolist() == [[False, expected]]
+        valid[0, 1] = False
+        assert not touching_trailers(states, sizes, np.array([[ego, other]]), valid).any()
 
 
 def test_the_absent_touch_nobody() -> None:

@@ -121,6 +121,23 @@ def test_somebody_who_cuts_in_from_behind_is_given_way():
     assert plans[1.7][0, -1, 1] < alone[0, -1, 1] - 0.3
 
 
+@pytest.mark.parametrize(("gap_m", "own"), [(-0.2, True), (0.2, False)])
+def test_its_own_trailer_does_not_count(gap_m, own):
+    """A trailer of 7 m that the ego touches is absent to it, wherever it is said to go.
+
+    The ego is at x = -60, and the trailer is said to stand at -46 in its way: that stops it unless
+    the trailer is its own.
+    """
+    planner = SamplingPlanner()
+    alone = approach().world.scene()
+    expected = planner.plan(alone, straight_on(alone)).states
+    behind = car(-90.0 - 2.25 - gap_m - 3.5, 10.0, kind=AgentClass.TRAILER)
+    scene = approach(behind).world.scene()
+    blocking = np.tile(np.array([-46.0, -1.75, 0.0, 0.0], dtype=np.float32), (STEPS, 1))
+    states = planner.plan(scene, two_modes(scene, blocking, 0.9)).states
+    assert (states.tobytes() == expected.tobytes()) is own
+
+
 def test_stands_while_somebody_walks_into_it():
     """A pedestrian who will touch the standing ego whatever it does: it waits, and is not at fault.
 

@@ -5,7 +5,7 @@ import math
 import numpy as np
 import pytest
 
-from asp_env.data.classes import AgentClass
+from asp_env.data.classes import FOOTPRINTS_M, AgentClass
 from asp_env.data.scenario import find_scenarios
 from asp_env.data.source import open_data
 from asp_env.errors import AspEnvError
@@ -209,6 +209,48 @@ def test_whose_fault_a_contact_is_shows_when_it_begins():
     while not simulation.world.events().collision[0]:
         drive(simulation, [(0.0, 0.0)])
     assert simulation.world.events().contacts[0].tolist() == [0, 0, Contact.EGO_STANDS]
+
+
+@pytest.mark.parametrize(
+    ("kind", "gap_m", "own"),
+    [
+        (AgentClass.TRUCK, -0.5, True),
+        (AgentClass.CAR, -0.5, True),
+        (AgentClass.TRUCK, 0.5, False),
+        (AgentClass.BICYCLE, -0.5, False),
+    ],
+)
+def test_the_egos_own_trailer_is_no_contact(kind, gap_m, own):
+    """A trailer of 7 m within the ego from the start never counts; one that comes up to it does.
+
+    The ego brakes to a stop and its trailer, replayed at 5 m/s, goes through it within 4 s.
+    """
+    length_m = float(FOOTPRINTS_M[kind, 0])
+    trailer_x_m = -60.0 - length_m / 2 - gap_m - 3.5
+    drives = (
+        car(-60.0, 5.0, kind=kind),
+        car(trailer_x_m, 5.0, kind=AgentClass.TRAILER),
+    )
+    simulation = simulate(make_recording(drives=drives, duration_s=12.0), scenario(length=40))
+    met = [bool(simulation.world.events().collision[0])]
+    for _ in range(20):
+        drive(simulation, [(-2.0, 0.0)])
+        met.append(bool(simulation.world.events().collision[0]))
+    assert simulation.world.episodes.own_trailer.tolist() == [[False, own]]
+    assert any(met) is not own
+    assert met[0] is (gap_m < 0 and not own)
+
+
+def test_an_own_trailer_is_forgotten_with_its_episode():
+    """After a reset without a trailer the same slot has contacts again."""
+    pulled = (car(-60.0, 5.0), car(-65.5, 5.0, kind=AgentClass.TRAILER))
+    alone = (car(-90.0, 10.0), car(-52.0, 0.0))
+    recordings = [make_recording(drives=each, duration_s=12.0) for each in (pulled, alone)]
+    simulation = simulate(recordings, scenario(length=20))
+    assert simulation.world.episodes.own_trailer.any()
+    simulation.reset([scenario(length=20, recording=1)], [np.random.default_rng(0)])
+    drive(simulation, [(0.0, 0.0)] * 4)
+    assert simulation.world.events().contacts[0].tolist() == [0, Contact.OTHER_STANDS]
 
 
 def test_off_road_by_hand():
