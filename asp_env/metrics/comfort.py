@@ -13,20 +13,30 @@ MAX_YAW_ACCELERATION_RADPS2 = 1.93
 MAX_LON_JERK_MPS3 = 4.13
 MAX_JERK_MPS3 = 8.37
 
-WINDOW_TICKS = 5
-"""Derivatives are slopes of a parabola fitted over this many ticks, 1 s at 0.2 s."""
+WINDOW_S = 1.0
+"""Derivatives are slopes of a parabola fitted over the ticks within this time."""
+
+LEAST_TICKS = 5
+"""The window has at least so many ticks, so that it smooths where ticks are over 0.25 s."""
+
+
+def window_ticks(dt_s: float) -> int:
+    """How many ticks the window has: odd, no more than 1 s from first to last, at least 5."""
+    # a little more than half the window, so that rounding takes no tick away
+    return max(2 * int(0.5 * WINDOW_S / dt_s + 1e-6) + 1, LEAST_TICKS)
 
 
 def slope(values: Float[np.ndarray, "*batch t"], dt_s: float) -> Float[np.ndarray, "*batch t"]:
     """Derivative by a least-squares parabola over a sliding window; at the ends, that window's.
 
-    A Savitzky-Golay filter as nuPlan uses; exact for parabolas. Needs at least 5 ticks.
+    A Savitzky-Golay filter as nuPlan uses; exact for parabolas. Needs `window_ticks` ticks.
     """
-    half = WINDOW_TICKS // 2
-    offsets = np.arange(WINDOW_TICKS) - half
+    ticks = window_ticks(dt_s)
+    half = ticks // 2
+    offsets = np.arange(ticks) - half
     powers = np.vander(offsets * dt_s, 3, increasing=True)
     fit = np.linalg.pinv(powers)  # (3, window): constant, slope, curvature / 2 at the middle
-    windows = np.lib.stride_tricks.sliding_window_view(values, WINDOW_TICKS, axis=-1)
+    windows = np.lib.stride_tricks.sliding_window_view(values, ticks, axis=-1)
     _, linear, square = np.moveaxis(windows @ fit.T, -1, 0)
     lead = offsets[:half] * dt_s
     head = linear[..., :1] + 2 * square[..., :1] * lead
@@ -37,8 +47,8 @@ def slope(values: Float[np.ndarray, "*batch t"], dt_s: float) -> Float[np.ndarra
 def comfortable(
     states: Float[np.ndarray, "*batch t 4"], dt_s: float, long_enough: Bool[np.ndarray, "*batch"]
 ) -> Masked:
-    """1 where every bound holds at every tick, else 0; invalid for motions under 5 ticks."""
-    if states.shape[-2] < WINDOW_TICKS:
+    """1 where every bound holds at every tick, else 0; invalid for motions under one window."""
+    if states.shape[-2] < window_ticks(dt_s):
         return Masked(
             value=np.zeros(states.shape[:-2]), valid=np.zeros(states.shape[:-2], dtype=bool)
         )

@@ -9,7 +9,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 
 from asp_env.metrics.boxes import AT_FAULT
-from asp_env.metrics.comfort import WINDOW_TICKS, comfortable
+from asp_env.metrics.comfort import comfortable, window_ticks
 from asp_env.metrics.drivable import OFF_ROAD_M
 from asp_env.metrics.masked import Masked
 
@@ -42,7 +42,8 @@ def driving_metrics(drives: Drives) -> dict[str, Masked]:
     - `on road`: 0 when a corner is ever over 0.3 m outside the drivable area (nuPlan).
     - `progress`: the share of the logged ego's way, 0 to 1.
     - `TTC`: 1 when the time to collision never falls below 0.95 s (nuPlan).
-    - `comfort`: 1 when all of nuPlan's bounds hold; missing for episodes under 1 s.
+    - `comfort`: 1 when all of nuPlan's bounds hold; missing for episodes shorter than its window of
+      about 1 s (`window_ticks`; 5 ticks of 0.2 s).
     - `log divergence`: mean distance to the logged ego at the same ticks, m.
     - `score`: NC·DAC·(5·EP + 5·TTC + 2·C)/12 (PDMS); where comfort is missing, without it over 10.
     """
@@ -77,10 +78,10 @@ def driving_metrics(drives: Drives) -> dict[str, Masked]:
 
 
 def _comfort(drives: Drives) -> Masked:
-    ticks = drives.lasted.sum(axis=1)
+    ticks, needed = drives.lasted.sum(axis=1), window_ticks(drives.dt_s)
     value = np.zeros(len(ticks))
     for b, count in enumerate(ticks):
-        if count >= WINDOW_TICKS:
+        if count >= needed:
             enough = np.ones((), dtype=bool)
             value[b] = comfortable(drives.states[b, :count], drives.dt_s, enough).value
-    return Masked(value=value, valid=np.asarray(ticks >= WINDOW_TICKS))
+    return Masked(value=value, valid=np.asarray(ticks >= needed))

@@ -144,6 +144,13 @@ def test_five_ticks_are_enough() -> None:
     assert values(drive(lasted=5))["comfort"] == 1
 
 
+def test_too_short_at_other_ticks() -> None:
+    """Eight ticks of 0.1 s are under the window of eleven: 5·0.8 + 5 of 10."""
+    found = values(dataclasses.replace(drive(), dt_s=0.1))
+    assert math.isnan(found["comfort"])
+    assert found["score"] == pytest.approx(0.9)
+
+
 @pytest.mark.parametrize(
     ("reached_m", "goal_m", "progress"),
     [(25.0, 50.0, 0.5), (60.0, 50.0, 1.0), (-3.0, 50.0, 0.0), (0.25, 0.0, 0.25), (0.0, 0.5, 0.0)],
