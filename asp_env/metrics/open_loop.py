@@ -11,6 +11,8 @@ Selection = Literal["most-probable", "best-of-3"]
 SELECTIONS: tuple[Selection, ...] = ("most-probable", "best-of-3")
 
 MISS_M = 2.0
+WHOLE_S = 1e-6
+"""A time this close to a tick is that tick's."""
 MOVING_MPS = 1.0
 MOVING_M = 2.0
 
@@ -80,14 +82,18 @@ def errors_over_time(
     *,
     dt_s: float,
 ) -> dict[str, Masked]:
-    """Per target, `L2@1s`, `L2@2s` and so on: the chosen mode's distance to the truth then, m."""
+    """Per target, `L2@1s`, `L2@2s` and so on: the chosen mode's distance to the truth then, m.
+
+    Only seconds that are a whole number of ticks: with ticks of 0.3 s the first is `L2@3s`.
+    """
     chosen = select_mode(modes, log_probs, truth, selection)
     distance = np.linalg.norm(modes[np.arange(len(modes)), chosen] - truth, axis=-1)
     whole = range(1, int(truth.shape[1] * dt_s + 1e-6) + 1)
-    at = {second: round(second / dt_s) - 1 for second in whole}
+    ticks = {second: round(second / dt_s) for second in whole}
     return {
-        f"L2@{second}s": Masked(value=distance[:, tick], valid=valid[:, tick])
-        for second, tick in at.items()
+        f"L2@{second}s": Masked(value=distance[:, tick - 1], valid=valid[:, tick - 1])
+        for second, tick in ticks.items()
+        if abs(tick * dt_s - second) < WHOLE_S
     }
 
 

@@ -13,6 +13,7 @@ from asp_env.metrics.open_loop import (
     SELECTIONS,
     Selection,
     displacement,
+    errors_over_time,
     moving,
     open_loop_errors,
     select_mode,
@@ -175,6 +176,32 @@ def test_moving(speed: float, way_m: float, known: bool, expected: bool) -> None
     now = np.array([(5.0, 5.0, 0.3, speed)])
     truth = np.array([[(5.0, 5.0), (5.0, 5.0 + way_m)]])
     assert moving(now, truth, np.array([[True, known]])) == [expected]
+
+
+@pytest.mark.parametrize(
+    ("dt_s", "ticks", "expected"),
+    [
+        (0.2, 15, {1: 5, 2: 10, 3: 15}),
+        (0.04, 50, {1: 25, 2: 50}),
+        (0.1, 9, {}),
+        (0.3, 9, {}),
+        (0.3, 20, {3: 10, 6: 20}),
+        (0.4, 12, {2: 5, 4: 10}),
+    ],
+)
+def test_errors_over_time(dt_s: float, ticks: int, expected: dict[int, int]) -> None:
+    """The error at tick k is k metres; only seconds that are whole ticks are told.
+
+    The truth is known up to the tick before the last.
+    """
+    modes = np.zeros((1, 1, ticks, 2))
+    modes[0, 0, :, 1] = np.arange(1, ticks + 1)
+    truth, known = np.zeros((1, ticks, 2)), np.arange(ticks)[None] < ticks - 1
+    found = errors_over_time(modes, np.zeros((1, 1)), truth, known, "most-probable", dt_s=dt_s)
+    assert set(found) == {f"L2@{second}s" for second in expected}
+    for second, tick in expected.items():
+        assert found[f"L2@{second}s"].value.tolist() == [tick]
+        assert found[f"L2@{second}s"].valid.tolist() == [tick < ticks]
 
 
 def test_nobody() -> None:
