@@ -1,5 +1,7 @@
 """A predictor of your own in the loop: everybody brakes gently, in two modes."""
 
+from typing import ClassVar
+
 import numpy as np
 
 from asp_env.data.forecast import Forecast, fill_missing, make_forecast
@@ -19,6 +21,7 @@ class Braking:
     history = 1
     horizon = 15
     trained_on = None
+    about: ClassVar[dict[str, str]] = {}
 
     def predict(self, scene: Scene, future: Future | None = None) -> Forecast:
         """Two modes for every target, through the bicycle model."""

@@ -92,3 +92,16 @@ def test_the_same_road_on_real_recordings(tmp_path: Path) -> None:
     by_metric = {row["metric"]: float(row["value"]) for row in expert}
     assert by_metric["no at-fault collision"] == 1.0
     assert by_metric["log divergence"] == 0.0
+
+
+def test_a_demo_takes_up_only_its_own_remains(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """A folder that holds something else is refused, and nothing in it is touched."""
+    other = tmp_path / "results"
+    other.mkdir()
+    (other / "mine.txt").write_text("precious")
+    (tmp_path / "plan.json").write_text('{"site": "elsewhere"}')
+    assert main(["demo", "--out", str(tmp_path)]) == 2
+    assert "choose another --out" in capsys.readouterr().err
+    assert (other / "mine.txt").read_text() == "precious"

@@ -35,6 +35,9 @@ def ticks(duration_s: float, dt_s: float) -> int:
     Raises:
         AspEnvError: the duration is no whole, positive number of ticks.
     """
+    for what, value_s in (("time step", dt_s), ("duration", duration_s)):
+        if not (math.isfinite(value_s) and value_s > 0):
+            raise AspEnvError(f"{what} {value_s} s: expected a positive number")
     count = round(duration_s / dt_s)
     if count < 1 or abs(count * dt_s - duration_s) > 1e-6:
         raise AspEnvError(f"{duration_s:g} s is no whole number of ticks of {dt_s:g} s")

@@ -11,7 +11,7 @@ from asp_env.data.clock import frames_per_tick
 from asp_env.data.recording import Recording
 from asp_env.data.snippets import SnippetIndex
 from asp_env.data.source import Recordings
-from asp_env.data.split import split_blocks, split_by_recording
+from asp_env.data.split import Part, split_blocks, split_by_recording
 
 Split = Literal["recording", "blocks"]
 
@@ -73,6 +73,21 @@ def unseen_ticks(
                 free[:] = False
         unseen.append(free)
     return unseen
+
+
+def ticks_of_part(
+    recordings: Recordings, trained_on: Sequence[TrainedOn], part: Part, dt_s: float
+) -> list[Bool[np.ndarray, " _"]]:
+    """Of each recording, the ticks that were this part of what every one of some predictors had."""
+    found = []
+    for recording, content in zip(recordings, recordings.hashes(), strict=True):
+        length = num_ticks(recording, dt_s)
+        mine = np.ones(length, dtype=bool)
+        for known in trained_on:
+            dealt = known.parts.get(content, "none")
+            mine &= part_of_ticks(length) == part if dealt == "blocks" else dealt == part
+        found.append(mine)
+    return found
 
 
 def part_of_ticks(length: int) -> Shaped[np.ndarray, " ticks"]:

@@ -1,5 +1,6 @@
 """The socket for predictors, and how one is named: `name` or `name:RUN_DIR`."""
 
+from collections.abc import Mapping
 from typing import Protocol, runtime_checkable
 
 from asp_env import registry
@@ -41,6 +42,11 @@ class Predictor(Protocol):
     @property
     def trained_on(self) -> TrainedOn | None:
         """What it learned from; None for one that learns nothing."""
+        ...
+
+    @property
+    def about(self) -> Mapping[str, str]:
+        """For tables and manifests: `trained_on`, `view`, `preset`, `weights`, as they apply."""
         ...
 
     def predict(self, scene: Scene, future: Future | None = None) -> Forecast:

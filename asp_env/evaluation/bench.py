@@ -14,6 +14,7 @@ from rich.table import Table
 from asp_env.data.scenario import Scenario, find_scenarios
 from asp_env.data.snippets import gather_scene, index_snippets
 from asp_env.data.source import Recordings, open_data
+from asp_env.errors import AspEnvError
 from asp_env.evaluation.unseen import nothing_left
 from asp_env.sim.drivers import DRIVERS, make_driver
 from asp_env.sim.simulation import Simulation
@@ -24,6 +25,7 @@ HISTORY = 15
 REPEATS = 5
 SIZES_PX = ((360, 240), (90, 60))
 COPY_BYTES = 256 * 2**20
+STATE_BYTES = 4 * np.dtype(np.float32).itemsize
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -39,9 +41,11 @@ class Bench:
 
     def run(self) -> None:
         """Measures and prints a table."""
+        if self.episodes < 1:
+            raise AspEnvError(f"--episodes {self.episodes}: expected at least 1")
         recordings = open_data(self.data)
         table = Table(title=f"medians of {REPEATS}, {os.cpu_count()} cores seen, one used")
-        for heading in ("what", "rate", "bytes moved", "share of copy bandwidth"):
+        for heading in ("what", "rate", "bytes written", "share of copy bandwidth"):
             table.add_column(heading, justify="left" if heading == "what" else "right")
         copy = _copy_bandwidth()
         table.add_row("memory copy (bytes written)", f"{copy / 1e9:.1f} GB/s", "", "1.00")
@@ -55,25 +59,27 @@ class Bench:
             )
         scenarios = _scenarios(recordings, self.data, self.episodes)
         for traffic in DRIVERS:
-            per_s, agents, size = _steps(recordings, scenarios, traffic)
+            per_s, resets_per_s, size = _steps(recordings, scenarios, traffic)
+            name = f"{self.episodes} episodes, {size // STATE_BYTES} slots, {traffic}"
             table.add_row(
-                f"{self.episodes} episodes, {agents} slots, {traffic}, with events",
+                f"{name}, step and events",
                 f"{per_s:,.0f} episode-steps/s",
                 f"{per_s * size / 1e9:.2f} GB/s",
-                f"{per_s * size / copy:.2f}",
+                f"{per_s * size / copy:.3f}",
             )
+            table.add_row(f"{name}, reset", f"{resets_per_s:,.0f} episodes/s")
         Console(width=max(Console().width, 110)).print(table)
 
 
-def median_s(work: Callable[[], object]) -> float:
-    """Median duration of several calls after one that is not counted."""
-    work()
+def median_s(work: Callable[[], object], prepare: Callable[[], object] = lambda: None) -> float:
+    """Median duration of several calls after one that is not counted; preparing is not timed."""
     durations = []
-    for _ in range(REPEATS):
+    for _ in range(1 + REPEATS):
+        prepare()
         start = perf_counter()
         work()
         durations.append(perf_counter() - start)
-    return float(np.median(durations))
+    return float(np.median(durations[1:]))
 
 
 def _copy_bandwidth() -> float:
@@ -101,22 +107,23 @@ def _scenarios(recordings: Recordings, source: str, count: int) -> list[Scenario
 
 def _steps(
     recordings: Recordings, scenarios: list[Scenario], traffic: str
-) -> tuple[float, int, int]:
+) -> tuple[float, float, int]:
+    """Episode-steps and resets per second, and the bytes of one tick's states of an episode."""
     simulation = Simulation(
         recordings, make_driver(traffic), num_episodes=len(scenarios), dt_s=DT_S, history=HISTORY
     )
-    simulation.reset(scenarios, [np.random.default_rng(0)] * len(scenarios))
-    start = simulation.world.snapshot()
+    generators = [np.random.default_rng(0)] * len(scenarios)
+    reset_s = median_s(lambda: simulation.reset(scenarios, generators))
+    start = simulation.snapshot()
     actions = np.zeros((len(scenarios), 2), dtype=np.float32)
     driven = np.ones(len(scenarios), dtype=bool)
     steps = min(scenario.length for scenario in scenarios)
 
-    def work() -> None:
-        simulation.world.restore(start)
+    def drive() -> None:
         for _ in range(steps):
             simulation.step(actions, driven)
             simulation.world.events()
 
-    agents = simulation.world.episodes.ids.shape[1]
-    state_bytes = agents * 4 * np.dtype(np.float32).itemsize
-    return steps * len(scenarios) / median_s(work), agents, state_bytes
+    step_s = median_s(drive, prepare=lambda: simulation.restore(start))
+    size = simulation.world.episodes.ids.shape[1] * STATE_BYTES
+    return steps * len(scenarios) / step_s, len(scenarios) / reset_s, size

@@ -77,7 +77,7 @@ class Drive:
             save_rollouts(folder, result)
             write_report(folder, title=f"Driving on {Path(self.data).name}", maps=result.maps)
         console = Console()
-        console.print(driving_table(result.rows))
+        console.print(driving_table(result.rows, result.manifest["privileged"]))
         console.print(f"wrote {self.out}/report.html")
 
 
@@ -87,6 +87,8 @@ class _Run:
 
     planner: str
     predictor: str
+    about: Mapping[str, str]
+    """Of the predictor; empty where none takes part."""
     metrics: Mapping[str, Masked]
     endings: tuple[Ending, ...]
     rollouts: tuple[Rollout, ...]
@@ -110,9 +112,7 @@ def drive(config: Drive) -> ClosedLoop:
     recordings = open_data(config.data)
     horizon, history = ticks(config.horizon, config.dt), ticks(HISTORY_S, config.dt)
     predictors = load_predictors(config.predictors, horizon=horizon, dt_s=config.dt)
-    allowed, part = ticks_to_judge(
-        recordings, predictors, config.part, dt_s=config.dt, horizon_s=config.horizon
-    )
+    allowed, part = ticks_to_judge(recordings, predictors, config.part, dt_s=config.dt)
     found = find_scenarios(
         recordings, source=config.data, dt_s=config.dt, history=history, allowed=allowed
     )
@@ -138,6 +138,7 @@ def drive(config: Drive) -> ClosedLoop:
             for entrant in entrants
         ]  # fmt: skip
     reference = next((run for run in runs if run.predictor == REFERENCE), None)
+    named = dict(zip(config.predictors, predictors, strict=True))
     rows = [row for run in runs for row in _rows(config, run, reference, scenarios)]
     short = short_names(config.predictors)
     drivers = {
@@ -151,12 +152,17 @@ def drive(config: Drive) -> ClosedLoop:
             "data": config.data,
             "data_hash": recordings.data_hash(),
             "planner": config.planner,
-            "predictors": list(config.predictors),
+            "predictors": {name: dict(p.about) for name, p in named.items()},
+            "privileged": [
+                EXPERT,
+                *(name for name, p in named.items() if p.privileged),
+            ],
             "traffic": config.traffic,
             "horizon_s": config.horizon,
             "dt_s": config.dt,
             "part": part,
-            "scenarios": [scenario.name for scenario in scenarios],
+            "most scenarios": config.scenarios,
+            "scenarios": {scenario.name: {"seed": scenario.seed} for scenario in scenarios},
             "endings": {
                 driver: dict(Counter(kind.name for kind in run.endings))
                 for driver, run in drivers.items()
@@ -219,6 +225,7 @@ def _drive_all(
     return _Run(
         planner=planner.name,
         predictor=name,
+        about=predictor.about if name else {},
         metrics=joined,
         endings=tuple(endings),
         rollouts=tuple(rollouts),
@@ -242,6 +249,9 @@ def _rows(
             Row(
                 data=config.data,
                 predictor=run.predictor,
+                trained_on=run.about.get("trained_on", ""),
+                view=run.about.get("view", ""),
+                preset=run.about.get("preset", ""),
                 planner=run.planner,
                 traffic=config.traffic,
                 latency_ticks=0,

@@ -1,13 +1,18 @@
 """`asp-env demo`: the main job on embedded data, from traffic to report."""
 
+import json
 import shutil
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
+from importlib import metadata
 from pathlib import Path
 from typing import Any
 
 from rich.console import Console
 
 from asp_env import registry
+from asp_env.errors import AspEnvError
 from asp_env.evaluation.closed_loop import Drive, drive, save_rollouts
 from asp_env.evaluation.open_loop import Evaluate, evaluate
 from asp_env.evaluation.output import output_folder, write_manifest, write_metrics
@@ -20,6 +25,16 @@ TRAINING = {"recordings": 30, "minutes": 2.5, "seed": 0, "locations": 6}
 HELD_OUT = {"recordings": 9, "minutes": 2.0, "seed": 1_000}
 """Traffic of other seeds, so of other places; no predictor sees it before it is judged."""
 SCENARIOS = 48
+PRESET = "cpu"
+PLAN = {
+    "site": SITE,
+    "training": TRAINING,
+    "held_out": HELD_OUT,
+    "predictor": PREDICTOR,
+    "preset": PRESET,
+    "asp-env": metadata.version("asp-env"),
+}
+"""What a demo's folder is made by; kept in it, so that another demo's remains are not taken up."""
 
 LEAD = (
     "Traffic was made, a predictor was trained on it, judged on recordings of places that it has "
@@ -36,12 +51,13 @@ class Demo:
     """
 
     out: Path = Path("demo")
-    """Folder to write; the report is in its folder `results`."""
+    """Folder to write, the report and all it is made from."""
 
     def run(self) -> None:
         """Runs every step that is not done yet, then writes the results anew."""
         check_report_possible()
         console = Console()
+        _claim(self.out)
         training, held_out = self.out / "traffic", self.out / "held-out"
         for folder, what in ((training, TRAINING), (held_out, HELD_OUT)):
             if not folder.exists():
@@ -50,7 +66,7 @@ class Demo:
         run = self.out / PREDICTOR
         if not (run / "config.json").exists():
             console.rule(f"training {PREDICTOR}")
-            _command("train", predictor=PREDICTOR, data=str(training), out=run, preset="cpu")
+            _command("train", predictor=PREDICTOR, data=str(training), out=run, preset=PRESET)
         console.rule("judging forecasts and driving")
         trained = f"{PREDICTOR}:{run}"
         opened = evaluate(
@@ -68,11 +84,17 @@ class Demo:
                 scenarios=SCENARIOS,
             )
         )
-        results = self.out / "results"
-        shutil.rmtree(results, ignore_errors=True)
-        with output_folder(results) as folder:
+        with _replacing(self.out) as folder:
             write_metrics(folder, [*opened.rows, *closed.rows])
-            write_manifest(folder, "demo", open_loop=opened.manifest, closed_loop=closed.manifest)
+            privileged = sorted({*opened.manifest["privileged"], *closed.manifest["privileged"]})
+            write_manifest(
+                folder,
+                "demo",
+                plan=PLAN,
+                privileged=privileged,
+                open_loop=opened.manifest,
+                closed_loop=closed.manifest,
+            )
             save_rollouts(folder, closed)
             write_report(
                 folder,
@@ -81,11 +103,45 @@ class Demo:
                 maps=closed.maps,
                 examples=opened.examples,
             )
-        for table in (*open_loop_tables(opened.rows), driving_table(closed.rows)):
+        for table in (
+            *open_loop_tables(opened.rows, opened.manifest["privileged"]),
+            driving_table(closed.rows, closed.manifest["privileged"]),
+        ):
             console.print(table)
-        console.print(f"wrote {results / 'report.html'}")
+        console.print(f"wrote {self.out / 'report.html'}")
 
 
 def _command(name: str, **options: Any) -> None:
     """Another package's command, with its options by field name."""
     registry.find("commands", name)(**options).run()
+
+
+def _claim(out: Path) -> None:
+    """Makes the folder this demo's own, or finds that it is already."""
+    path = out / "plan.json"
+    if out.exists() and (not out.is_dir() or any(out.iterdir())):
+        try:
+            same = json.loads(path.read_text()) == PLAN
+        except (OSError, ValueError):
+            same = False
+        if not same:
+            raise AspEnvError(
+                f"{out}: holds no demo that this version began; choose another --out or remove it"
+            )
+        return
+    out.mkdir(parents=True, exist_ok=True)
+    path.write_text(json.dumps(PLAN, indent=2) + "\n")
+
+
+@contextmanager
+def _replacing(out: Path) -> Iterator[Path]:
+    """A folder whose content takes the place of what `out` holds under the same names."""
+    fresh = out / "fresh"
+    shutil.rmtree(fresh, ignore_errors=True)
+    with output_folder(fresh) as folder:
+        yield folder
+    for made in fresh.iterdir():
+        old = out / made.name
+        shutil.rmtree(old) if old.is_dir() else old.unlink(missing_ok=True)
+        made.rename(old)
+    fresh.rmdir()

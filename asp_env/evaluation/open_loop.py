@@ -1,6 +1,6 @@
 """`asp-env evaluate`: forecasts against what happened, on snippets of recordings."""
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any
@@ -73,7 +73,7 @@ class Evaluate:
                 folder, title=f"Open loop on {Path(self.data).name}", examples=result.examples
             )
         console = Console()
-        for table in open_loop_tables(result.rows):
+        for table in open_loop_tables(result.rows, result.manifest["privileged"]):
             console.print(table)
         console.print(f"wrote {self.out}/report.html")
 
@@ -103,18 +103,18 @@ def evaluate(config: Evaluate) -> OpenLoop:
     recordings = open_data(config.data)
     horizon = ticks(config.horizon, config.dt)
     predictors = load_predictors(config.predictors, horizon=horizon, dt_s=config.dt)
-    allowed, part = ticks_to_judge(
-        recordings, predictors, config.part, dt_s=config.dt, horizon_s=config.horizon
-    )
+    allowed, part = ticks_to_judge(recordings, predictors, config.part, dt_s=config.dt)
     index = index_snippets(recordings, dt_s=config.dt, horizon_s=config.horizon)
     index = keep_within(index, allowed)
     judged, subset = _judge(recordings, index, predictors, config.predictors)
+    named = dict(zip(config.predictors, predictors, strict=True))
     return OpenLoop(
-        rows=_rows(config, judged, subset, index.recording),
+        rows=_rows(config, named, judged, subset, index.recording),
         manifest={
             "data": config.data,
             "data_hash": recordings.data_hash(),
-            "predictors": list(config.predictors),
+            "predictors": {name: dict(p.about) for name, p in named.items()},
+            "privileged": [name for name, p in named.items() if p.privileged],
             "horizon_s": config.horizon,
             "dt_s": config.dt,
             "part": part,
@@ -183,6 +183,7 @@ def _judge(
 
 def _rows(
     config: Evaluate,
+    predictors: Mapping[str, Predictor],
     judged: Sequence[Judged],
     subsets: dict[str, Bool[np.ndarray, " n"]],
     groups: Shaped[np.ndarray, " n"],
@@ -208,6 +209,9 @@ def _rows(
                 Row(
                     data=config.data,
                     predictor=each.name,
+                    trained_on=predictors[each.name].about.get("trained_on", ""),
+                    view=predictors[each.name].about.get("view", ""),
+                    preset=predictors[each.name].about.get("preset", ""),
                     horizon_s=config.horizon,
                     selection=each.selection,
                     subset=subset,

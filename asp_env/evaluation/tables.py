@@ -1,6 +1,6 @@
 """Tables for terminals, 80 columns wide; all intervals are in `metrics.csv` and the report."""
 
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 
 from rich import box
 from rich.table import Table
@@ -20,13 +20,18 @@ DRIVING_SHORT = {
 }
 
 
-def open_loop_tables(rows: Sequence[Row]) -> list[Table]:
-    """Predictor by metric, a table for every subset and selection."""
+MARK = " *"
+"""Stands behind who was handed the recorded future."""
+
+
+def open_loop_tables(rows: Sequence[Row], privileged: Collection[str] = ()) -> list[Table]:
+    """Predictor by metric, a table for every subset and selection; * knows the future."""
     short = short_names([row.predictor for row in rows])
     groups: dict[tuple[str, str], dict[str, dict[str, Row]]] = {}
     for row in rows:
         members = groups.setdefault((row.subset, row.selection), {})
-        members.setdefault(short[row.predictor], {})[row.metric] = row
+        mark = MARK if row.predictor in privileged else ""
+        members.setdefault(short[row.predictor] + mark, {})[row.metric] = row
     tables = []
     for (subset, selection), members in groups.items():
         table = _table(f"{subset} targets, {selection}, 95 % intervals over recordings")
@@ -35,20 +40,26 @@ def open_loop_tables(rows: Sequence[Row]) -> list[Table]:
     return tables
 
 
-def driving_table(rows: Sequence[Row]) -> Table:
-    """Driver by metric; the expert, which is the noise floor, first."""
+def driving_table(rows: Sequence[Row], privileged: Collection[str] = ()) -> Table:
+    """Driver by metric; the expert, which is the noise floor, first; * knows the future."""
     table = _table("driving, mean per episode, 95 % interval over recordings")
     short = short_names([row.predictor for row in rows])
     members: dict[str, dict[str, Row]] = {}
     for row in rows:
         name = " + ".join(part for part in (row.planner, short[row.predictor]) if part)
-        members.setdefault(name, {})[row.metric] = row
+        mark = MARK if row.planner in privileged or row.predictor in privileged else ""
+        members.setdefault(name + mark, {})[row.metric] = row
     _fill(table, "driver", members, DRIVING, DRIVING_SHORT)
     return table
 
 
 def _table(title: str) -> Table:
-    return Table(title=title, box=box.SIMPLE_HEAD, show_edge=False, padding=(0, 1, 0, 0))
+    return Table(
+        title=title,
+        box=box.SIMPLE_HEAD,
+        show_edge=False,
+        padding=(0, 1, 0, 0),
+    )
 
 
 def _fill(
@@ -59,6 +70,8 @@ def _fill(
     without: dict[str, str],
 ) -> None:
     table.add_column(who, min_width=18)
+    if any(name.endswith(MARK) for name in members):
+        table.caption = f"{MARK.strip()} knows the recorded future"
     for heading in (*with_interval.values(), *without.values(), "n"):
         table.add_column(heading, justify="right", no_wrap=True)
     for name, metrics in members.items():

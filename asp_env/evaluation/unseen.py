@@ -6,7 +6,7 @@ from typing import Literal
 import numpy as np
 from jaxtyping import Bool
 
-from asp_env.data.parts import num_ticks, snippet_parts, unseen_ticks
+from asp_env.data.parts import num_ticks, snippet_parts, ticks_of_part, unseen_ticks
 from asp_env.data.predictor import Predictor
 from asp_env.data.snippets import SnippetIndex, index_snippets
 from asp_env.data.source import Recordings
@@ -14,33 +14,46 @@ from asp_env.errors import AspEnvError
 
 PartChoice = Literal["auto", "train", "validation", "test", "all"]
 
+SPLIT_HORIZON_S = 3.0
+"""Recordings are dealt by their number of snippets with this horizon, whatever is judged."""
+
 
 def ticks_to_judge(
-    recordings: Recordings,
-    predictors: Sequence[Predictor],
-    part: PartChoice,
-    *,
-    dt_s: float,
-    horizon_s: float,
+    recordings: Recordings, predictors: Sequence[Predictor], part: PartChoice, *, dt_s: float
 ) -> tuple[list[Bool[np.ndarray, " _"]], str]:
     """The ticks of each recording that may be judged on, and in words which they are.
 
     `auto`: what no predictor has learned from or was selected on. `train`, `validation` and `test`:
-    that part of DATA under the split by recording. `all`: everything, seen or not.
+    that part of what the predictors were trained on; where none was trained on these recordings,
+    that part of them under the split by recording for 3 s. `all`: everything, seen or not.
+
+    Raises:
+        AspEnvError: these recordings cannot be split.
     """
+    contents = set(recordings.hashes())
+    trained = [
+        known
+        for predictor in predictors
+        if (known := predictor.trained_on) is not None and contents & set(known.parts)
+    ]
     if part == "auto":
-        trained = [known for predictor in predictors if (known := predictor.trained_on) is not None]
-        overlap = {name for known in trained for name in known.parts} & set(recordings.hashes())
-        label = "what no predictor has seen" if overlap else "all, of which no predictor saw any"
+        label = "what no predictor has seen" if trained else "all, of which no predictor saw any"
         return unseen_ticks(recordings, trained, dt_s), label
-    lengths = [num_ticks(recording, dt_s) for recording in recordings]
     if part == "all":
+        lengths = [num_ticks(recording, dt_s) for recording in recordings]
         return [np.ones(length, dtype=bool) for length in lengths], "all, seen or not"
-    index = index_snippets(recordings, dt_s=dt_s, horizon_s=horizon_s)
-    _, known = snippet_parts(recordings, index, "recording")
-    mine = [known.parts[content] == part for content in recordings.hashes()]
-    chosen = [np.full(length, keep) for length, keep in zip(lengths, mine, strict=True)]
-    return chosen, f"{part} of the split by recording"
+    if trained:
+        label = f"{part} of what the predictors were trained on"
+        return ticks_of_part(recordings, trained, part, dt_s), label
+    index = index_snippets(recordings, dt_s=dt_s, horizon_s=SPLIT_HORIZON_S)
+    try:
+        _, dealt = snippet_parts(recordings, index, "recording")
+    except AspEnvError as error:
+        raise AspEnvError(
+            f"--part {part}: no location has three recordings with snippets, so there is no split "
+            "by recording; say --part all"
+        ) from error
+    return ticks_of_part(recordings, [dealt], part, dt_s), f"{part} of the split by recording"
 
 
 def keep_within(index: SnippetIndex, allowed: Sequence[Bool[np.ndarray, " _"]]) -> SnippetIndex:

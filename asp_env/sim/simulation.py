@@ -1,5 +1,6 @@
 """A world and the drivers of its traffic, stepped together by what the egos do."""
 
+import copy
 from collections.abc import Sequence
 
 import numpy as np
@@ -8,7 +9,7 @@ from jaxtyping import Bool, Float, Int
 from asp_env.data.recording import Recording
 from asp_env.data.scenario import Scenario
 from asp_env.sim.drivers import Driver
-from asp_env.sim.replay import ReplayWorld
+from asp_env.sim.replay import ReplayWorld, Snapshot
 from asp_env.sim.world import EGO, Ending, Events
 
 OFF_ROAD_END_M = 2.0
@@ -52,6 +53,16 @@ class Simulation:
         actions, driven = control.actions.copy(), control.driven.copy()
         actions[:, EGO], driven[:, EGO] = ego_actions, ego_driven
         self.world.step(actions, driven, control.leaving)
+
+    def snapshot(self) -> tuple[Snapshot, Driver]:
+        """The whole state, the driver's memory included, to be handed to `restore`."""
+        return self.world.snapshot(), copy.deepcopy(self.driver)
+
+    def restore(self, snapshot: tuple[Snapshot, Driver]) -> None:
+        """Goes back to a snapshot, bit for bit."""
+        world, driver = snapshot
+        self.world.restore(world)
+        self.driver = copy.deepcopy(driver)
 
 
 def ending(events: Events) -> Int[np.ndarray, " b"]:

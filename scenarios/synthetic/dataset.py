@@ -23,6 +23,7 @@ from scenarios.synthetic.tables import (
 )
 from scenarios.synthetic.traffic import parked_cars, record, tracks_in_view
 
+MAX_SECONDS = 24 * 3600.0
 RECORDINGS_PER_LOCATION = 3
 """At least so many, where there are enough: a split by recording needs three at each location."""
 _DAYS = ("monday", "tuesday", "wednesday", "thursday", "friday")
@@ -61,7 +62,7 @@ def synthesize(
     if site not in SITES:
         raise unknown_name("site", site, SITES)
     places = max(1, recordings // RECORDINGS_PER_LOCATION) if locations is None else locations
-    if not 1 <= places <= recordings or not minutes * 60.0 >= 1.0 or seed < 0:
+    if not 1 <= places <= recordings or not 1.0 <= minutes * 60.0 < MAX_SECONDS or seed < 0:
         raise AspEnvError(
             f"{recordings} recordings of {minutes} minutes at {places} locations with seed {seed} "
             "cannot be made: at least one recording of a second and more, at least one location "

@@ -35,6 +35,7 @@ def record(
     wanted = demand(rng, place.site, seconds)
     seed = int(rng.integers(1, 2**31 - 1))
     motions: dict[str, Motion] = {}
+    late: set[str] = set()
     for _ in range(_MOST_ATTEMPTS):
         moved = simulate(place.folder, wanted.routes, seconds=seconds, seed=seed)
         motions = _motions(moved, place, wanted.users)
@@ -46,6 +47,8 @@ def record(
         if not late:
             break
         wanted = wanted.without(late)
+    else:  # never seen; whoever still touches somebody is left out of the picture
+        motions = {name: motion for name, motion in motions.items() if name not in late}
     return motions, wanted.users
 
 

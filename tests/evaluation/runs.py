@@ -85,6 +85,7 @@ def write_tables(out: Path, rows: Sequence[dict[str, object]]) -> None:
         "data": "sample:intersection",
         "data_hash": "3f2a9c",
         "seeds": [0, 1],
+        "privileged": ["expert", "oracle"],
         "configuration": {"view": "chauffeurnet", "dt_s": 0.2, "limits": {"braking_mps2": 5.0}},
         "versions": {"asp-env": "0.1.0", "numpy": "2.4.6"},
     }

@@ -39,6 +39,7 @@ class Spy:
     dt_s: float = DT_S
     history: int = 0
     trained_on: TrainedOn | None = None
+    about: dict[str, str] = field(default_factory=dict)
     asked: list[tuple[Scene, Future | None]] = field(default_factory=list)
 
     def predict(self, scene: Scene, future: Future | None = None) -> Forecast:

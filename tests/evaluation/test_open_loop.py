@@ -89,7 +89,8 @@ def test_the_manifest_says_what_was_judged(crossings, recordings):
     assert told["recordings"] == 3
     assert told["part"] == "all, of which no predictor saw any"
     assert told["snippets"] > told["moving snippets"] > 50
-    assert told["predictors"] == ["constant-velocity", "constant-turn-rate"]
+    assert told["predictors"] == {"constant-velocity": {}, "constant-turn-rate": {}}
+    assert told["privileged"] == []
 
 
 def test_running_twice_gives_the_same_bits(crossings):

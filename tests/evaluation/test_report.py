@@ -154,6 +154,7 @@ def test_names_that_look_like_markup_stay_text(tmp_path: Path) -> None:
 
 def test_what_is_missing_or_damaged_is_one_line(tmp_path: Path) -> None:
     """No table, a column less, text for a number, no manifest, a rollout without its map."""
+    (tmp_path / "manifest.json").write_text("{}")
     with pytest.raises(DataError, match=r"metrics\.csv: not a table"):
         write_report(tmp_path, title="x")
     (tmp_path / "metrics.csv").write_text("data,predictor\na,b\n")

@@ -78,3 +78,12 @@ def test_short_names_are_as_short_as_they_can_be():
     assert short_names(["mtp:a/1", "mtp:a/2/"]) == {"mtp:a/1": "mtp 1", "mtp:a/2/": "mtp 2"}
     assert short_names(["mtp:a/1", "mtp:/b/1"]) == {"mtp:a/1": "mtp a-1", "mtp:/b/1": "mtp b-1"}
     assert short_names(["oracle", "oracle"]) == {"oracle": "oracle"}
+
+
+def test_who_knows_the_future_is_marked():
+    """A star behind the name and a caption that explains it, whatever the plug is called."""
+    rows = [_row("score", 0.9, planner="prophet"), _row("score", 0.5, planner="sampling")]
+    lines = _printed(driving_table(rows, ["prophet"]))
+    assert any(line.startswith("prophet *") for line in lines)
+    assert "* knows the recorded future" in lines[-1]
+    assert not any(line.startswith("sampling *") for line in lines)

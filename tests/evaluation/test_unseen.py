@@ -25,7 +25,7 @@ def _trained(recordings: Recordings, *parts: str) -> ConstantVelocity:
 
 
 def _judge(recordings: Recordings, *predictors: ConstantVelocity, part: PartChoice = "auto"):
-    return ticks_to_judge(recordings, predictors, part, dt_s=0.2, horizon_s=3.0)
+    return ticks_to_judge(recordings, predictors, part, dt_s=0.2)
 
 
 def test_nobody_trained_everything_is_judged(recordings):
@@ -107,3 +107,19 @@ def test_nothing_left_is_an_error(recordings):
     index = index_snippets(recordings, dt_s=0.2, horizon_s=3.0)
     with pytest.raises(AspEnvError, match=r"no snippet is left to judge on.*--part all"):
         keep_within(index, [np.zeros(101, dtype=bool)] * 3)
+
+
+def test_a_named_part_is_that_of_the_training(recordings):
+    """`--part validation` takes what a predictor was selected on, not what a new deal says."""
+    predictor = _trained(recordings, "validation", "train", "test")
+    allowed, words = _judge(recordings, predictor, part="validation")
+    assert [bool(ticks.all()) for ticks in allowed] == [True, False, False]
+    assert words == "validation of what the predictors were trained on"
+
+
+def test_a_named_part_of_blocks_is_blocks(recordings):
+    """`--part test` of a predictor trained on blocks never takes a tick that it learned from."""
+    predictor = _trained(recordings, "blocks", "blocks", "blocks")
+    allowed, _ = _judge(recordings, predictor, part="test")
+    for ticks in allowed:
+        assert ticks.tolist() == (part_of_ticks(len(ticks)) == "test").tolist()

@@ -6,8 +6,10 @@ import numpy as np
 import pytest
 
 from asp_env.metrics.boxes import Contact
+from asp_env.sim.drivers import DRIVERS
 from asp_env.sim.simulation import ending
 from asp_env.sim.world import Ending, Events
+from tests.sim.worlds import HISTORY, car, on_road, replay, scenario, simulate
 
 RUNNING = Events(
     contacts=np.zeros((1, 2), dtype=np.int8),
@@ -48,3 +50,21 @@ def test_the_first_of_the_enumeration_wins(kind):
     for later in reversed([each for each in SIGNS if each >= kind]):
         all_later |= SIGNS[later]
     assert ending(dataclasses.replace(RUNNING, **all_later)).tolist() == [kind]
+
+
+@pytest.mark.parametrize("traffic", sorted(DRIVERS))
+def test_a_snapshot_brings_back_the_drivers_memory(traffic):
+    """After a restore the same 10 steps lead to the same bits, whatever happened in between."""
+    recording = on_road(car(-60.0, 6.0), car(-40.0, 9.0, (3.0, -2.0, 0.0)), car(-90.0, 10.0))
+    scenarios = [scenario(1), scenario(1, start=HISTORY + 6)]
+    simulation = simulate(recording, scenarios, traffic=traffic)
+    replay(simulation, 5)
+    snapshot = simulation.snapshot()
+    ends = []
+    for _ in range(2):
+        simulation.restore(snapshot)
+        replay(simulation, 10)
+        ends.append(simulation.world.episodes.states.copy())
+        replay(simulation, 10)
+        simulation.reset(scenarios[::-1], [np.random.default_rng(1)] * 2)
+    np.testing.assert_array_equal(ends[0], ends[1])

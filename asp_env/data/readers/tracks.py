@@ -70,9 +70,9 @@ class _Rows:
 def read_tracks(files: RecordingFiles) -> TrackTable:
     """Reads a recording's tracks.
 
-    Vehicles keep the file's heading, and their speed is the velocity along it, negative when they
-    back up. Vulnerable road users head where they move; below 0.3 m/s they keep the heading they
-    had, and before they first move the file's. Their speed is the length of the velocity.
+    Vehicles keep the file's heading; their speed is the velocity's, negative when they back up.
+    Vulnerable road users head where they move; below 0.3 m/s they keep the heading they had, and
+    before they first move the file's. Their speed is the size of the velocity.
     A track with a gap in its frames is split there: what follows gets an id of its own.
 
     Raises:

@@ -66,7 +66,8 @@ def write_report(
 
     from asp_env.evaluation.report import plots
 
-    results = read_results(out / "metrics.csv")
+    run = _read_manifest(out / "manifest.json")
+    results = read_results(out / "metrics.csv", privileged=run.get("privileged", ()))
     colour = plots.colours(results.predictors)
     figures = {
         "final-errors": plots.final_errors(results.open_loop, colour),
@@ -81,7 +82,7 @@ def write_report(
         "drives": drives_payload(out / "rollouts", maps or {}, map_table),
     }
     data["maps"] = map_table.payloads
-    sections = _sections(out, results, data)
+    sections = _sections(run, results, data)
     page = _fill(
         (ASSETS / "page.html").read_text(encoding="utf-8"),
         {
@@ -108,7 +109,9 @@ def write_report(
     return path
 
 
-def _sections(out: Path, results: Results, data: dict[str, Any]) -> dict[str, tuple[str, str]]:
+def _sections(
+    run: dict[str, Any], results: Results, data: dict[str, Any]
+) -> dict[str, tuple[str, str]]:
     """(heading, body) of the sections that have something to show, by their anchors."""
     replay = (ASSETS / "replay.html").read_text(encoding="utf-8")
     figures = {name: f"<div class='plot' data-figure='{name}'></div>" for name in data["figures"]}
@@ -126,7 +129,7 @@ def _sections(out: Path, results: Results, data: dict[str, Any]) -> dict[str, tu
         ),
         "drives": ("Watch the drives", replay if data["drives"] else ""),
         "metrics": ("What the metrics say", _notes(results)),
-        "run": ("What was run", manifest(_read_manifest(out / "manifest.json"))),
+        "run": ("What was run", manifest(run)),
     }
     return {name: part for name, part in parts.items() if part[1]}
 

@@ -2,7 +2,7 @@
 
 import csv
 import re
-from collections.abc import Iterable, Sequence
+from collections.abc import Collection, Iterable, Sequence
 from dataclasses import dataclass, fields
 from pathlib import Path, PurePath
 
@@ -12,8 +12,6 @@ from asp_env.evaluation.output import Row
 COLUMNS = tuple(field.name for field in fields(Row))
 DETAILS = ("trained_on", "view", "preset", "chaining", "traffic", "latency_ticks")
 """Columns that tell rows of one predictor or planner apart, where they differ."""
-PRIVILEGED = frozenset({"oracle", "expert"})
-"""Predictors and planners that are handed the recorded future."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -24,6 +22,8 @@ class Entrant:
     predictor: str
     details: tuple[str, ...] = ()
     """What tells it from others of the same name."""
+    privileged: bool = False
+    """Whether it knew the recorded future."""
 
     @property
     def name(self) -> str:
@@ -35,11 +35,6 @@ class Entrant:
     def label(self) -> str:
         """The name with its details."""
         return " · ".join((self.name, *self.details))
-
-    @property
-    def privileged(self) -> bool:
-        """Whether it knew the recorded future."""
-        return bool(PRIVILEGED & {self.planner, self.predictor.partition(":")[0]})
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -77,8 +72,12 @@ class Results:
         return distinct(e.predictor for e in every if e.predictor and not e.privileged)
 
 
-def read_results(path: Path) -> Results:
+def read_results(path: Path, *, privileged: Collection[str] = ()) -> Results:
     """The table of metrics.
+
+    Args:
+        path: of the file.
+        privileged: predictors and planners that were handed the recorded future.
 
     Raises:
         DataError: the file is missing, lacks a column, or holds text for a number.
@@ -94,20 +93,26 @@ def read_results(path: Path) -> Results:
     if missing:
         raise DataError(f"{path}: no column {missing[0]!r}, expected {', '.join(COLUMNS)}")
     return Results(
-        open_loop=_results(path, [row for row in rows if not row["planner"]]),
-        driving=_results(path, [row for row in rows if row["planner"]]),
+        open_loop=_results(path, [row for row in rows if not row["planner"]], privileged),
+        driving=_results(path, [row for row in rows if row["planner"]], privileged),
     )
 
 
-def _results(path: Path, rows: Sequence[dict[str, str]]) -> tuple[Result, ...]:
+def _results(
+    path: Path, rows: Sequence[dict[str, str]], privileged: Collection[str]
+) -> tuple[Result, ...]:
     values = {name: {row[name] for row in rows} - {""} for name in DETAILS}
     varying = [name for name in DETAILS if len(values[name]) > 1]
     fixed = tuple(_detail(n, *values[n]) for n in DETAILS if len(values[n]) == 1)
-    return tuple(_result(path, row, varying, fixed) for row in rows)
+    return tuple(_result(path, row, varying, fixed, privileged) for row in rows)
 
 
 def _result(
-    path: Path, row: dict[str, str], varying: Sequence[str], fixed: tuple[str, ...]
+    path: Path,
+    row: dict[str, str],
+    varying: Sequence[str],
+    fixed: tuple[str, ...],
+    privileged: Collection[str],
 ) -> Result:
     folder = PurePath(row["predictor"].partition(":")[2])
     details = ["/".join(folder.parts[-2:])] if folder.name else []
@@ -122,7 +127,12 @@ def _result(
     except ValueError as error:
         raise DataError(f"{path}: metric {row['metric']!r}: {error}") from error
     return Result(
-        entrant=Entrant(planner=row["planner"], predictor=row["predictor"], details=tuple(details)),
+        entrant=Entrant(
+            planner=row["planner"],
+            predictor=row["predictor"],
+            details=tuple(details),
+            privileged=row["planner"] in privileged or row["predictor"] in privileged,
+        ),
         data=row["data"],
         horizon_s=row["horizon_s"],
         fixed=fixed,
