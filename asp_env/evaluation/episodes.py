@@ -138,7 +138,7 @@ def _ttc(world: ReplayWorld, events: Events) -> Float[np.ndarray, " b"]:
         np.ascontiguousarray(episodes.states[rows, world.now]),
         episodes.sizes,
         np.ascontiguousarray(episodes.valid[rows, world.now]),
-        events.contacts > 0,
+        (events.contacts > 0) | episodes.own_trailer,
     )
 
 
