@@ -24,7 +24,7 @@ class Fail:
         """Raises it."""
         raise {
             "input": AspEnvError("first line\nsecond line"),
-            "system": PermissionError(13, "Permission denied", "/somewhere/file"),
+            "system": PermissionError(13, "Permission denied", "/a/file"),
             "interrupt": KeyboardInterrupt(),
             "bug": ZeroDivisionError(),
         }[self.how]
@@ -154,7 +154,7 @@ def test_every_command_has_a_help(capsys, command):
 def test_errors_of_a_command_are_one_line(capsys):
     """Bad input and errors of the system; what has several lines becomes one."""
     assert _refused(capsys, "any", "--how", "input") == "asp-env: first line second line"
-    assert _refused(capsys, "any", "--how", "system") == "asp-env: /somewhere/file: Permission denied"
+    assert _refused(capsys, "any", "--how", "system") == "asp-env: /a/file: Permission denied"
 
 
 @pytest.mark.usefixtures("failing")
