@@ -7,16 +7,17 @@ import os
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import torch
 from safetensors import SafetensorError
 from safetensors.torch import load_file, save
 from torch import Tensor
 
 from asp_env.data.parts import TrainedOn
-from asp_env.errors import AspEnvError, CheckpointError
-from asp_env.views import PictureView, view_from_config
-from predictors.learned import AbstractNetwork, Learned, LearnedPlug, NetworkShape
+from asp_env.errors import AspEnvError, CheckpointError, unknown_name
+from asp_env.views import PictureView, SceneView, view_from_config
+from predictors.chaining import CHAININGS
+from predictors.learned import Learned
+from predictors.network import AbstractNetwork, LearnedPlug, NetworkShape
 
 CONFIG = "config.json"
 WEIGHTS = "weights.safetensors"
@@ -32,8 +33,9 @@ def save_learned(
     plug: LearnedPlug,
     network_config: Any,
     shape: NetworkShape,
-    view: PictureView,
+    view: SceneView,
     weights: dict[str, Tensor],
+    temperature: float,
     provenance: dict[str, Any],
 ) -> None:
     """Writes a predictor that `load_learned` loads; the configuration last, so never half.
@@ -45,6 +47,7 @@ def save_learned(
         shape: what the network was made for, with the normaliser.
         view: what it looks at.
         weights: the network's state.
+        temperature: what its logits are to be divided by.
         provenance: what it was trained on (`trained_on`) and how (`config`, with its `preset`
             if it has one); no times of day.
     """
@@ -57,19 +60,24 @@ def save_learned(
         "history": shape.history,
         "horizon": shape.horizon,
         "normaliser": {"action_range": list(shape.action_range)},
+        "temperature": temperature,
         "provenance": provenance,
     }
     save_weights(weights, folder / WEIGHTS)
     write_json(config, folder / CONFIG)
 
 
-def load_learned(plug: LearnedPlug, argument: str, *, dt_s: float) -> Learned:
+def load_learned(
+    plug: LearnedPlug, argument: str, *, dt_s: float, chaining: str = "beam"
+) -> Learned:
     """The predictor in a finished run's folder.
 
     Raises:
         CheckpointError: it is missing, damaged, or of another predictor.
-        AspEnvError: it was trained for another time step.
+        AspEnvError: it was trained for another time step, or there is no such chaining.
     """
+    if chaining not in CHAININGS:
+        raise unknown_name("chaining", chaining, CHAININGS)
     if not argument:
         raise CheckpointError(
             f"predictor {plug.name} is trained: name its run as {plug.name}:RUN_DIR"
@@ -82,12 +90,14 @@ def load_learned(plug: LearnedPlug, argument: str, *, dt_s: float) -> Learned:
             f"name it as {config['predictor']}:{folder}"
         )
     try:
-        shape, view, network, trained_on = _build(plug, config)
-        preset = config["provenance"].get("config", {}).get("preset")
+        view, network, trained_on = _build(plug, config)
+        temperature = float(config["temperature"])
+        training = config["provenance"].get("config", {})
     except (KeyError, TypeError, ValueError, RuntimeError) as error:
         raise CheckpointError(
             f"{folder / CONFIG} does not describe a {plug.name}: {_brief(error)}"
         ) from error
+    shape = network.shape
     if abs(shape.dt_s - dt_s) > 1e-6:
         raise AspEnvError(
             f"{plug.name} in {folder} was trained for a time step of {shape.dt_s:g} s, "
@@ -97,16 +107,18 @@ def load_learned(plug: LearnedPlug, argument: str, *, dt_s: float) -> Learned:
     about = {
         "trained_on": trained_on.source,
         "view": view.name,
-        **({} if preset is None else {"preset": str(preset)}),
+        **{key: str(training[key]) for key in ("preset", "history") if key in training},
+        **({"chaining": chaining} if len(network.later_ticks) > 1 else {}),
         "weights": hashlib.sha256((folder / WEIGHTS).read_bytes()).hexdigest()[:HASH_DIGITS],
     }
     return Learned(
         name=plug.name,
         network=network,
         view=view,
-        shape=shape,
         trained_on=trained_on,
         about=about,
+        temperature=temperature,
+        chaining=chaining,
     )
 
 
@@ -133,13 +145,19 @@ def read_config(folder: Path) -> dict[str, Any]:
     return config
 
 
+def shape_for(view: SceneView, **numbers: Any) -> NetworkShape:
+    """The shape of a network that looks at a view; the other fields by name."""
+    packed = isinstance(view, PictureView) and view.binary
+    return NetworkShape(seen=view.shape, packed=packed, **numbers)
+
+
 def _build(
     plug: LearnedPlug, config: dict[str, Any]
-) -> tuple[NetworkShape, PictureView, AbstractNetwork, TrainedOn]:
+) -> tuple[SceneView, AbstractNetwork, TrainedOn]:
     view = view_from_config(config["view"])
     acceleration, steering = config["normaliser"]["action_range"]
-    shape = NetworkShape(
-        raster=view.shape,
+    shape = shape_for(
+        view,
         history=int(config["history"]),
         horizon=int(config["horizon"]),
         dt_s=float(config["dt_s"]),
@@ -148,24 +166,33 @@ def _build(
     trained_on = TrainedOn(**config["provenance"]["trained_on"])
     with torch.random.fork_rng(devices=[]):  # initial weights are drawn and at once replaced
         network = plug.network(plug.config(**config["network"]), shape)
-    return shape, view, network, trained_on
+    return view, network, trained_on
 
 
-def _load_weights(network: AbstractNetwork, path: Path) -> None:
+def read_weights(path: Path) -> dict[str, Tensor]:
+    """The tensors of a finished run.
+
+    Raises:
+        CheckpointError: they are missing, damaged, or not finite.
+    """
     try:
         weights = load_file(path)
     except FileNotFoundError:
         raise CheckpointError(f"{path} is missing: the run is not complete, train again") from None
     except (OSError, ValueError, SafetensorError) as error:
         raise CheckpointError(f"{path} cannot be read: {_brief(error)}") from error
+    if not all(bool(tensor.isfinite().all()) for tensor in weights.values()):
+        raise CheckpointError(f"{path} holds weights that are not finite: train again")
+    return weights
+
+
+def _load_weights(network: AbstractNetwork, path: Path) -> None:
     try:
-        network.load_state_dict(weights)
+        network.load_state_dict(read_weights(path))
     except RuntimeError as error:
         raise CheckpointError(
             f"{path} does not fit the network of its {CONFIG}: {_brief(error)}"
         ) from error
-    if not all(bool(np.isfinite(tensor.numpy()).all()) for tensor in weights.values()):
-        raise CheckpointError(f"{path} holds weights that are not finite: train again")
 
 
 def save_weights(weights: dict[str, Tensor], path: Path) -> None:

@@ -1,25 +1,118 @@
-"""From rasters to features: ResNet18, and a small network for small rasters on a CPU."""
+"""From what is seen to features: ResNet18, a small network for small pictures, one for vectors."""
 
-from typing import Literal, final
+from pathlib import Path
+from typing import final
 
 import torch
-from jaxtyping import Float
+from jaxtyping import Float, UInt8
+from safetensors import SafetensorError
+from safetensors.torch import load_file
 from torch import Tensor, nn
 
-EncoderName = Literal["resnet18", "small"]
+from asp_env.errors import AspEnvError, CheckpointError, unknown_name
+from asp_env.views.vectors import VectorShape
+from predictors.batch import Seen
+from predictors.network import NetworkShape
+from predictors.vector_encoder import VectorEncoder
+
+PICTURE_ENCODERS = ("resnet18", "small")
+ENCODERS = (*PICTURE_ENCODERS, "vector")
 
 
-def make_encoder(name: EncoderName, shape: tuple[int, int, int], features: int) -> nn.Module:
-    """The encoder of rasters (channels, height, width) into so many features.
+def make_encoder(name: str, shape: NetworkShape, features: int) -> nn.Module:
+    """The encoder of what is seen into so many features.
 
     ResNet18 always has 512 features; others are reached by a linear layer behind it.
+
+    Raises:
+        AspEnvError: the name is unknown, or the encoder does not read what is seen.
     """
-    if name == "small":
-        return SmallEncoder(shape, features)
-    resnet = ResNet18(shape[0])
-    if features == resnet.features:
-        return resnet
-    return nn.Sequential(resnet, nn.Linear(resnet.features, features))
+    if name not in ENCODERS:
+        raise unknown_name("encoder", name, ENCODERS)
+    if isinstance(shape.seen, VectorShape):
+        if name in PICTURE_ENCODERS:
+            raise AspEnvError(f"encoder {name} reads pictures, the view draws vectors: take vector")
+        return VectorEncoder(shape.seen, features)
+    if name not in PICTURE_ENCODERS:
+        raise AspEnvError(
+            f"encoder {name} reads vectors, the view draws pictures: take "
+            f"{' or '.join(PICTURE_ENCODERS)}"
+        )
+    return PictureEncoder(name, shape.seen, features, packed=shape.packed)
+
+
+@final
+class PictureEncoder(nn.Module):
+    """Pictures of bytes or bits into features; unpacked and scaled where the network runs."""
+
+    def __init__(
+        self, name: str, shape: tuple[int, int, int], features: int, *, packed: bool
+    ) -> None:
+        """For pictures (channels, height, width)."""
+        super().__init__()
+        self._width = shape[2] if packed else None
+        if name == "small":
+            self.body: nn.Module = SmallEncoder(shape, features)
+            self.ahead: nn.Module = nn.Identity()
+        else:
+            self.body = ResNet18(shape[0])
+            same = features == ResNet18.features
+            self.ahead = nn.Identity() if same else nn.Linear(ResNet18.features, features)
+
+    def forward(self, seen: Seen) -> Float[Tensor, "n features"]:
+        """Features of pictures of 0 to 255, or of bits along rows."""
+        assert isinstance(seen, Tensor)
+        device = seen.device.type
+        dtype = torch.bfloat16 if torch.is_autocast_enabled(device) else torch.float32
+        # Small integers are moved to channels-last before they grow: there is less to move.
+        seen = seen.contiguous(memory_format=torch.channels_last)
+        if self._width is None:
+            pixels = seen.to(dtype) * (1 / 255)
+        else:
+            pixels = unpack_bits(seen, self._width).to(dtype)
+        return self.ahead(self.body(pixels.contiguous(memory_format=torch.channels_last)))
+
+
+def unpack_bits(packed: UInt8[Tensor, "n c h bytes"], width: int) -> UInt8[Tensor, "n c h w"]:
+    """Bits along rows as 0 and 1, the highest bit first, as `asp_env.views.packing` packs them."""
+    shifts = torch.arange(7, -1, -1, dtype=torch.uint8, device=packed.device)
+    bits = (packed[..., None] >> shifts) & 1
+    return bits.flatten(-2)[..., :width]
+
+
+def load_resnet18(network: nn.Module, path: Path) -> None:
+    """Starts the ResNet18 of a network from a file of weights with torchvision's names.
+
+    The classifier is left out, and so is the first convolution where it has other channels.
+
+    Raises:
+        CheckpointError: the file cannot be read or does not fit, or the network has no ResNet18.
+    """
+    found = [module for module in network.modules() if isinstance(module, ResNet18)]
+    if not found:
+        raise CheckpointError(f"{path}: the network has no resnet18 to start from these weights")
+    try:
+        weights = load_file(path)
+    except (OSError, ValueError, SafetensorError) as error:
+        raise CheckpointError(
+            f"{path} cannot be read as safetensors ({error}); other formats are not loaded, "
+            "convert the file first"
+        ) from error
+    for resnet in found:
+        own = resnet.state_dict()
+        skipped = {name for name in weights if name.startswith("fc.")}
+        first = weights.get("conv1.weight")
+        if first is not None and first.shape != own["conv1.weight"].shape:
+            skipped.add("conv1.weight")
+        taken = {name: value for name, value in weights.items() if name not in skipped}
+        lacking = set(own) - set(taken) - skipped
+        if lacking or set(taken) - set(own):
+            name = sorted(lacking or set(taken) - set(own))[0]
+            raise CheckpointError(f"{path} holds no weights of a ResNet18: {name} does not fit")
+        try:
+            resnet.load_state_dict(taken, strict=False)
+        except RuntimeError as error:
+            raise CheckpointError(f"{path} holds no weights of a ResNet18: {error}") from error
 
 
 @final

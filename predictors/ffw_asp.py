@@ -1,60 +1,47 @@
 """FFW-ASP: feed-forward prediction in action space (Janjoš, Dolgov, Zöllner 2021).
 
-An encoder turns the target's raster into features z. A recurrent decoder reads [z, a] at every step
-of the past actions a; its last state gives, for each mode, future actions and a logit. The bicycle
-model turns actions into states, on which the loss is taken.
+An encoder turns the target's surroundings into features z. A recurrent decoder reads [z, a] at
+every step of the past actions a; its last state gives, for each mode, future actions and a logit.
+The bicycle model turns actions into states, on which the loss is taken.
 
 Read into the paper: z passes a LayerNorm before the decoder; actions are tanh times the symmetric
 99.9th percentile of the training data's actions, within the limits of actions. Changed, as options
 that the `paper` recipe leaves off: `skip` leads z, the present speed and the past actions around
 the recurrent layers to the output, without which accuracy is lost; `hidden` puts a hidden layer
-there.
+there; `head="connected"` puts the fully connected head of DKM in the recurrent one's place (the
+paper's ablation).
 
 Dimensions: n targets, m modes, t ticks ahead, z features.
 """
 
 from dataclasses import dataclass
-from typing import ClassVar, final
+from typing import ClassVar, Literal, final
 
 import torch
-from jaxtyping import Float
-from torch import Tensor, nn
+from torch import nn
 
 from asp_env.data.predictor import Predictor
-from asp_env.dynamics import clip_actions, rollout
 from asp_env.dynamics.bicycle import Integrator
 from asp_env.errors import AspEnvError
-from predictors.batch import Batch, Labels
-from predictors.encoders import EncoderName, make_encoder
-from predictors.learned import AbstractNetwork, Modes, NetworkShape
-from predictors.modes import (
-    Assignment,
-    Classification,
-    best_mode,
-    classification_loss,
-    regression_loss,
-)
-
-SPEED_SCALE_MPS = 10.0
+from predictors.batch import Batch
+from predictors.encoders import make_encoder
+from predictors.heads import ConnectedHead, RecurrentReader
+from predictors.network import AbstractNetwork, Modes, NetworkConfig, NetworkShape, drive
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class FFWASPConfig:
+class FFWASPConfig(NetworkConfig):
     """What decides the network and its loss; the defaults are the paper's."""
 
-    encoder: EncoderName = "resnet18"
-    features: int = 512
-    """z, the width of what the encoder gives."""
+    head: Literal["recurrent", "connected"] = "recurrent"
+    """What reads features and past actions: a GRU in turn, or a layer all at once."""
     gru_width: int = 512
     gru_layers: int = 2
     skip: bool = False
     """Whether z, the present speed and the past actions also reach the output directly."""
     hidden: int = 0
-    """Width of a hidden layer before the output; 0 for none, as in the paper."""
-    modes: int = 3
+    """Width of a hidden layer before the output; 0 for none, as in the paper's recurrent head."""
     integrator: Integrator = "euler"
-    assignment: Assignment = "angle"
-    classification: Classification = "cross-entropy"
 
     def __post_init__(self) -> None:
         """Checks the sizes.
@@ -62,11 +49,9 @@ class FFWASPConfig:
         Raises:
             AspEnvError: one is not positive.
         """
-        for field in ("features", "gru_width", "gru_layers", "modes"):
-            if getattr(self, field) < 1:
-                raise AspEnvError(f"ffw-asp: {field} is {getattr(self, field)}, expected 1 or more")
+        self.check_positive("features", "modes", "gru_width", "gru_layers")
         if self.hidden < 0:
-            raise AspEnvError(f"ffw-asp: hidden is {self.hidden}, expected 0 or more")
+            raise AspEnvError(f"network: hidden is {self.hidden}, expected 0 or more")
 
 
 @final
@@ -75,70 +60,35 @@ class FFWASPNetwork(AbstractNetwork):
 
     def __init__(self, config: FFWASPConfig, shape: NetworkShape) -> None:
         """With random weights."""
-        super().__init__()
-        self.config = config
-        self.shape = shape
-        self.register_buffer("action_range", torch.tensor(shape.action_range), persistent=False)
-        self.encoder = make_encoder(config.encoder, shape.raster, config.features)
+        super().__init__(config, shape)
+        self._integrator: Integrator = config.integrator
+        self._skip = config.skip
+        self.encoder = make_encoder(config.encoder, shape, config.features)
         self.norm = nn.LayerNorm(config.features)
-        self.gru = nn.GRU(
-            config.features + 2, config.gru_width, config.gru_layers, batch_first=True
-        )
-        width = config.gru_width
-        if config.skip:
-            width += config.features + 1 + 2 * shape.history
-        layers: list[nn.Module] = []
-        if config.hidden:
-            layers = [nn.Linear(width, config.hidden), nn.ReLU(inplace=True)]
-            width = config.hidden
-        self.head = nn.Sequential(*layers, nn.Linear(width, config.modes * (2 * shape.horizon + 1)))
+        self.reader: RecurrentReader | None = None
+        width = 0
+        if config.head == "recurrent":
+            self.reader = RecurrentReader(config.features, config.gru_width, config.gru_layers)
+            width = config.gru_width
+        if config.skip or self.reader is None:
+            width += config.features + 2 * shape.history
+        width += config.skip
+        self.head = ConnectedHead(width, config.hidden, modes=config.modes, ticks=shape.horizon)
 
     def forward(self, batch: Batch) -> Modes:
         """The modes of every target."""
-        device = batch.raster.device.type
-        dtype = torch.bfloat16 if torch.is_autocast_enabled(device) else torch.float32
-        # Bytes are moved to channels-last before they grow into floats: there is less to move.
-        pixels = batch.raster.contiguous(memory_format=torch.channels_last).to(dtype)
-        z = self.norm(self.encoder(pixels * (1 / 255)).float())
-        with torch.autocast(device, enabled=False):
-            return self._decode(z, batch)
-
-    def _decode(self, z: Float[Tensor, "n z"], batch: Batch) -> Modes:
-        scale = self.get_buffer("action_range")
-        past = (batch.actions / scale).clamp(-1.5, 1.5)
-        steps = torch.cat([z[:, None].expand(-1, past.shape[1], -1), past], dim=-1)
-        out, _ = self.gru(steps)
-        features = [out[:, -1]]
-        if self.config.skip:
-            speed = batch.speed_mps[:, None] / SPEED_SCALE_MPS
-            features += [z, speed, past.flatten(1)]
-        out = self.head(torch.cat(features, dim=-1))
-        m, t = self.config.modes, self.shape.horizon
-        logits, raw = out[:, :m], out[:, m:].unflatten(1, (m, t, 2))
-        actions = clip_actions(raw.tanh() * scale)
-        return Modes(actions, self._drive(actions, batch), logits)
-
-    def _drive(self, actions: Float[Tensor, "n m t 2"], batch: Batch) -> Float[Tensor, "n m t 4"]:
-        start = batch.speed_mps[:, None] * batch.speed_mps.new_tensor([0.0, 0.0, 0.0, 1.0])
-        return rollout(
-            start[:, None].expand(-1, actions.shape[1], -1),
-            actions,
-            batch.length_m[:, None].expand(-1, actions.shape[1]),
-            self.shape.dt_s,
-            integrator=self.config.integrator,
-        )
-
-    def loss(self, modes: Modes, labels: Labels) -> dict[str, Tensor]:
-        """The terms of the loss by name, `loss` their sum."""
-        positions, label = modes.states[..., :2], labels.states[..., :2]
-        best = best_mode(positions.detach(), label, self.config.assignment)
-        regression = regression_loss(positions, label, best)
-        classification = classification_loss(modes.logits, best, self.config.classification)
-        return {
-            "loss": regression + classification,
-            "regression": regression,
-            "classification": classification,
-        }
+        z = self.norm(self.encoder(batch.seen).float())
+        with torch.autocast(z.device.type, enabled=False):
+            past = self.scaled_actions(batch.actions)
+            inputs = [] if self.reader is None else [self.reader(z, past)]
+            if self._skip or self.reader is None:
+                inputs += [z, past.flatten(1)]
+            if self._skip:
+                inputs.append(self.scaled_motion(batch)[:, :1])
+            raw, logits = self.head(torch.cat(inputs, dim=-1))
+            actions = self.actions_from(raw)
+            states = drive(actions, batch, self.shape.dt_s, self._integrator)
+        return Modes(states, logits, actions)
 
 
 @final

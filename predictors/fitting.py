@@ -8,7 +8,7 @@ import platform
 import shutil
 import sys
 import warnings
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from importlib.metadata import version
 from pathlib import Path
@@ -20,62 +20,76 @@ from lightning.pytorch.loggers import CSVLogger, TensorBoardLogger
 from safetensors.torch import load_file
 
 from asp_env import registry
-from asp_env.data.parts import TrainedOn, snippet_parts
-from asp_env.data.snippets import SnippetIndex, index_snippets
-from asp_env.data.source import Recordings, open_data
 from asp_env.errors import AspEnvError
 from asp_env.views import make_view
-from predictors.checkpoint import CONFIG, save_learned, write_json
-from predictors.learned import LearnedPlug, NetworkShape
+from predictors.calibration import temperature_on
+from predictors.checkpoint import CONFIG, save_learned, shape_for, write_json
 from predictors.lightning_parts import Fit, KeepBest, TellEpochs
-from predictors.recipes import TrainingConfig
+from predictors.network import LearnedPlug
+from predictors.recipes import SEGMENT_S, TrainingConfig
 from predictors.resume import SafetensorsIO
-from predictors.samples import Batches, action_range, choose_snippets
+from predictors.samples import action_range
+from predictors.start import Start
+from predictors.training_data import VALIDATION_BATCH, open_training_data
 
 RUN = "run.json"
 STATE = "unfinished"
 LOGS = "logs"
+BEFORE = "3s"
 
 
-def train(config: TrainingConfig, data: str, out: Path) -> Path:
+def train(config: TrainingConfig, data: str, out: Path, *, start: Path | None = None) -> Path:
     """Trains a predictor, or goes on with a run that was killed.
 
     Args:
-        config: everything that decides the weights.
+        config: everything that decides the weights, besides the data and the start.
         data: DATA, as `open_data` takes it.
         out: the run's folder. It holds `logs` and, until the run is finished, `unfinished`; then
-            `config.json` and `weights.safetensors`, of the epoch with the lowest
+            `config.json`, `weights.safetensors` and `README.md`, of the epoch with the lowest
             `validation FDE moving`.
+        start: the folder of a finished run, or a file of ResNet18 weights, to start from.
 
     Returns:
         `out`.
 
     Raises:
         AspEnvError: the folder holds a finished run, or one of another configuration, or something
-            else; the data are bad; or the loss is not finite.
+            else; the data or the start are bad; or the loss is not finite.
     """
-    recordings = open_data(data)
-    run = {"config": dataclasses.asdict(config), "data_hash": recordings.data_hash()}
+    chosen = open_training_data(config, data)
+    run = {"config": dataclasses.asdict(config), "data_hash": chosen.data_hash}
+    if chosen.validation_hash is not None:
+        run["validation_hash"] = chosen.validation_hash
+    plug: LearnedPlug = registry.find("predictors", config.predictor)
+    view = make_view(config.view, pixels=config.pixels)
+    begin = Start.read(start, plug) if start is not None else None
+    if begin is not None:
+        run["start"] = begin.weights_hash
     resumed = _resumes(out, run)
 
-    snippets = index_snippets(recordings, dt_s=config.dt_s, horizon_s=config.horizon_s)
-    training, validation, trained_on = _choose(recordings, snippets, config)
-    view = make_view(config.view, height_px=config.height_px, width_px=config.width_px)
-    shape = NetworkShape(
-        raster=view.shape,
-        history=snippets.history,
-        horizon=snippets.horizon,
+    training = chosen.training
+    if begin is None or begin.action_range is None:
+        scale = action_range(training.recordings, training.snippets)
+    else:
+        scale = begin.action_range
+    shape = shape_for(
+        view,
+        history=training.snippets.history,
+        horizon=training.snippets.horizon,
         dt_s=config.dt_s,
-        action_range=action_range(recordings, training),
+        action_range=scale,
     )
-
-    plug: LearnedPlug = registry.find("predictors", config.predictor)
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(config.seed)
         network = plug.network(config.network, shape)
+    new = [] if begin is None else begin.apply(network)
+    later = network.later_ticks
     batches = [
-        Batches(recordings, chosen, view=view, batch_size=size)
-        for chosen, size in ((training, config.batch_size), (validation, 256))
+        share.batches(view, size=size, later_ticks=later, config=config)
+        for share, size in (
+            (training, config.batch_size),
+            (chosen.validation, VALIDATION_BATCH),
+        )
     ]
     if not resumed:
         (out / STATE).mkdir(parents=True)
@@ -84,17 +98,24 @@ def train(config: TrainingConfig, data: str, out: Path) -> Path:
         Fit(network, config=config, training=batches[0], validation=batches[1]), config, out
     )
 
+    weights = load_file(out / STATE / "best.safetensors")
+    network.load_state_dict(weights)
     save_learned(
         out,
         plug=plug,
         network_config=config.network,
         shape=shape,
         view=view,
-        weights=load_file(out / STATE / "best.safetensors"),
+        weights=weights,
+        temperature=temperature_on(network, batches[1]),
         provenance={
             **run,
-            "trained_on": dataclasses.asdict(trained_on),
-            "snippets": {"training": len(training), "validation": len(validation)},
+            "trained_on": dataclasses.asdict(chosen.trained_on),
+            "snippets": {
+                "training": len(training.snippets),
+                "validation": len(chosen.validation.snippets),
+            },
+            "not_started": new,
             "best_epoch": best.best_epoch,
             "best_value": best.best_value,
             "versions": _versions(),
@@ -102,6 +123,34 @@ def train(config: TrainingConfig, data: str, out: Path) -> Path:
     )
     shutil.rmtree(out / STATE)
     return out
+
+
+def train_stages(
+    config_for: Callable[[float], TrainingConfig],
+    horizon_s: float,
+    data: str,
+    out: Path,
+    *,
+    start: Path | None = None,
+) -> Path:
+    """Trains for a horizon; one above 3 s goes on from a run for 3 s in `out/3s`, made if need be.
+
+    Args:
+        config_for: the configuration of a horizon in seconds.
+        horizon_s: that is asked for.
+        data: DATA.
+        out: the run's folder.
+        start: where to start from instead.
+
+    Raises:
+        AspEnvError: as `train`.
+    """
+    config = config_for(horizon_s)
+    if start is None and horizon_s > SEGMENT_S:
+        start = out / BEFORE
+        if not (start / CONFIG).exists():
+            train(config_for(SEGMENT_S), data, start)
+    return train(config, data, out, start=start)
 
 
 def _resumes(out: Path, run: dict[str, Any]) -> bool:
@@ -119,7 +168,7 @@ def _resumes(out: Path, run: dict[str, Any]) -> bool:
                 "give another --out, or delete it"
             )
         return True
-    if out.exists() and (not out.is_dir() or any(out.iterdir())):
+    if out.exists() and (not out.is_dir() or any(each.name != BEFORE for each in out.iterdir())):
         raise AspEnvError(f"{out} holds something that is no run: give another --out")
     return False
 
@@ -139,7 +188,7 @@ def _fit(module: Fit, config: TrainingConfig, out: Path) -> KeepBest:
             accelerator="auto",
             devices=1,
             precision=config.precision,
-            max_epochs=config.epochs,
+            max_epochs=config.all_epochs,
             callbacks=[best, TellEpochs()],
             logger=[
                 CSVLogger(out, name=LOGS, version=started),
@@ -185,32 +234,3 @@ def _keep_freed_memory() -> None:
 
 def _versions() -> dict[str, str]:
     return {name: version(name) for name in ("asp-env", "lightning", "numpy", "torch")}
-
-
-def _choose(
-    recordings: Recordings, snippets: SnippetIndex, config: TrainingConfig
-) -> tuple[SnippetIndex, SnippetIndex, TrainedOn]:
-    """Training and validation snippets, and which recordings they are from."""
-    parts, trained_on = snippet_parts(recordings, snippets, config.split)
-    found = {part: snippets.select(parts == part) for part in ("train", "validation")}
-    for part, chosen in found.items():
-        if not len(chosen):
-            raise AspEnvError(
-                f"data {recordings.source!r}: no snippet is left for {part} after the split by "
-                f"{config.split}; give more recordings or longer ones"
-            )
-    training = choose_snippets(
-        recordings,
-        found["train"],
-        standing_share=config.standing_share,
-        max_snippets=config.max_snippets,
-        seed=config.seed,
-    )
-    validation = choose_snippets(
-        recordings,
-        found["validation"],
-        standing_share=1.0,
-        max_snippets=config.max_validation_snippets,
-        seed=config.seed,
-    )
-    return training, validation, trained_on

@@ -1,15 +1,11 @@
 """A trained network behind the predictor socket."""
 
-import dataclasses
-from abc import ABC, abstractmethod
 from collections.abc import Mapping
 from types import MappingProxyType
-from typing import Any, NamedTuple, Protocol, final, runtime_checkable
+from typing import NamedTuple, final
 
 import numpy as np
 import torch
-from jaxtyping import Float
-from torch import Tensor, nn
 
 from asp_env.data.forecast import Forecast, make_forecast
 from asp_env.data.geometry import from_frame
@@ -17,93 +13,62 @@ from asp_env.data.parts import TrainedOn
 from asp_env.data.scene import Scene
 from asp_env.data.snippets import Future
 from asp_env.dynamics import wrap_angle
-from asp_env.views import PictureView
-from predictors.batch import Batch, Labels, make_batch
+from asp_env.errors import AspEnvError
+from asp_env.views import SceneView
+from predictors.batch import Labels, make_batch, make_labels
+from predictors.chaining import Chaining
+from predictors.network import AbstractNetwork, Modes
 from predictors.physical import seen_for
+from predictors.ssp_asp import SSPASPNetwork
 
 CHUNK = 256
 """Targets that are drawn and forecast at once, which bounds the memory that is used."""
 
 
-class Modes(NamedTuple):
-    """What a network says of N targets, in their own frames."""
+class _Said(NamedTuple):
+    """A forecast of some targets, in the recording's frame."""
 
-    actions: Float[Tensor, "n m t 2"]
-    states: Float[Tensor, "n m t 4"]
-    logits: Float[Tensor, "n m"]
-
-
-@dataclasses.dataclass(frozen=True, slots=True, kw_only=True)
-class NetworkShape:
-    """What a network is made for, besides its own configuration."""
-
-    raster: tuple[int, int, int]
-    """Channels, height, width."""
-    history: int
-    """Past ticks."""
-    horizon: int
-    """Ticks ahead."""
-    dt_s: float
-    action_range: tuple[float, float]
-    """What outputs in [-1, 1] are multiplied by: m/s², rad. The normaliser."""
-
-
-class AbstractNetwork(nn.Module, ABC):
-    """A network that can be trained and put behind the socket; made of (config, shape)."""
-
-    @abstractmethod
-    def forward(self, batch: Batch) -> Modes:
-        """The modes of every target."""
-
-    @abstractmethod
-    def loss(self, modes: Modes, labels: Labels) -> dict[str, Tensor]:
-        """The terms of the loss by name, `loss` their weighted sum."""
-
-
-@runtime_checkable
-class LearnedPlug(Protocol):
-    """What the registry holds under a learned predictor's name, for training and loading."""
-
-    @property
-    def name(self) -> str:
-        """By which it is registered."""
-        ...
-
-    @property
-    def config(self) -> type[Any]:
-        """A frozen dataclass of what JSON can hold."""
-        ...
-
-    @property
-    def network(self) -> type[AbstractNetwork]:
-        """Made of (config, shape)."""
-        ...
+    states: np.ndarray
+    actions: np.ndarray | None
+    log_probs: np.ndarray
 
 
 @final
 class Learned:
     """Forecasts with a network that is not trained any more."""
 
-    privileged = False
-
     def __init__(
         self,
         *,
         name: str,
         network: AbstractNetwork,
-        view: PictureView,
-        shape: NetworkShape,
+        view: SceneView,
         trained_on: TrainedOn,
         about: Mapping[str, str],
+        temperature: float = 1.0,
+        chaining: Chaining = "beam",
     ) -> None:
-        """The network sees what `view` draws; `about` is what tables tell of its training."""
+        """The network sees what `view` draws; `about` is what tables tell of its training.
+
+        Args:
+            name: what tables call it.
+            network: trained.
+            view: what it was trained on.
+            trained_on: which recordings it has seen.
+            about: what tables tell of it.
+            temperature: what logits are divided by, fitted on validation.
+            chaining: of segments, for a network that chains any; `oracle` is privileged.
+        """
         self.name = name
         self.view = view
-        self.dt_s = shape.dt_s
-        self.history = shape.history
-        self.horizon = shape.horizon
+        self.dt_s = network.shape.dt_s
+        self.history = network.shape.history
+        self.horizon = network.shape.horizon
+        self.privileged = chaining == "oracle"
         self.trained_on: TrainedOn | None = trained_on
         self._about = MappingProxyType(dict(about))
+        self._temperature = temperature
+        self._chaining: Chaining = chaining
         self._network = network.eval()
 
     @property
@@ -112,35 +77,69 @@ class Learned:
         return self._about
 
     def predict(self, scene: Scene, future: Future | None = None) -> Forecast:
-        """Forecasts the targets of predicted classes seen for the whole history; reads no future.
+        """Forecasts the targets of predicted classes seen for the whole history.
+
+        Reads no future, unless its chaining is `oracle`.
 
         Raises:
-            AspEnvError: the scene has another time step, or a shorter history.
+            AspEnvError: the scene has another time step, or a shorter history; or chaining by
+                oracle gets no future.
         """
-        del future
         scene.check_dt(self.dt_s, self.name)
         valid = seen_for(scene, self.history)
         known = np.flatnonzero(valid)
+        label = self._label(scene, future, known) if self.privileged else None
         with torch.inference_mode():
             parts = [
-                self._predict(scene.with_targets(scene.targets[known[first : first + CHUNK]]))
+                self._predict(scene.with_targets(scene.targets[known[rows]]), label, rows)
                 for first in range(0, max(len(known), 1), CHUNK)
+                for rows in [slice(first, first + CHUNK)]
             ]
-        actions, states, log_probs = (np.concatenate([part[i] for part in parts]) for i in range(3))
-        modes = log_probs.shape[1]
-        all_states = np.zeros((len(valid), *states.shape[1:]), dtype=np.float32)
-        all_actions = np.zeros((len(valid), *actions.shape[1:]), dtype=np.float32)
-        all_log_probs = np.full((len(valid), modes), -np.log(modes), dtype=np.float32)
-        all_states[known], all_actions[known], all_log_probs[known] = states, actions, log_probs
+        log_probs = _scattered([part.log_probs for part in parts], valid)
+        log_probs[~valid] = -np.log(log_probs.shape[1])
+        with_actions = parts[0].actions is not None
         return make_forecast(
-            scene, states=all_states, actions=all_actions, log_probs=all_log_probs, valid=valid
+            scene,
+            states=_scattered([part.states for part in parts], valid),
+            actions=_scattered([p.actions for p in parts if p.actions is not None], valid)
+            if with_actions
+            else None,
+            log_probs=log_probs,
+            valid=valid,
         )
 
-    def _predict(self, scene: Scene) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        modes: Modes = self._network(make_batch(scene, self.view, self.history))
+    def _label(self, scene: Scene, future: Future | None, known: np.ndarray) -> Labels:
+        if future is None or future.states.shape[1] < self.horizon:
+            raise AspEnvError(
+                f"{self.name} chained by oracle needs the recorded future of {self.horizon} ticks"
+            )
+        some = Future(
+            states=future.states[known, : self.horizon], valid=future.valid[known, : self.horizon]
+        )
+        return make_labels(scene.with_targets(scene.targets[known]), some)
+
+    def _predict(self, scene: Scene, label: Labels | None, rows: slice) -> _Said:
+        batch = make_batch(scene, self.view, self.history)
+        if isinstance(self._network, SSPASPNetwork):
+            truth = None if label is None else label.states[rows, :, :2]
+            modes = self._network.chain(batch, self._chaining, truth)
+        else:
+            modes: Modes = self._network(batch)
         now = scene.target_states.astype(np.float64)[:, None, None]
         local = modes.states.numpy()
         xy = from_frame(local[..., :2].astype(np.float64), now)
         heading = wrap_angle(local[..., 2:3] + now[..., 2:3])
         states = np.concatenate([xy, heading, local[..., 3:]], axis=-1).astype(np.float32)
-        return modes.actions.numpy(), states, modes.logits.log_softmax(dim=-1).numpy()
+        return _Said(
+            states=states,
+            actions=None if modes.actions is None else modes.actions.numpy(),
+            log_probs=(modes.logits / self._temperature).log_softmax(dim=-1).numpy(),
+        )
+
+
+def _scattered(parts: list[np.ndarray], valid: np.ndarray) -> np.ndarray:
+    """Rows of the valid targets at their places among all, zeros elsewhere."""
+    rows = np.concatenate(parts)
+    out = np.zeros((len(valid), *rows.shape[1:]), dtype=np.float32)
+    out[valid] = rows
+    return out

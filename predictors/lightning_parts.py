@@ -16,7 +16,8 @@ from asp_env.errors import AspEnvError
 from asp_env.metrics.open_loop import moving, open_loop_errors
 from predictors.batch import Batch, Labels
 from predictors.checkpoint import save_weights
-from predictors.learned import AbstractNetwork
+from predictors.diagnosis import Diagnosis
+from predictors.network import AbstractNetwork, Moment
 from predictors.recipes import TrainingConfig
 from predictors.samples import Batches, epoch_rows
 
@@ -62,9 +63,10 @@ class Fit(pl.LightningModule):
         self._training = training
         self._validation = validation
         self._errors: list[dict[str, np.ndarray]] = []
+        self._diagnosis = Diagnosis()
         count = len(training.snippets)
         self._per_epoch = min(config.snippets_per_epoch or count, count)
-        self._steps = config.epochs * -(-self._per_epoch // config.batch_size)
+        self._steps = config.all_epochs * -(-self._per_epoch // config.batch_size)
 
     def train_dataloader(self) -> Iterable[tuple[Batch, Labels]]:
         """The batches of the present epoch; asked for anew before each."""
@@ -124,7 +126,9 @@ class Fit(pl.LightningModule):
             AspEnvError: it is not finite.
         """
         batch, labels = sample
-        terms: dict[str, Tensor] = self.network.loss(self.network(batch), labels)
+        pretraining = self.current_epoch < self.config.pretraining_epochs
+        moment = Moment(share=self.global_step / self._steps, pretraining=pretraining)
+        terms: dict[str, Tensor] = self.network.training_loss(batch, labels, moment)
         if not torch.isfinite(terms["loss"]):
             raise AspEnvError(
                 f"the loss is not finite in epoch {self.current_epoch}: lower the learning rate, "
@@ -143,12 +147,13 @@ class Fit(pl.LightningModule):
         batch, labels = sample
         modes = self.network(batch)
         count = len(labels.states)
-        terms: dict[str, Tensor] = self.network.loss(modes, labels)
+        terms: dict[str, Tensor] = self.network.loss(batch, modes, labels, Moment())
+        self._diagnosis.add(self.network.features(batch, labels))
         self.log(VALIDATION_LOSS, terms["loss"], batch_size=count)
         truth = labels.states[..., :2].cpu().numpy()
         valid = np.ones(truth.shape[:2], dtype=bool)
         now = np.zeros((count, 4), dtype=np.float32)
-        now[:, 3] = batch.speed_mps.cpu().numpy()
+        now[:, 3] = batch.motion[:, 0].cpu().numpy()
         positions = modes.states[..., :2].float().cpu().numpy()
         log_probs = modes.logits.float().log_softmax(dim=-1).cpu().numpy()
         found = {"moving": moving(now, truth, valid)}
@@ -164,6 +169,13 @@ class Fit(pl.LightningModule):
         of = joined["moving"] if joined["moving"].any() else np.ones_like(joined["moving"])
         self.log(SELECTED_BY, float(joined["most-probable"][of].mean()), prog_bar=True)
         self.log(f"{SELECTED_BY} best of 3", float(joined["best-of-3"][of].mean()))
+        for name, value in self._diagnosis.finish().items():
+            self.log(name, value)
+
+    def optimizer_step(self, *args: Any, **kwargs: Any) -> None:
+        """Takes the step, and tells the network of it."""
+        super().optimizer_step(*args, **kwargs)
+        self.network.after_step()
 
 
 @final
@@ -189,13 +201,15 @@ class KeepBest(pl.Callback):
     def on_train_epoch_end(self, trainer: pl.Trainer, pl_module: pl.LightningModule) -> None:
         """Writes the weights first, so that the state never speaks of some that are not there."""
         value = float(trainer.callback_metrics[SELECTED_BY])
-        if value < self.best_value:
+        fit = pl_module if isinstance(pl_module, Fit) else None
+        learned = fit is None or trainer.current_epoch >= fit.config.pretraining_epochs
+        if learned and value < self.best_value:
             self.best_value, self.best_epoch = value, trainer.current_epoch
             network: nn.Module = pl_module.get_submodule("network")
             save_weights(network.state_dict(), self._best_path)
         # Lightning would take this step after the state is saved, and a resumed run would lack it.
-        if isinstance(pl_module, Fit):
-            pl_module.step_plateau(float(trainer.callback_metrics[VALIDATION_LOSS]))
+        if learned and fit is not None:
+            fit.step_plateau(float(trainer.callback_metrics[VALIDATION_LOSS]))
         trainer.save_checkpoint(self._state_path)
 
 

@@ -15,6 +15,10 @@ MAX_ANGLE_RAD = math.radians(5.0)
 STANDING_M = 2.0
 HUBER_M = 1.0
 
+ANNEAL_FROM_M = 8.0
+ANNEAL_UNTIL = 0.5
+MIN_TEMPERATURE_M = 0.05
+
 
 def best_mode(
     positions: Float[Tensor, "n m t 2"],
@@ -40,6 +44,57 @@ def best_mode(
     return distance.argmin(dim=1)
 
 
+def mode_terms(
+    positions: Float[Tensor, "n m t 2"],
+    logits: Float[Tensor, "n m"],
+    label: Float[Tensor, "n t 2"],
+    *,
+    assignment: Assignment,
+    classification: Classification,
+    share: float | None,
+) -> dict[str, Tensor]:
+    """The losses `regression` and `classification` of modes against labels.
+
+    Args:
+        positions: of the modes, seen from the agent, now at (0, 0).
+        logits: of the modes.
+        label: what happened.
+        assignment: which mode is the best one.
+        classification: what its improbability costs.
+        share: of the training that is over, for annealing; None trains the best mode alone.
+    """
+    best = best_mode(positions.detach(), label, assignment)
+    if share is None:
+        regression = regression_loss(positions, label, best)
+    else:
+        regression = annealed_loss(positions, label, best, share)
+    return {
+        "regression": regression,
+        "classification": classification_loss(logits, best, classification),
+    }
+
+
+def annealed_loss(
+    positions: Float[Tensor, "n m t 2"],
+    label: Float[Tensor, "n t 2"],
+    best: Int[Tensor, " n"],
+    share: float,
+) -> Float[Tensor, ""]:
+    """Huber loss of all modes, weighted by the softmin of their mean distances over a temperature.
+
+    The temperature falls along a line from 8 m to zero at half of the training; from there on the
+    best mode alone learns (annealed winner-takes-all, Perera et al. 2024).
+    """
+    temperature_m = ANNEAL_FROM_M * (1 - share / ANNEAL_UNTIL)
+    if temperature_m <= MIN_TEMPERATURE_M:
+        return regression_loss(positions, label, best)
+    delta = positions - label[:, None]
+    distance = torch.linalg.vector_norm(delta.detach(), dim=-1).mean(dim=-1)
+    weights = (-distance / temperature_m).softmax(dim=1)
+    huber = functional.huber_loss(delta, torch.zeros_like(delta), delta=HUBER_M, reduction="none")
+    return (weights * huber.mean(dim=(2, 3))).sum(dim=1).mean()
+
+
 def regression_loss(
     positions: Float[Tensor, "n m t 2"], label: Float[Tensor, "n t 2"], best: Int[Tensor, " n"]
 ) -> Float[Tensor, ""]:
@@ -62,3 +117,13 @@ def classification_loss(
         probability = logits.softmax(dim=1).gather(1, best[:, None])
         return -probability.mean()
     return functional.cross_entropy(logits, best)
+
+
+def into_frame(
+    positions: Float[Tensor, "*batch t 2"], origin: Float[Tensor, "*#batch 4"]
+) -> Float[Tensor, "*batch t 2"]:
+    """Positions as seen from states [x, y, heading, speed]: x ahead, y left."""
+    delta = positions - origin[..., None, :2]
+    cos, sin = origin[..., None, 2].cos(), origin[..., None, 2].sin()
+    ahead = cos * delta[..., 0] + sin * delta[..., 1]
+    return torch.stack([ahead, cos * delta[..., 1] - sin * delta[..., 0]], dim=-1)

@@ -10,11 +10,16 @@ import numpy as np
 from jaxtyping import Bool, Int
 
 from asp_env.data.recording import Recording
-from asp_env.data.snippets import SnippetIndex, gather_future, gather_scene
+from asp_env.data.snippets import (
+    SnippetIndex,
+    gather_future,
+    gather_present,
+    gather_scene,
+)
 from asp_env.dynamics import MAX_ACCELERATION_MPS2, MAX_STEERING_RAD, inverse
 from asp_env.errors import AspEnvError
 from asp_env.metrics.open_loop import moving
-from asp_env.views import PictureView
+from asp_env.views import SceneView
 from predictors.batch import Batch, Labels, make_batch, make_labels
 
 AHEAD = 4
@@ -40,12 +45,25 @@ class Batches:
         recordings: Sequence[Recording],
         snippets: SnippetIndex,
         *,
-        view: PictureView,
+        view: SceneView,
         batch_size: int,
+        later_ticks: Sequence[int] = (),
+        histories: Sequence[Recording] | None = None,
     ) -> None:
-        """Of `batch_size` snippets each, the last one possibly smaller."""
+        """Of `batch_size` snippets each, the last one possibly smaller.
+
+        Args:
+            recordings: what happened, which labels are taken from.
+            snippets: of them.
+            view: what is drawn of each.
+            batch_size: snippets at once.
+            later_ticks: how long after now the later scenes lie that labels hold.
+            histories: the same recordings with what was known at the time; themselves if None.
+        """
         self.snippets = snippets
         self._recordings = recordings
+        self._histories = recordings if histories is None else histories
+        self._later_ticks = tuple(later_ticks)
         self._view = view
         self._batch_size = batch_size
 
@@ -56,6 +74,8 @@ class Batches:
             self.snippets.select(rows),
             view=self._view,
             batch_size=self._batch_size,
+            later_ticks=self._later_ticks,
+            histories=self._histories,
         )
 
     def __len__(self) -> int:
@@ -76,8 +96,14 @@ class Batches:
         first = number * self._batch_size
         rows = np.arange(first, min(first + self._batch_size, len(self.snippets)))
         chosen = self.snippets.select(rows)
-        scene = gather_scene(self._recordings, chosen)
-        labels = make_labels(scene, gather_future(self._recordings, chosen))
+        scene = gather_scene(self._histories, chosen)
+        later = tuple(
+            make_batch(
+                gather_scene(self._histories, chosen.shifted(ticks)), self._view, chosen.history
+            )
+            for ticks in self._later_ticks
+        )
+        labels = make_labels(scene, gather_future(self._recordings, chosen), later)
         return make_batch(scene, self._view, chosen.history), labels
 
 
@@ -143,7 +169,7 @@ def moving_snippets(
     """Which snippets are in the subset `moving`, on which predictors are compared."""
     parts = [np.zeros(0, dtype=bool)]
     for chosen in _chunks(snippets):
-        now = gather_scene(recordings, chosen).target_states
+        now, _ = gather_present(recordings, chosen)
         future = gather_future(recordings, chosen)
         parts.append(moving(now, future.states[..., :2], future.valid))
     return np.concatenate(parts)
@@ -157,11 +183,11 @@ def action_range(recordings: Sequence[Recording], snippets: SnippetIndex) -> tup
     """
     found = [np.zeros((0, 2))]
     for chosen in _chunks(snippets):
-        scene = gather_scene(recordings, chosen)
+        now, lengths = gather_present(recordings, chosen)
         future = gather_future(recordings, chosen).states
-        before = np.concatenate([scene.target_states[:, None], future[:, :-1]], axis=1)
-        lengths = scene.sizes[scene.targets[:, 0], scene.targets[:, 1], 0][:, None]
-        found.append(np.abs(inverse(before, future, lengths, snippets.dt_s)).reshape(-1, 2))
+        before = np.concatenate([now[:, None], future[:, :-1]], axis=1)
+        actions = inverse(before, future, lengths[:, None], snippets.dt_s)
+        found.append(np.abs(actions).reshape(-1, 2))
     actions = np.concatenate(found)
     if not len(actions):
         return MIN_ACTION_RANGE

@@ -3,7 +3,7 @@
 import dataclasses
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Annotated, Any, Literal
 
 import tyro
 from rich.console import Console
@@ -22,11 +22,18 @@ class Train:
     out: Path
     """Folder of the run."""
     preset: str = "cpu"
-    """cpu (minutes on two cores) or paper (the paper's network and schedule)."""
+    """cpu (the paper's structure in minutes on two cores), ours (better, as small) or paper (the
+    paper's network and schedule)."""
     view: str = "chauffeurnet"
-    """What the network looks at."""
+    """What the network looks at: chauffeurnet, mtp or vectors."""
     horizon: float = 3.0
-    """How far it forecasts, seconds."""
+    """How far it forecasts, seconds. More than 3 s go on from a run for 3 s, in OUT/3s."""
+    start: Path | None = None
+    """A finished run to start from instead, or a safetensors file of ResNet18 weights."""
+    validation: str | None = None
+    """Other data to select on; all of DATA is learned from then."""
+    history: Literal["recorded", "causal"] = "recorded"
+    """Histories as recorded, or filtered again by a filter that knows no later frame."""
     split: Literal["recording", "blocks"] = "recording"
     """What is held out: whole recordings, or blocks of time within each."""
     epochs: int | None = None
@@ -43,18 +50,23 @@ class Train:
             AspEnvError: an option, the data or the folder is bad.
         """
         try:
-            from predictors.fitting import train
-            from predictors.recipes import recipe
+            from predictors.fitting import train_stages
         except ModuleNotFoundError as error:
             raise MissingExtraError(str(error.name), "train", "training") from error
 
-        config = recipe(self.predictor, self.preset, view=self.view, horizon_s=self.horizon)
-        config = dataclasses.replace(
+        run = train_stages(self._config, self.horizon, self.data, self.out, start=self.start)
+        Console().print(f"wrote {run}: name it as {self.predictor}:{run}")
+
+    def _config(self, horizon_s: float) -> Any:
+        from predictors.recipes import recipe
+
+        config = recipe(self.predictor, self.preset, view=self.view, horizon_s=horizon_s)
+        return dataclasses.replace(
             config,
             split=self.split,
             seed=self.seed,
+            validation=self.validation,
+            history=self.history,
             max_snippets=self.max_snippets,
             epochs=config.epochs if self.epochs is None else self.epochs,
         )
-        run = train(config, self.data, self.out)
-        Console().print(f"wrote {run}: name it as {self.predictor}:{run}")

@@ -9,11 +9,13 @@ from jaxtyping import Bool, Shaped
 
 from asp_env.data.clock import frames_per_tick
 from asp_env.data.recording import Recording
-from asp_env.data.snippets import SnippetIndex
+from asp_env.data.snippets import SnippetIndex, index_snippets
 from asp_env.data.source import Recordings
 from asp_env.data.split import Part, split_blocks, split_by_recording
 
 Split = Literal["recording", "blocks"]
+
+SPLIT_HORIZON_S = 3.0
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -32,11 +34,15 @@ def snippet_parts(
 ) -> tuple[Shaped[np.ndarray, " n"], TrainedOn]:
     """The part of each snippet, and what a predictor trained on them is to remember.
 
+    Recordings are dealt by their number of snippets of 3 s, whatever these snippets' horizon, so
+    that a run for 6 s that goes on from one for 3 s learns from the same recordings.
+
     Raises:
         AspEnvError: nothing would be left to test on.
     """
     if split == "recording":
-        counts = np.bincount(index.recording, minlength=len(recordings))
+        dealt = index_snippets(recordings, dt_s=index.dt_s, horizon_s=SPLIT_HORIZON_S)
+        counts = np.bincount(dealt.recording, minlength=len(recordings))
         locations = [recording.location for recording in recordings]
         of_recording = np.array(split_by_recording(counts, locations))
         remembered, parts = of_recording, of_recording[index.recording]

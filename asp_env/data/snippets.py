@@ -43,6 +43,17 @@ class SnippetIndex:
             horizon=self.horizon,
         )
 
+    def shifted(self, ticks: int) -> "SnippetIndex":
+        """The same targets some ticks later, of whose future so much less is known."""
+        return SnippetIndex(
+            recording=self.recording,
+            track=self.track,
+            tick=self.tick + ticks,
+            dt_s=self.dt_s,
+            history=self.history,
+            horizon=self.horizon - ticks,
+        )
+
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Future:
@@ -171,19 +182,40 @@ def gather_scene(recordings: Sequence[Recording], index: SnippetIndex) -> Scene:
 
 def gather_future(recordings: Sequence[Recording], index: SnippetIndex) -> Future:
     """What the targets of `gather_scene` went on to do."""
-    states = np.zeros((len(index), index.horizon, 4), dtype=np.float32)
-    valid = np.zeros((len(index), index.horizon), dtype=bool)
-    for row in range(len(index)):
-        recording = recordings[int(index.recording[row])]
-        found, present = gather_window(
-            recording,
-            index.track[row : row + 1],
-            first_tick=int(index.tick[row]) + 1,
-            num_ticks=index.horizon,
-            stride=frames_per_tick(recording.frame_rate_hz, index.dt_s),
-        )
-        states[row], valid[row] = found[0], present[0]
+    states, valid = _gather_targets(recordings, index, 1 + np.arange(index.horizon))
     return Future(states=states, valid=valid)
+
+
+def gather_present(
+    recordings: Sequence[Recording], index: SnippetIndex
+) -> tuple[Float[np.ndarray, "n 4"], Float[np.ndarray, " n"]]:
+    """The targets' states and lengths now: what `gather_scene` says of them, without the scene."""
+    states, _ = _gather_targets(recordings, index, np.zeros(1, dtype=np.int64))
+    lengths = np.zeros(len(index), dtype=np.float32)
+    for number in np.unique(index.recording):
+        mine = index.recording == number
+        lengths[mine] = recordings[int(number)].sizes[index.track[mine], 0]
+    return states[:, 0], lengths
+
+
+def _gather_targets(
+    recordings: Sequence[Recording], index: SnippetIndex, offsets: Int[np.ndarray, " steps"]
+) -> tuple[Float[np.ndarray, "n steps 4"], Bool[np.ndarray, "n steps"]]:
+    """The targets' states some ticks from now, and whether they were there; zeros where not."""
+    states = np.zeros((len(index), len(offsets), 4), dtype=np.float32)
+    valid = np.zeros((len(index), len(offsets)), dtype=bool)
+    for number in np.unique(index.recording):
+        mine = np.flatnonzero(index.recording == number)
+        recording = recordings[int(number)]
+        stride = frames_per_tick(recording.frame_rate_hz, index.dt_s)
+        frames = (index.tick[mine][:, None] + offsets) * stride
+        track = index.track[mine]
+        first = recording.first_frames[track].astype(np.int64)[:, None]
+        there = (frames >= first) & (frames <= recording.last_frames[track][:, None])
+        rows = np.where(there, recording.starts[track][:, None] + frames - first, 0)
+        states[mine] = np.where(there[..., None], recording.states[rows], 0)
+        valid[mine] = there
+    return states, valid
 
 
 def _agents(recording: Recording, index: SnippetIndex, row: int) -> Int[np.ndarray, " a"]:

@@ -21,7 +21,7 @@ from asp_env.sim.observation import Observer
 from asp_env.sim.reward import reward_terms, weighted_sum, weights_from
 from asp_env.sim.simulation import Simulation, ending
 from asp_env.sim.world import Ending
-from asp_env.views import make_view
+from asp_env.views import make_picture_view
 
 METADATA = {"render_modes": ["rgb_array"], "render_fps": 5}
 FAILURES = (Ending.COLLISION, Ending.OFF_ROAD)
@@ -96,10 +96,7 @@ width m |
             raise AspEnvError(
                 f"{data}: no vehicle covers 10 m in 4 s after 3 s of history; use other recordings"
             )
-        height_px, width_px = raster_px
-        self._observer = Observer(
-            observations, make_view(view, height_px=height_px, width_px=width_px), history
-        )
+        self._observer = Observer(observations, make_picture_view(view, pixels=raster_px), history)
         self._simulation = Simulation(
             self.recordings, make_driver(traffic), num_episodes=1, dt_s=dt_s, history=history
         )

@@ -18,7 +18,7 @@ from asp_env.errors import AspEnvError
 from asp_env.evaluation.unseen import nothing_left
 from asp_env.sim.drivers import DRIVERS, make_driver
 from asp_env.sim.simulation import Simulation
-from asp_env.views import make_view
+from asp_env.views import make_picture_view
 
 DT_S = 0.2
 HISTORY = 15
@@ -93,7 +93,7 @@ def _rasters(recordings: Recordings, height_px: int, width_px: int) -> tuple[flo
         raise nothing_left("snippet")
     chosen = np.linspace(0, len(index) - 1, min(256, len(index))).astype(int)
     scene = gather_scene(recordings, index.select(chosen))
-    view = make_view("chauffeurnet", height_px=height_px, width_px=width_px)
+    view = make_picture_view("chauffeurnet", pixels=(height_px, width_px))
     out = np.zeros((len(chosen), *view.shape), dtype=np.uint8)
     return len(chosen) / median_s(lambda: view.draw(scene, out)), out[0].nbytes
 

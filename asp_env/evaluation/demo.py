@@ -25,7 +25,7 @@ TRAINING = {"recordings": 30, "minutes": 2.5, "seed": 0, "locations": 6}
 HELD_OUT = {"recordings": 9, "minutes": 2.0, "seed": 48_271}
 """Traffic of other seeds, so of other places; no predictor sees it before it is judged."""
 SCENARIOS = 48
-PRESET = "cpu"
+PRESET = "ours"
 PLAN = {
     "site": SITE,
     "training": TRAINING,

@@ -1,0 +1,57 @@
+"""Calibrating the probabilities of modes by one temperature (Guo et al. 2017)."""
+
+import numpy as np
+import torch
+from jaxtyping import Float, Int
+
+from predictors.modes import best_mode
+from predictors.network import AbstractNetwork
+from predictors.samples import Batches
+
+LIMITS = (0.05, 20.0)
+STEPS = 60
+_GOLDEN = (np.sqrt(5.0) - 1) / 2
+
+
+def temperature_on(network: AbstractNetwork, batches: Batches) -> float:
+    """The temperature of a network's logits on validation data; leaves the network evaluating."""
+    network.eval().cpu()
+    logits, best = [], []
+    with torch.inference_mode():
+        for batch, labels in batches:
+            modes = network(batch)
+            logits.append(modes.logits.numpy())
+            nearest = best_mode(modes.states[..., :2], labels.states[..., :2], "distance")
+            best.append(nearest.numpy())
+    return fit_temperature(np.concatenate(logits), np.concatenate(best))
+
+
+def fit_temperature(logits: Float[np.ndarray, "n m"], best: Int[np.ndarray, " n"]) -> float:
+    """What logits are to be divided by so that the best modes are the least improbable.
+
+    Golden-section search on the logarithm: in 1/temperature the mean cross-entropy is convex.
+
+    Args:
+        logits: of the modes.
+        best: the mode that each label is nearest to.
+    """
+    if len(logits) == 0 or logits.shape[1] == 1:
+        return 1.0
+    low, high = np.log(LIMITS[0]), np.log(LIMITS[1])
+    for _ in range(STEPS):
+        left, right = high - _GOLDEN * (high - low), low + _GOLDEN * (high - low)
+        if cross_entropy(logits, best, np.exp(left)) < cross_entropy(logits, best, np.exp(right)):
+            high = right
+        else:
+            low = left
+    return float(np.exp((low + high) / 2))
+
+
+def cross_entropy(
+    logits: Float[np.ndarray, "n m"], best: Int[np.ndarray, " n"], temperature: float
+) -> float:
+    """Mean of minus the logarithm of the best modes' probabilities."""
+    scaled = logits.astype(np.float64) / temperature
+    scaled -= scaled.max(axis=1, keepdims=True)
+    total = np.log(np.exp(scaled).sum(axis=1))
+    return float((total - scaled[np.arange(len(best)), best]).mean())

@@ -1,0 +1,77 @@
+"""Chaining segments of several modes into longer forecasts. N targets, K chains, M modes, T ticks.
+
+A later segment starts from one mode of the one before. `top1` goes on from the most probable mode
+alone, `full` from every one, `beam` from every one and keeps the most probable chains. `oracle`
+goes on from the mode nearest to the label (the paper's label matching, at test time): it knows the
+future, and tables say so.
+"""
+
+from typing import Literal, NamedTuple
+
+import torch
+from jaxtyping import Float, Int
+from torch import Tensor
+
+from predictors.modes import Assignment, best_mode
+
+Chaining = Literal["beam", "top1", "full", "oracle"]
+CHAININGS: tuple[Chaining, ...] = ("beam", "top1", "full", "oracle")
+
+
+class Chains(NamedTuple):
+    """What has been forecast so far, and where it goes on from."""
+
+    states: Float[Tensor, "n k t 4"]
+    actions: Float[Tensor, "n k t 2"]
+    log_probs: Float[Tensor, "n k"]
+    z: Float[Tensor, "n k z"]
+    """Predicted features at the end."""
+
+
+def starts(
+    chains: Chains,
+    chaining: Chaining,
+    *,
+    label: Float[Tensor, "n t 2"] | None = None,
+    assignment: Assignment = "angle",
+) -> Chains:
+    """The chains that the next segment goes on from; where it is one, its probability is one."""
+    if chaining in ("beam", "full"):
+        return chains
+    if chaining == "oracle":
+        assert label is not None
+        ticks = chains.states.shape[2]
+        row = best_mode(chains.states[..., :2], label[:, :ticks], assignment)
+    else:
+        row = chains.log_probs.argmax(dim=1)
+    chosen = pick(chains, row[:, None])
+    return chosen._replace(log_probs=torch.zeros_like(chosen.log_probs))
+
+
+def grow(chains: Chains, segment: Chains) -> Chains:
+    """Every chain followed by each of the modes that were predicted for it.
+
+    Args:
+        chains: of K chains.
+        segment: of K·M rows for each target, M in turn for each chain.
+    """
+    k, grown = chains.log_probs.shape[1], segment.log_probs.shape[1]
+    again = torch.arange(k, device=segment.z.device).repeat_interleave(grown // k)
+    return Chains(
+        states=torch.cat([chains.states[:, again], segment.states], dim=2),
+        actions=torch.cat([chains.actions[:, again], segment.actions], dim=2),
+        log_probs=chains.log_probs[:, again] + segment.log_probs,
+        z=segment.z,
+    )
+
+
+def prune(chains: Chains, keep: int) -> Chains:
+    """The most probable chains, most probable first, with probabilities that sum to one again."""
+    log_probs, rows = chains.log_probs.topk(min(keep, chains.log_probs.shape[1]), dim=1)
+    return pick(chains, rows)._replace(log_probs=log_probs.log_softmax(dim=1))
+
+
+def pick(chains: Chains, rows: Int[Tensor, "n k"]) -> Chains:
+    """Some chains of each target."""
+    target = torch.arange(len(rows), device=rows.device)[:, None]
+    return Chains(*(field[target, rows] for field in chains))

@@ -1,0 +1,74 @@
+"""Where a run starts from, other than from random weights."""
+
+import hashlib
+from dataclasses import dataclass
+from pathlib import Path
+
+from torch import Tensor
+
+from asp_env.errors import CheckpointError
+from predictors.checkpoint import WEIGHTS, read_config, read_weights
+from predictors.encoders import load_resnet18
+from predictors.network import AbstractNetwork, LearnedPlug
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Start:
+    """The weights of a finished run of the same predictor, or of a ResNet18."""
+
+    path: Path
+    weights_hash: str
+    action_range: tuple[float, float] | None
+    """The normaliser that the weights belong to; None for a ResNet18."""
+    weights: dict[str, Tensor] | None
+    """None for a ResNet18."""
+
+    @classmethod
+    def read(cls, path: Path, plug: LearnedPlug) -> "Start":
+        """From the folder of a run, or a file of ResNet18 weights.
+
+        Raises:
+            CheckpointError: it is missing, damaged, or of another predictor.
+        """
+        if path.is_file():
+            digest = hashlib.sha256(path.read_bytes()).hexdigest()
+            return cls(path=path, weights_hash=digest, action_range=None, weights=None)
+        config = read_config(path)
+        if config["predictor"] != plug.name:
+            raise CheckpointError(
+                f"{path} holds the predictor {config['predictor']!r}, which {plug.name!r} cannot "
+                "start from"
+            )
+        weights = read_weights(path / WEIGHTS)
+        try:
+            acceleration, steering = config["normaliser"]["action_range"]
+            scale = (float(acceleration), float(steering))
+        except (KeyError, TypeError, ValueError) as error:
+            raise CheckpointError(f"{path} does not say its normaliser: train again") from error
+        digest = hashlib.sha256((path / WEIGHTS).read_bytes()).hexdigest()
+        return cls(path=path, weights_hash=digest, action_range=scale, weights=weights)
+
+    def apply(self, network: AbstractNetwork) -> list[str]:
+        """Loads the weights that fit the network; the names of those that it keeps at random.
+
+        A network for a longer horizon has an output of another size, and keeps that.
+
+        Raises:
+            CheckpointError: none of the encoder's weights fit.
+        """
+        if self.weights is None:
+            load_resnet18(network, self.path)
+            return []
+        own = network.state_dict()
+        fitting = {
+            name: value
+            for name, value in self.weights.items()
+            if name in own and own[name].shape == value.shape
+        }
+        encoder = {name for name in own if name.startswith("encoder.")}
+        if not encoder <= set(fitting):
+            raise CheckpointError(
+                f"{self.path} has another encoder or view than this run: start from one of the same"
+            )
+        network.load_state_dict(fitting, strict=False)
+        return sorted(set(own) - set(fitting))
