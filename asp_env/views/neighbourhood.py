@@ -1,0 +1,171 @@
+"""Who and what is near each target of a scene: the compiled part of the vector view.
+
+All kernels are in this one file because numba's cache watches only the file of the kernel that is
+called from Python: another file's change would go unnoticed.
+"""
+
+import math
+from typing import no_type_check
+
+import numpy as np
+from numba import njit
+
+AHEAD_M = 20.0
+"""How far ahead of the target lies the point around which lines are chosen."""
+
+SIDEWAYS = 1.5
+"""What distances across the target's heading are multiplied by in that choice."""
+
+FIRST_GROUP = 7
+"""Fields of an agent before those that tell its class."""
+
+FIRST_KIND = 4
+"""Fields of a line before those that tell its kind."""
+
+
+@njit(cache=True, nogil=True)
+@no_type_check
+def place_agents(
+    states, valid, sizes, classes, groups, ids, targets, frames, own_past, agents, agents_valid
+):
+    """Writes the agents of every target.
+
+    Args:
+        states: (situations, slots, ticks, 4) float32, the last tick is now.
+        valid: (situations, slots, ticks).
+        sizes: (situations, slots, 2) lengths and widths.
+        classes: (situations, slots).
+        groups: (classes,) which of the last fields each class sets.
+        ids: (situations, slots).
+        targets: (targets, 2) situation and slot.
+        frames: (targets, 4) x, y, cos and sin of the targets now, float64.
+        own_past: whether the targets are shown before now.
+        agents: (targets, agents, ticks, fields), zeros.
+        agents_valid: (targets, agents, ticks), false.
+    """
+    num_ticks = states.shape[2]
+    chosen = np.empty(agents.shape[1], dtype=np.int64)
+    distances = np.empty(agents.shape[1])
+    for t in range(len(targets)):
+        b, ego = targets[t]
+        if not valid[b, ego, num_ticks - 1]:
+            continue
+        x_0, y_0, cos_0, sin_0 = frames[t, 0], frames[t, 1], frames[t, 2], frames[t, 3]
+        count = _choose_agents(
+            states[b, :, -1], valid[b, :, -1], ids[b], ego, (x_0, y_0), chosen, distances
+        )
+        for i in range(count):
+            a = chosen[i]
+            group = FIRST_GROUP + groups[classes[b, a]]
+            for k in range(num_ticks - 1 if i == 0 and not own_past else 0, num_ticks):
+                if not valid[b, a, k]:
+                    continue
+                agents_valid[t, i, k] = True
+                row = agents[t, i, k]
+                dx, dy = states[b, a, k, 0] - x_0, states[b, a, k, 1] - y_0
+                cos, sin = math.cos(states[b, a, k, 2]), math.sin(states[b, a, k, 2])
+                row[0] = cos_0 * dx + sin_0 * dy
+                row[1] = cos_0 * dy - sin_0 * dx
+                row[2] = cos_0 * cos + sin_0 * sin
+                row[3] = cos_0 * sin - sin_0 * cos
+                row[4] = states[b, a, k, 3]
+                row[5] = sizes[b, a, 0]
+                row[6] = sizes[b, a, 1]
+                row[group] = 1.0
+
+
+@njit(cache=True, nogil=True)
+@no_type_check
+def _choose_agents(states, valid, ids, ego, origin, chosen, distances):
+    """Writes the slots of the ego and then of those nearest to it; returns how many there are.
+
+    Args:
+        states: (slots, 4) now.
+        valid: (slots,) now.
+        ids: (slots,).
+        ego: slot of the target.
+        origin: where it is.
+        chosen: (agents,) is written.
+        distances: (agents,) is written, squared.
+    """
+    chosen[0], distances[0] = ego, -1.0
+    count = 1
+    for a in range(len(valid)):
+        if a == ego or not valid[a]:
+            continue
+        away = (states[a, 0] - origin[0]) ** 2 + (states[a, 1] - origin[1]) ** 2
+        # Sorted by insertion. The farthest falls off the end where there are too many.
+        place = count
+        while away < distances[place - 1] or (
+            away == distances[place - 1] and ids[a] < ids[chosen[place - 1]]
+        ):
+            place -= 1
+            if place + 1 < len(chosen):
+                chosen[place + 1], distances[place + 1] = chosen[place], distances[place]
+        if place < len(chosen):
+            chosen[place], distances[place] = a, away
+            count = min(count + 1, len(chosen))
+    return count
+
+
+@njit(cache=True, nogil=True)
+@no_type_check
+def place_lines(middles, points, kinds, rows, frames, lines, lines_valid):
+    """Writes the lines of those targets that are on one map.
+
+    Args:
+        middles: (2, pieces) of the map's pieces.
+        points: (pieces, points, 4) x, y, cos, sin.
+        kinds: (pieces,) indices into `KINDS`.
+        rows: (m,) which targets.
+        frames: (targets, 4) x, y, cos and sin of the targets now, float64.
+        lines: (targets, lines, points, fields), zeros.
+        lines_valid: (targets, lines, points), false.
+    """
+    chosen = np.arange(min(lines.shape[1], len(kinds)))
+    distances = np.empty(len(kinds))
+    for t in rows:
+        x_0, y_0, cos_0, sin_0 = frames[t, 0], frames[t, 1], frames[t, 2], frames[t, 3]
+        if len(chosen) < len(kinds):
+            _choose_pieces(middles, (x_0, y_0, cos_0, sin_0), chosen, distances)
+        for i in range(len(chosen)):
+            piece, kind = points[chosen[i]], FIRST_KIND + kinds[chosen[i]]
+            for k in range(points.shape[1]):
+                dx, dy = piece[k, 0] - x_0, piece[k, 1] - y_0
+                row = lines[t, i, k]
+                row[0] = cos_0 * dx + sin_0 * dy
+                row[1] = cos_0 * dy - sin_0 * dx
+                row[2] = cos_0 * piece[k, 2] + sin_0 * piece[k, 3]
+                row[3] = cos_0 * piece[k, 3] - sin_0 * piece[k, 2]
+                row[kind] = 1.0
+                lines_valid[t, i, k] = True
+
+
+@njit(cache=True, nogil=True)
+@no_type_check
+def _choose_pieces(middles, frame, chosen, distances):
+    """Writes the indices of the nearest pieces in their order; of equally near ones the first.
+
+    Args:
+        middles: (2, pieces).
+        frame: x, y, cos and sin of the target now.
+        chosen: (lines,) is written; fewer than there are pieces.
+        distances: (pieces,) is written, squared.
+    """
+    x_0, y_0, cos_0, sin_0 = frame
+    most = len(chosen)
+    if most == 0:
+        return
+    for p in range(len(distances)):
+        dx, dy = middles[0, p] - x_0, middles[1, p] - y_0
+        ahead = cos_0 * dx + sin_0 * dy - AHEAD_M
+        left = SIDEWAYS * (cos_0 * dy - sin_0 * dx)
+        distances[p] = ahead * ahead + left * left
+    limit = np.partition(distances, most - 1)[most - 1]
+    ties = most - (distances < limit).sum()
+    i = 0
+    for p in range(len(distances)):
+        if distances[p] < limit or (distances[p] == limit and ties > 0):
+            ties -= distances[p] == limit
+            chosen[i] = p
+            i += 1
