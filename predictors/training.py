@@ -1,6 +1,7 @@
 """The command `asp-env train`."""
 
 import dataclasses
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any, Literal
@@ -24,6 +25,8 @@ class Train:
     preset: str = "cpu"
     """cpu (the paper's structure in minutes on two cores), ours (better, as small) or paper (the
     paper's network and schedule)."""
+    variant: str | None = None
+    """The preset with a change by name, such as no-trail: an ablation."""
     view: str = "chauffeurnet"
     """What the network looks at: chauffeurnet, mtp or vectors."""
     horizon: float = 3.0
@@ -50,18 +53,35 @@ class Train:
             AspEnvError: an option, the data or the folder is bad.
         """
         try:
-            from predictors.fitting import train_stages
+            from predictors.ablations import variant
+            from predictors.fitting import train, train_stages
         except ModuleNotFoundError as error:
             raise MissingExtraError(str(error.name), "train", "training") from error
 
-        run = train_stages(self._config, self.horizon, self.data, self.out, start=self.start)
+        if self.variant is not None and not variant(self.predictor, self.variant).goes_on:
+            run = train(self.config_for(self.horizon), self.data, self.out, start=self.start)
+        else:
+            run = train_stages(self.config_for, self.horizon, self.data, self.out, start=self.start)
         Console().print(f"wrote {run}: name it as {self.predictor}:{run}")
 
-    def _config(self, horizon_s: float) -> Any:
+    @staticmethod
+    def variants(predictor: str) -> Mapping[str, Any]:
+        """What `variant` can be for a predictor, by name."""
+        from predictors.ablations import VARIANTS
+
+        return VARIANTS.get(predictor, {})
+
+    def config_for(self, horizon_s: float) -> Any:
+        """All that decides the weights of a run for a horizon, besides data and start.
+
+        Raises:
+            AspEnvError: a name is unknown, or a number out of its range.
+        """
+        from predictors.ablations import variant
         from predictors.recipes import recipe
 
         config = recipe(self.predictor, self.preset, view=self.view, horizon_s=horizon_s)
-        return dataclasses.replace(
+        config = dataclasses.replace(
             config,
             split=self.split,
             seed=self.seed,
@@ -70,3 +90,6 @@ class Train:
             max_snippets=self.max_snippets,
             epochs=config.epochs if self.epochs is None else self.epochs,
         )
+        if self.variant is not None:
+            config = variant(self.predictor, self.variant).apply(config, self.variant)
+        return config
