@@ -17,6 +17,9 @@ The ego is not among the agents: it has channels of its own. Agents of every cla
 their footprint. What is not valid is not drawn; a target that is not valid now has an empty
 picture. Lines are at least 1.5 pixels wide and boxes at least one, so nothing vanishes at coarse
 scales. The picture does not depend on the order of slots, nor on the other targets of the scene.
+
+Without the ego trail (`chauffeurnet-no-trail`) its channel stays, empty: an ablation. A network
+that is also shown pictures of the future could read the way there off the trail.
 """
 
 from dataclasses import dataclass, field
@@ -27,17 +30,22 @@ from jaxtyping import UInt8
 
 from asp_env.data.scene import Scene
 from asp_env.errors import AspEnvError
-from asp_env.views.boundaries import BoundaryCache
-from asp_env.views.draw import draw_agents, draw_pieces
+from asp_env.views.boundaries import BOUNDARY_WIDTH_M, MapCache, boundary_pieces
+from asp_env.views.draw import draw_agents, draw_boundaries
+from asp_env.views.placed import memory, place
 from asp_env.views.view import View
 
 SNAPSHOTS = (0, 2, 4, 6, 8, 9, 11, 13, 15)
 """States of the history at which the other agents are drawn; 15 is now."""
 
-BOUNDARY_WIDTH_M = 0.3
 TRAIL_WIDTH_M = 0.4
-MIN_LINE_WIDTH_PX = 1.5
-"""Narrower lines would have gaps."""
+
+NAMES = {True: "chauffeurnet", False: "chauffeurnet-no-trail"}
+"""By whether there is an ego trail."""
+
+
+def _cache() -> MapCache[np.ndarray]:
+    return MapCache(boundary_pieces)
 
 
 @final
@@ -46,23 +54,31 @@ class ChauffeurNet:
     """Draws scenes as the module's documentation says. Equal when the configurations are."""
 
     view: View = field(default_factory=View)
-    _boundaries: BoundaryCache = field(
-        default_factory=BoundaryCache, init=False, repr=False, compare=False
+    ego_trail: bool = True
+    """Whether the channel `ego_trail` shows something."""
+    _boundaries: MapCache[np.ndarray] = field(
+        default_factory=_cache, init=False, repr=False, compare=False
     )
 
-    name: ClassVar[str] = "chauffeurnet"
     channels: ClassVar[tuple[str, ...]] = (
         "road_boundary",
         "ego_box",
         "ego_trail",
         *(f"agents_{i}" for i in range(len(SNAPSHOTS))),
     )
+    binary: ClassVar[bool] = True
+    """Every value is 0 or 255."""
     history: ClassVar[int] = SNAPSHOTS[-1]
     """Past ticks that a scene must have."""
 
     def __reduce__(self) -> tuple[Any, ...]:
         """Copies and pickles carry the configuration, not the drawn maps."""
-        return (ChauffeurNet, (self.view,))
+        return (ChauffeurNet, (self.view, self.ego_trail))
+
+    @property
+    def name(self) -> str:
+        """By which `make_view` knows it."""
+        return NAMES[self.ego_trail]
 
     @property
     def shape(self) -> tuple[int, int, int]:
@@ -71,20 +87,38 @@ class ChauffeurNet:
 
     def config(self) -> dict[str, Any]:
         """Everything that decides the picture, ready for JSON."""
-        return {"name": self.name, **self.view.config()}
+        return {"name": self.name, "ego_trail": self.ego_trail, **self.view.config()}
+
+    @classmethod
+    def make(
+        cls, pixels: tuple[int, int] | None = None, *, ego_trail: bool = True
+    ) -> "ChauffeurNet":
+        """Of the usual 72 m x 48 m, in so many pixels (height, width).
+
+        Raises:
+            AspEnvError: the pixels would not be square.
+        """
+        return cls(View().scaled(pixels), ego_trail)
 
     @classmethod
     def from_config(cls, config: dict[str, Any]) -> "ChauffeurNet":
-        """The view that `config()` described.
+        """The view that `config()` described; one without `ego_trail` has the trail.
 
         Raises:
             AspEnvError: the configuration is of another view, or a field is wrong.
         """
         fields = dict(config)
-        name = fields.pop("name", None)
-        if name != cls.name:
-            raise AspEnvError(f"configuration of the view {name!r}, expected {cls.name!r}")
-        return cls(View.from_config(fields))
+        name, ego_trail = fields.pop("name", None), fields.pop("ego_trail", True)
+        if name not in NAMES.values():
+            raise AspEnvError(
+                f"configuration of the view {name!r}, expected {' or '.join(NAMES.values())}"
+            )
+        if ego_trail is not (name == NAMES[True]):
+            raise AspEnvError(
+                f"configuration of the view {name!r} with ego_trail {ego_trail!r}: "
+                f"expected {name == NAMES[True]}"
+            )
+        return cls(View.from_config(fields), name == NAMES[True])
 
     def draw(self, scene: Scene, out: np.ndarray | None = None) -> UInt8[np.ndarray, "t 12 h w"]:
         """One picture per target, in the order of `scene.targets`.
@@ -100,46 +134,27 @@ class ChauffeurNet:
         Raises:
             AspEnvError: the history is too short, or `out` does not fit.
         """
-        if scene.history < self.history:
-            raise AspEnvError(
-                f"view {self.name!r} needs {self.history} past ticks, the scene has "
-                f"{scene.history}: take a longer history"
-            )
-        shape = (len(scene.targets), *self.shape)
-        if out is None:
-            out = np.empty(shape, dtype=np.uint8)
-        elif out.shape != shape or out.dtype != np.uint8 or not out.flags.c_contiguous:
-            raise AspEnvError(
-                f"cannot draw into {out.dtype} {out.shape}: give C-contiguous uint8 {shape}"
-            )
-        states = np.ascontiguousarray(scene.states[:, :, -self.history - 1 :], dtype=np.float32)
-        valid = np.ascontiguousarray(scene.valid[:, :, -self.history - 1 :])
-        sizes = np.ascontiguousarray(scene.sizes, dtype=np.float32)
-        targets = np.ascontiguousarray(scene.targets, dtype=np.int64)
-        situation, slot = targets[:, 0], targets[:, 1]
-        # What is not valid may hold anything, so no pose is made of it.
-        known = valid[situation, slot, -1]
-        poses = np.where(known[:, None], states[situation, slot, -1], 0)
-        matrices = self.view.pixels_from_world(poses)
-        pixels_per_metre = 1 / self.view.metres_per_pixel
-        map_of_target = np.where(known, scene.map_index[situation], -1)
-        half_width = 0.5 * max(BOUNDARY_WIDTH_M * pixels_per_metre, MIN_LINE_WIDTH_PX)
-        out[:, 0] = 0
-        for index, road_map in enumerate(scene.maps):
-            pieces = self._boundaries(road_map)
-            on_map = map_of_target == index
-            draw_pieces(pieces, on_map, matrices, pixels_per_metre, half_width, out)
-        half_width = 0.5 * max(TRAIL_WIDTH_M * pixels_per_metre, MIN_LINE_WIDTH_PX)
-        draw_agents(
-            states,
-            valid,
-            sizes,
-            targets,
-            SNAPSHOTS,
-            matrices,
-            pixels_per_metre,
-            (float(self.view.anchor_column_px), float(self.view.anchor_row_px)),
-            half_width,
-            out,
-        )
+        out = memory((len(scene.targets), *self.shape), out)
+        self._draw(scene, np.empty((0, 0), dtype=np.uint8), out)
         return out
+
+    def draw_packed(self, scene: Scene) -> UInt8[np.ndarray, "t 12 h bytes"]:
+        """What `draw` gives, packed to bits as `asp_env.views.packing` does, and sooner.
+
+        Raises:
+            AspEnvError: the history is too short.
+        """
+        channels, height_px, width_px = self.shape
+        out = memory((len(scene.targets), channels, height_px, -(-width_px // 8)), None)
+        self._draw(scene, np.empty((height_px, width_px), dtype=np.uint8), out)
+        return out
+
+    def _draw(self, scene: Scene, plane: np.ndarray, out: np.ndarray) -> None:
+        """Into `out`, by way of `plane` if that is not empty."""
+        placed = place(scene, self.view, history=self.history, who=self.name)
+        half_width = self.view.half_line_px(BOUNDARY_WIDTH_M)
+        out[placed.map_of_target < 0, 0] = 0
+        for index, road_map in enumerate(scene.maps):
+            draw_boundaries(self._boundaries(road_map), index, placed, half_width, plane, out)
+        trail = self.view.half_line_px(TRAIL_WIDTH_M) if self.ego_trail else 0.0
+        draw_agents(placed, SNAPSHOTS, trail, plane, out)

@@ -1,9 +1,13 @@
-"""Drawing boxes and lines into binary pictures: the compiled part of views.
+"""Drawing boxes and lines into pictures: the compiled part of views.
 
 Pixel coordinates are (column, row) as `asp_env.views.view` defines them. A pixel belongs to a box
 when its centre does; left and top edges are inside, right and bottom edges are not, so that boxes
 which share an edge share no pixel. No box vanishes: sides are at least one pixel long, and the
 pixel that holds the box's centre is always set.
+
+Kernels draw into `out` (targets, channels, height, width) what is `placed`. Binary pictures may be
+packed to bits: then each channel is drawn in `plane` (height, width) and packed into `out`; else
+`plane` is empty. Pictures in colours are painted in numbers of colours, in channel 0.
 
 All kernels are in this one file because numba's cache watches only the file of the kernel that is
 called from Python: another file's change would go unnoticed.
@@ -52,7 +56,7 @@ def out_of_sight(height, width, column, row, reach):
 
 @njit(cache=True, nogil=True)
 @no_type_check
-def fill_box(canvas, column, row, along_column, along_row, half_length, half_width):
+def fill_box(canvas, column, row, along_column, along_row, half_length, half_width, value):
     """Sets the pixels of one box; those outside the canvas are left out.
 
     Args:
@@ -63,6 +67,7 @@ def fill_box(canvas, column, row, along_column, along_row, half_length, half_wid
         along_row: row part of that vector.
         half_length: half the length, pixels.
         half_width: half the width, pixels.
+        value: of the pixels.
     """
     height, width = canvas.shape
     half_length = max(half_length, 0.5)
@@ -95,14 +100,14 @@ def fill_box(canvas, column, row, along_column, along_row, half_length, half_wid
         first = int(max(np.ceil(left), 0.0))
         end = int(max(min(np.ceil(right), float(width)), 0.0))
         # An assignment to a slice is faster here than a loop, which would become calls of memset.
-        canvas[r, first:end] = SET
+        canvas[r, first:end] = value
     if 0 <= row < height and 0 <= column < width:
-        canvas[int(row), int(column)] = SET
+        canvas[int(row), int(column)] = value
 
 
 @njit(cache=True, nogil=True)
 @no_type_check
-def fill_segment(canvas, column_0, row_0, column_1, row_1, half_width):
+def fill_segment(canvas, column_0, row_0, column_1, row_1, half_width, value):
     """Sets the pixels of a thick line with square ends that reach `half_width` beyond the points.
 
     A half width of 0.75 or more leaves no gap, whatever the direction.
@@ -111,100 +116,193 @@ def fill_segment(canvas, column_0, row_0, column_1, row_1, half_width):
     length = math.hypot(run, drop)
     along_column, along_row = (run / length, drop / length) if length > 1e-9 else (0.0, 1.0)
     column, row = 0.5 * (column_0 + column_1), 0.5 * (row_0 + row_1)
-    fill_box(canvas, column, row, along_column, along_row, 0.5 * length + half_width, half_width)
+    half_length = 0.5 * length + half_width
+    fill_box(canvas, column, row, along_column, along_row, half_length, half_width, value)
 
 
 @njit(cache=True, nogil=True)
 @no_type_check
-def draw_pieces(pieces, on_map, pixels_from_world, pixels_per_metre, half_width, out):
-    """Draws the straight pieces of one map into channel 0 of some pictures.
+def pack_rows(pixels, packed):
+    """Packs rows of 0 or 255 to bits, the first pixel into the highest bit.
 
     Args:
-        pieces: (pieces, 5) middle x, middle y, cos, sin and half length of each, metres.
-        on_map: (targets,) whose pictures.
-        pixels_from_world: (targets, 2, 3).
-        pixels_per_metre: of the view.
-        half_width: of the lines, pixels.
-        out: (targets, channels, height, width), channel 0 cleared.
+        pixels: (rows, width).
+        packed: (rows, ⌈width / 8⌉), written; a last byte that is not full ends with zeros.
     """
-    height, width = out.shape[2:]
-    for t in range(len(on_map)):
-        if not on_map[t]:
+    rows, width = pixels.shape
+    whole = width // 8
+    rest = width - 8 * whole
+    for r in range(rows):
+        row = pixels[r]
+        for i in range(whole):
+            packed[r, i] = _pack_eight(row, 8 * i)
+        if rest == 0:
             continue
-        canvas, matrix = out[t, 0], affine(pixels_from_world[t])
-        for i in range(len(pieces)):
-            # Pieces reach beyond their ends by half their width, so that corners close.
-            half_length = pieces[i, 4] * pixels_per_metre + half_width
-            column, row = locate(matrix, pieces[i, 0], pieces[i, 1])
-            if out_of_sight(height, width, column, row, half_length + half_width):
-                continue
-            across, down = turn(matrix, pieces[i, 2], pieces[i, 3])
-            across, down = across / pixels_per_metre, down / pixels_per_metre
-            fill_box(canvas, column, row, across, down, half_length, half_width)
+        if whole > 0:  # the last eight pixels, without those that are packed already
+            packed[r, whole] = (_pack_eight(row, width - 8) << (8 - rest)) & 255
+        else:
+            byte = 0
+            for column in range(width):
+                byte |= row[column] & (128 >> column)
+            packed[r, 0] = byte
 
 
 @njit(cache=True, nogil=True)
 @no_type_check
-def draw_agents(
-    states,
-    valid,
-    sizes,
-    targets,
-    snapshots,
-    pixels_from_world,
-    pixels_per_metre,
-    anchor,
-    trail_half_width,
-    out,
-):
+def _pack_eight(pixels, first):
+    """Eight pixels as one byte."""
+    word = np.uint64(pixels[first])  # the compiler makes one load of the eight
+    for i in range(1, 8):
+        word |= np.uint64(pixels[first + i]) << np.uint64(8 * i)
+    # The product brings the lowest bit of byte i to bit 63 - i; no two of its terms meet.
+    ones = word & np.uint64(0x0101010101010101)
+    return (ones * np.uint64(0x8040201008040201)) >> np.uint64(56)
+
+
+@njit(cache=True, nogil=True)
+@no_type_check
+def _draw_box(canvas, matrix, scale, x, y, cos, sin, half_length, half_width, value):
+    """A box of the world: its middle in metres, its sides in pixels, `scale` pixels to a metre."""
+    column, row = locate(matrix, x, y)
+    height, width = canvas.shape
+    if out_of_sight(height, width, column, row, half_length + half_width + 1.0):
+        return
+    across, down = turn(matrix, cos, sin)
+    fill_box(canvas, column, row, across / scale, down / scale, half_length, half_width, value)
+
+
+@njit(cache=True, nogil=True)
+@no_type_check
+def _draw_lines(canvas, matrix, scale, pieces, half_width, value):
+    """Straight pieces (pieces, 5): middle x, middle y, cos, sin and half length, metres."""
+    for i in range(len(pieces)):
+        # Pieces reach beyond their ends by half their width, so that corners close.
+        half_length = pieces[i, 4] * scale + half_width
+        x, y, cos, sin = pieces[i, 0], pieces[i, 1], pieces[i, 2], pieces[i, 3]
+        _draw_box(canvas, matrix, scale, x, y, cos, sin, half_length, half_width, value)
+
+
+@njit(cache=True, nogil=True)
+@no_type_check
+def _cleared(channel, plane):
+    """Where to draw a channel: in itself, or in `plane`, which is packed into it afterwards."""
+    # Channels are cleared one by one, just before they are drawn into: they fit the cache.
+    canvas = plane if plane.size > 0 else channel
+    canvas[:] = 0
+    return canvas
+
+
+@njit(cache=True, nogil=True)
+@no_type_check
+def _finish(canvas, plane, channel):
+    if plane.size > 0:
+        pack_rows(canvas, channel)
+
+
+@njit(cache=True, nogil=True)
+@no_type_check
+def draw_boundaries(pieces, map_index, placed, half_width, plane, out):
+    """Clears channel 0 of the pictures on one map and draws its lines, half a width in pixels."""
+    scale = placed.pixels_per_metre
+    for t in range(len(placed.targets)):
+        if placed.map_of_target[t] == map_index:
+            matrix = affine(placed.pixels_from_world[t])
+            canvas = _cleared(out[t, 0], plane)
+            _draw_lines(canvas, matrix, scale, pieces, half_width, SET)
+            _finish(canvas, plane, out[t, 0])
+
+
+@njit(cache=True, nogil=True)
+@no_type_check
+def draw_agents(placed, snapshots, trail_half_width, plane, out):
     """Clears and draws all channels but the map's: box, trail, then one for each snapshot.
 
     Args:
-        states: (situations, agents, ticks, 4) float32, the last tick is now.
-        valid: (situations, agents, ticks).
-        sizes: (situations, agents, 2) lengths and widths, metres.
-        targets: (targets, 2) situation and slot of the ego of each picture.
+        placed: the scene.
         snapshots: ticks at which the other agents are drawn; the last is now.
-        pixels_from_world: (targets, 2, 3).
-        pixels_per_metre: of the view.
-        anchor: (column, row) of the ego in every picture.
-        trail_half_width: pixels.
-        out: (targets, 3 + snapshots, height, width).
+        trail_half_width: pixels; 0 draws no trail.
+        plane: memory, or nothing.
+        out: pictures.
     """
+    states, valid, scale = placed.states, placed.valid, placed.pixels_per_metre
+    half_sizes = 0.5 * placed.sizes * scale  # pixels
     agents, now = states.shape[1], states.shape[2] - 1
-    height, width = out.shape[2:]
     cos, sin = np.empty((len(snapshots), agents)), np.empty((len(snapshots), agents))
     turned = -1
-    for t in range(len(targets)):
-        b, ego = targets[t]
+    for t in range(len(placed.targets)):
+        b, ego = placed.targets[t]
         if not valid[b, ego, now]:
             out[t, 1:] = 0
             continue
         if b != turned:  # all targets of one situation see the same boxes
             turned = b
             _directions(states[b], valid[b], snapshots, cos, sin)
-        matrix = affine(pixels_from_world[t])
-        # Channels are cleared one by one, just before they are drawn into: they fit the cache.
-        out[t, 1:3] = 0
+        matrix = affine(placed.pixels_from_world[t])
+        canvas = _cleared(out[t, 1], plane)
         # In its own frame the ego always looks the same, so no rounding of its pose may enter.
-        half_length = 0.5 * sizes[b, ego, 0] * pixels_per_metre
-        half_width = 0.5 * sizes[b, ego, 1] * pixels_per_metre
-        fill_box(out[t, 1], anchor[0], anchor[1], 0.0, -1.0, half_length, half_width)
-        _draw_trail(out[t, 2], states[b, ego], valid[b, ego], matrix, trail_half_width)
+        length, width = half_sizes[b, ego]
+        fill_box(canvas, *placed.anchor, 0.0, -1.0, length, width, SET)
+        _finish(canvas, plane, out[t, 1])
+        canvas = _cleared(out[t, 2], plane)
+        if trail_half_width > 0:
+            _draw_trail(canvas, states[b, ego], valid[b, ego], matrix, trail_half_width)
+        _finish(canvas, plane, out[t, 2])
         for k in range(len(snapshots)):
-            tick = snapshots[k]
-            out[t, 3 + k] = 0
+            canvas, tick = _cleared(out[t, 3 + k], plane), snapshots[k]
             for a in range(agents):
-                if a == ego or not valid[b, a, tick]:
-                    continue
-                half_length = 0.5 * sizes[b, a, 0] * pixels_per_metre
-                half_width = 0.5 * sizes[b, a, 1] * pixels_per_metre
-                column, row = locate(matrix, states[b, a, tick, 0], states[b, a, tick, 1])
-                if out_of_sight(height, width, column, row, half_length + half_width + 1.0):
-                    continue
-                across, down = turn(matrix, cos[k, a], sin[k, a])
-                across, down = across / pixels_per_metre, down / pixels_per_metre
-                fill_box(out[t, 3 + k], column, row, across, down, half_length, half_width)
+                if a != ego and valid[b, a, tick]:
+                    x, y, c, s = states[b, a, tick, 0], states[b, a, tick, 1], cos[k, a], sin[k, a]
+                    length, width = half_sizes[b, a]
+                    _draw_box(canvas, matrix, scale, x, y, c, s, length, width, SET)
+            _finish(canvas, plane, out[t, 3 + k])
+
+
+@njit(cache=True, nogil=True)
+@no_type_check
+def draw_coloured_lines(pieces, map_index, placed, half_width, colour, out):
+    """Draws the lines of one map over what is in channel 0 of the pictures on it."""
+    scale = placed.pixels_per_metre
+    for t in range(len(placed.targets)):
+        if placed.map_of_target[t] == map_index:
+            matrix = affine(placed.pixels_from_world[t])
+            _draw_lines(out[t, 0], matrix, scale, pieces, half_width, colour)
+
+
+@njit(cache=True, nogil=True)
+@no_type_check
+def draw_coloured_agents(placed, colours, order, own_colours, out):
+    """Draws boxes at all ticks over channel 0: the others, oldest first, then the own.
+
+    Args:
+        placed: the scene.
+        colours: (situations, agents) of the oldest box of each agent; they go up by 1 a tick.
+        order: (situations, agents) slots in the order in which they are drawn at each tick.
+        own_colours: of the oldest box of the vehicle that a picture is drawn around.
+        out: (targets, 3, height, width).
+    """
+    states, valid, scale = placed.states, placed.valid, placed.pixels_per_metre
+    half_sizes = 0.5 * placed.sizes * scale  # pixels
+    agents, ticks = states.shape[1:3]
+    cos, sin = np.empty((ticks, agents)), np.empty((ticks, agents))
+    turned = -1
+    for t in range(len(placed.targets)):
+        b, own = placed.targets[t]
+        if not valid[b, own, ticks - 1]:
+            continue
+        if b != turned:
+            turned = b
+            _directions(states[b], valid[b], np.arange(ticks), cos, sin)
+        canvas, matrix = out[t, 0], affine(placed.pixels_from_world[t])
+        for own_turn in range(2):
+            for k in range(ticks - own_turn):  # the own box now comes last
+                for a in order[b]:
+                    if (a == own) == (own_turn == 1) and valid[b, a, k]:
+                        x, y, c, s = states[b, a, k, 0], states[b, a, k, 1], cos[k, a], sin[k, a]
+                        length, width = half_sizes[b, a]
+                        colour = k + (own_colours if own_turn else colours[b, a])
+                        _draw_box(canvas, matrix, scale, x, y, c, s, length, width, colour)
+        length, width = half_sizes[b, own]
+        fill_box(canvas, *placed.anchor, 0.0, -1.0, length, width, own_colours + ticks - 1)
 
 
 @njit(cache=True, nogil=True)
@@ -226,4 +324,4 @@ def _draw_trail(canvas, states, valid, matrix, half_width):
         if valid[k - 1] and valid[k]:
             column_0, row_0 = locate(matrix, states[k - 1, 0], states[k - 1, 1])
             column_1, row_1 = locate(matrix, states[k, 0], states[k, 1])
-            fill_segment(canvas, column_0, row_0, column_1, row_1, half_width)
+            fill_segment(canvas, column_0, row_0, column_1, row_1, half_width, SET)

@@ -10,6 +10,9 @@ from jaxtyping import Float, Shaped
 
 from asp_env.errors import AspEnvError
 
+MIN_LINE_WIDTH_PX = 1.5
+"""Narrower lines would have gaps."""
+
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class View:
@@ -49,26 +52,37 @@ class View:
                 f"the anchor must lie within its {self.height_px}x{self.width_px} pixels"
             )
 
-    @classmethod
-    def scaled(cls, height_px: int, width_px: int) -> "View":
-        """The default 72 m by 48 m with its anchor, in another number of pixels.
+    def scaled(self, pixels: tuple[int, int] | None) -> "View":
+        """The same extent and anchor in another number of pixels, height and width.
+
+        Without one it is the view itself.
 
         Raises:
             AspEnvError: the pixels would not be square.
         """
-        whole = cls()
-        if height_px < 1 or height_px * whole.width_px != width_px * whole.height_px:
+        if pixels is None:
+            return self
+        height_px, width_px = pixels
+        if height_px < 1 or height_px * self.width_px != width_px * self.height_px:
+            common = math.gcd(self.height_px, self.width_px)
+            good = [
+                f"{self.height_px // common * times}x{self.width_px // common * times}"
+                for times in (common, common // 2, common // 4)
+                if times
+            ]
+            scale = self.metres_per_pixel
             raise AspEnvError(
-                f"a view of {height_px}x{width_px} pixels does not show 72 m x 48 m in square "
-                "pixels: give a height of 3/2 the width, such as 360x240, 180x120 or 90x60"
+                f"a view of {height_px}x{width_px} pixels does not show {self.height_px * scale:g} "
+                f"m x {self.width_px * scale:g} m in square pixels: give a height and a width "
+                f"such as {', '.join(good)}"
             )
-        scale = height_px / whole.height_px
-        return cls(
+        scale = height_px / self.height_px
+        return View(
             height_px=height_px,
             width_px=width_px,
-            metres_per_pixel=whole.metres_per_pixel / scale,
-            anchor_row_px=whole.anchor_row_px * scale,
-            anchor_column_px=whole.anchor_column_px * scale,
+            metres_per_pixel=self.metres_per_pixel / scale,
+            anchor_row_px=self.anchor_row_px * scale,
+            anchor_column_px=self.anchor_column_px * scale,
         )
 
     @classmethod
@@ -76,7 +90,7 @@ class View:
         """The view that `config` describes, as `config()` wrote it.
 
         Raises:
-            AspEnvError: a field is unknown, or its value is not possible.
+            AspEnvError: a field is unknown or missing, or its value is not possible.
         """
         known = [field.name for field in dataclasses.fields(cls)]
         unknown = sorted(set(config) - set(known))
@@ -84,11 +98,20 @@ class View:
             raise AspEnvError(
                 f"view configuration with {', '.join(unknown)}: known are {', '.join(known)}"
             )
+        missing = [name for name in known if name not in config]
+        if missing:
+            raise AspEnvError(
+                f"view configuration without {', '.join(missing)}: give all of {', '.join(known)}"
+            )
         return cls(**config)
 
     def config(self) -> dict[str, Any]:
         """The fields, ready for JSON."""
         return dataclasses.asdict(self)
+
+    def half_line_px(self, width_m: float) -> float:
+        """Half the width of a line in pixels, of so many metres but wide enough to have no gaps."""
+        return 0.5 * max(width_m / self.metres_per_pixel, MIN_LINE_WIDTH_PX)
 
     def pixels_from_world(
         self, poses: Shaped[np.ndarray, "*batch n"]

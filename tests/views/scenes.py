@@ -9,10 +9,12 @@ from jaxtyping import Float
 from asp_env.data.road_map import LineType, Ragged, RoadMap
 from asp_env.data.scene import Scene
 from asp_env.views.chauffeurnet import ChauffeurNet
-from asp_env.views.view import View
+from asp_env.views.mtp import MTP
 
 CAR_M = (4.0, 2.0)
-COARSE = ChauffeurNet(View.scaled(90, 60))
+COARSE = ChauffeurNet.make((90, 60))
+PICTURES = (COARSE, ChauffeurNet.make((90, 60), ego_trail=False), MTP.make((90, 90)))
+"""Every view of pictures, small."""
 
 
 def make_map(lines: Sequence[tuple[LineType, Sequence[Sequence[float]]]] = ()) -> RoadMap:

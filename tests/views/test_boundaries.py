@@ -5,7 +5,7 @@ import math
 import numpy as np
 
 from asp_env.data.road_map import LineType
-from asp_env.views.boundaries import BoundaryCache, boundary_pieces
+from asp_env.views.boundaries import MapCache, boundary_pieces
 from tests.views.scenes import make_map
 
 
@@ -45,7 +45,7 @@ def test_repeated_and_single_points_are_no_pieces() -> None:
 
 def test_each_map_is_worked_out_once() -> None:
     """The same map gives the same array, another map another one."""
-    cache = BoundaryCache(2)
+    cache = MapCache(boundary_pieces, 2)
     maps = [make_map([(LineType.CURB, [(0, 0), (i, 1)])]) for i in range(4)]
     first = cache(maps[0])
     assert cache(maps[0]) is first

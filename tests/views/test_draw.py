@@ -18,7 +18,7 @@ def draw_box(
 ) -> np.ndarray:
     """Which pixels of an empty canvas a box sets."""
     canvas = np.zeros((HEIGHT, WIDTH), dtype=np.uint8)
-    fill_box(canvas, column, row, math.cos(angle), math.sin(angle), half_length, half_width)
+    fill_box(canvas, column, row, math.cos(angle), math.sin(angle), half_length, half_width, 255)
     assert set(np.unique(canvas)) <= {0, 255}
     return canvas > 0
 
@@ -105,7 +105,7 @@ def test_senseless_numbers_draw_nothing(place: int, bad: float) -> None:
     numbers = [5.0, 5.0, 1.0, 0.0, 2.0, 1.0]
     numbers[place] = bad
     canvas = np.zeros((HEIGHT, WIDTH), dtype=np.uint8)
-    fill_box(canvas, *numbers)
+    fill_box(canvas, *numbers, 255)
     assert not canvas.any()
 
 
@@ -115,7 +115,7 @@ def test_senseless_numbers_draw_nothing(place: int, bad: float) -> None:
 def test_lines_have_no_gaps(ends: tuple[float, float, float, float]) -> None:
     """A line 1.5 pixels wide is one piece and holds the pixels of both ends."""
     canvas = np.zeros((HEIGHT, WIDTH), dtype=np.uint8)
-    fill_segment(canvas, *ends, 0.75)
+    fill_segment(canvas, *ends, 0.75, 255)
     pieces, labels = cv2.connectedComponents(canvas, connectivity=8)
     assert pieces == 2  # the background and the line
     assert labels[int(ends[1]), int(ends[0])] == labels[int(ends[3]), int(ends[2])] == 1
@@ -124,7 +124,7 @@ def test_lines_have_no_gaps(ends: tuple[float, float, float, float]) -> None:
 def test_line_reaches_half_its_width_beyond_its_ends() -> None:
     """From (4, 10) to (8, 10), 2 wide, are rows 9 and 10 and columns 3 to 9."""
     canvas = np.zeros((HEIGHT, WIDTH), dtype=np.uint8)
-    fill_segment(canvas, 4.0, 10.0, 8.0, 10.0, 1.0)
+    fill_segment(canvas, 4.0, 10.0, 8.0, 10.0, 1.0, 255)
     expected = np.zeros((HEIGHT, WIDTH), dtype=bool)
     expected[9:11, 3:9] = True
     np.testing.assert_array_equal(canvas > 0, expected)

@@ -154,7 +154,7 @@ def test_a_target_that_is_not_there_has_an_empty_picture() -> None:
 
 def test_copies_carry_the_configuration_alone() -> None:
     """Pickled and copied views are equal and draw the same, and carry no map with them."""
-    view = ChauffeurNet(View.scaled(90, 60))
+    view = ChauffeurNet.make((90, 60))
     empty = len(pickle.dumps(view))
     picture = view.draw(busy_scene())
     for again in (pickle.loads(pickle.dumps(view)), copy.deepcopy(view)):
@@ -165,7 +165,7 @@ def test_copies_carry_the_configuration_alone() -> None:
 
 def test_many_maps() -> None:
     """A view that has drawn more maps than it keeps draws the first one as before."""
-    view = ChauffeurNet(View.scaled(90, 60))
+    view = ChauffeurNet.make((90, 60))
     states = standing([(0.0, 0.0, 0.0)])
     scenes = [
         make_scene(states, maps=(make_map([(LineType.CURB, [(5, 0.1 * i), (20, 5)])]),))

@@ -3,6 +3,7 @@
 import dataclasses
 import json
 import math
+from collections.abc import Callable
 from typing import Any
 
 import numpy as np
@@ -12,9 +13,11 @@ from hypothesis import strategies as st
 
 from asp_env.data.geometry import from_frame
 from asp_env.errors import AspEnvError
-from asp_env.views import VIEWS, PictureView, make_view, view_from_config
+from asp_env.views import VIEWS, PictureView, make_picture_view, make_view, view_from_config
 from asp_env.views.chauffeurnet import ChauffeurNet
+from asp_env.views.mtp import MTP
 from asp_env.views.view import View
+from tests.views.scenes import PICTURES
 
 
 def pixel(view: View, pose: tuple[float, float, float], point: tuple[float, float]) -> np.ndarray:
@@ -78,7 +81,7 @@ def test_poses_keep_their_axes() -> None:
 @pytest.mark.parametrize(("height", "width"), [(360, 240), (180, 120), (90, 60), (45, 30)])
 def test_scaled_shows_the_same_extent(height: int, width: int) -> None:
     """72 m by 48 m and the anchor at 80 % from the top, in any number of pixels."""
-    view = View.scaled(height, width)
+    view = View().scaled((height, width))
     assert (view.height_px, view.width_px) == (height, width)
     assert view.metres_per_pixel * height == pytest.approx(72)
     assert view.metres_per_pixel * width == pytest.approx(48)
@@ -86,9 +89,22 @@ def test_scaled_shows_the_same_extent(height: int, width: int) -> None:
     assert view.anchor_column_px == pytest.approx(0.5 * width)
 
 
-def test_scaled_to_its_own_size_is_the_default() -> None:
-    """360x240 is the default view itself."""
-    assert View.scaled(360, 240) == View()
+def test_scaled_to_its_own_size_is_the_view_itself() -> None:
+    """360x240 of the default view, and no size at all."""
+    assert View().scaled((360, 240)) == View().scaled(None) == View()
+
+
+@pytest.mark.parametrize("side", [360, 180, 90, 45])
+def test_mtp_shows_the_same_extent(side: int) -> None:
+    """57.6 m ahead, 14.4 m behind and 36 m to either side, in any number of pixels."""
+    view = MTP.make((side, side)).view
+    per_metre = side / 72
+    for point, expected in (
+        ((57.6, 36.0), (0, 0)),
+        ((-14.4, -36.0), (side, side)),
+        ((0.0, 0.0), (36 * per_metre, 57.6 * per_metre)),
+    ):
+        np.testing.assert_allclose(pixel(view, (0.0, 0.0, 0.0), point), expected, atol=1e-9)
 
 
 @pytest.mark.parametrize(
@@ -109,49 +125,106 @@ def test_impossible_views_are_refused(fields: dict[str, Any]) -> None:
     assert "\n" not in str(caught.value)
 
 
-@pytest.mark.parametrize(("height", "width"), [(90, 90), (0, 0), (90, 61)])
-def test_scaled_refuses_oblong_pixels(height: int, width: int) -> None:
-    """Sizes that are not 3 to 2 are refused, with sizes that are."""
-    with pytest.raises(AspEnvError, match="360x240"):
-        View.scaled(height, width)
+@pytest.mark.parametrize(
+    ("view", "pixels", "good"),
+    [
+        ("chauffeurnet", (90, 90), "72 m x 48 m .* 360x240, 180x120, 90x60$"),
+        ("chauffeurnet", (0, 0), "360x240"),
+        ("chauffeurnet", (90, 61), "360x240"),
+        ("mtp", (90, 60), "72 m x 72 m .* 360x360, 180x180, 90x90$"),
+        ("mtp", (-90, -90), "360x360"),
+    ],
+)
+def test_oblong_pixels_are_refused(view: str, pixels: tuple[int, int], good: str) -> None:
+    """Sizes of another ratio than the extent's are refused in one line, with sizes that are not."""
+    with pytest.raises(AspEnvError, match=good) as caught:
+        make_view(view, pixels=pixels)
+    assert "\n" not in str(caught.value)
 
 
-def test_configuration_survives_json() -> None:
+@pytest.mark.parametrize("view", PICTURES, ids=lambda view: view.name)
+def test_configuration_survives_json(view: PictureView) -> None:
     """A view written to JSON and read back draws the same pictures, by equality."""
-    view = ChauffeurNet(View.scaled(90, 60))
     again = view_from_config(json.loads(json.dumps(view.config())))
     assert again == view
-    assert again != ChauffeurNet()
+    assert [again == other for other in PICTURES].count(True) == 1
 
 
-def test_configuration_names_every_field() -> None:
+@pytest.mark.parametrize("view", PICTURES, ids=lambda view: view.name)
+def test_configuration_names_every_field(view: PictureView) -> None:
     """Nothing that decides the picture is left out of the configuration."""
-    fields = {field.name for field in dataclasses.fields(View)}
-    assert set(ChauffeurNet().config()) == fields | {"name"}
+    fields = {field.name for field in dataclasses.fields(View)} | {"name"}
+    extra = {"ego_trail"} if isinstance(view, ChauffeurNet) else set()
+    assert set(view.config()) == fields | extra
 
 
-@pytest.mark.parametrize("name", list(VIEWS))
-def test_make_view_knows_every_name(name: str) -> None:
-    """Every registered view comes in the size asked for and knows its own name."""
-    view = make_view(name, height_px=90, width_px=60)
+@pytest.mark.parametrize("name", [view.name for view in PICTURES])
+def test_make_picture_view_knows_every_name(name: str) -> None:
+    """Every view of pictures comes in the size asked for and knows its own name."""
+    whole = make_picture_view(name)
+    channels, height, width = whole.shape
+    view = make_picture_view(name, pixels=(height // 4, width // 4))
     assert isinstance(view, PictureView)
-    assert view.name == name
-    assert view.shape == (len(view.channels), 90, 60)
-    assert view_from_config(view.config()) == view
+    assert view.name == whole.name == name
+    assert len(view.channels) == channels
+    assert view.shape == (channels, height // 4, width // 4)
+    assert view_from_config(view.config()) == view != whole
+
+
+def test_the_registry_names_the_pictures() -> None:
+    """Besides the vector views, the registered views are the three of pictures."""
+    names = {view.name for view in PICTURES}
+    assert {name for name in VIEWS if not name.startswith("vectors")} == names
 
 
 def test_unknown_names_list_the_known() -> None:
     """A misspelt view is refused with the known names."""
     with pytest.raises(AspEnvError, match="did you mean 'chauffeurnet'"):
-        make_view("chaufeurnet", height_px=90, width_px=60)
+        make_view("chaufeurnet", pixels=(90, 60))
     with pytest.raises(AspEnvError, match="known are chauffeurnet"):
         view_from_config({})
 
 
+@pytest.mark.parametrize("make", [ChauffeurNet.from_config, MTP.from_config], ids=["binary", "mtp"])
 @pytest.mark.parametrize(
-    "config", [{"name": "mtp"}, {}, {"name": "chauffeurnet", "zoom": 2.0}], ids=str
+    "config",
+    [
+        {"name": "vectors"},
+        {},
+        {**ChauffeurNet().config(), "zoom": 2.0},
+        {**MTP().config(), "zoom": 2.0},
+        {"name": "chauffeurnet"},
+        {"name": "mtp"},
+    ],
+    ids=str,
 )
-def test_foreign_configurations_are_refused(config: dict[str, object]) -> None:
-    """Another view's configuration, none, or an unknown field is refused in one line."""
-    with pytest.raises(AspEnvError, match="configuration"):
-        ChauffeurNet.from_config(config)
+def test_foreign_configurations_are_refused(
+    make: Callable[[dict[str, Any]], PictureView], config: dict[str, Any]
+) -> None:
+    """Another view's configuration, none, an unknown field, or a missing one: one line."""
+    with pytest.raises(AspEnvError, match="configuration") as caught:
+        make(config)
+    assert "\n" not in str(caught.value)
+
+
+def test_configurations_from_before_the_trail_was_a_choice() -> None:
+    """A configuration without `ego_trail`, as older checkpoints hold, is of the view with it."""
+    config = ChauffeurNet.make((90, 60)).config()
+    del config["ego_trail"]
+    assert view_from_config(config) == ChauffeurNet.make((90, 60))
+
+
+@pytest.mark.parametrize(
+    "fields",
+    [
+        {"ego_trail": False},
+        {"name": "chauffeurnet-no-trail"},
+        {"ego_trail": 1},
+        {"ego_trail": None},
+    ],
+    ids=str,
+)
+def test_a_trail_that_contradicts_the_name_is_refused(fields: dict[str, Any]) -> None:
+    """The name says whether there is a trail; a field that says otherwise, or neither, is wrong."""
+    with pytest.raises(AspEnvError, match="ego_trail"):
+        view_from_config({**ChauffeurNet().config(), **fields})
