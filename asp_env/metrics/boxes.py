@@ -186,3 +186,47 @@ def time_to_collision(
     out = np.zeros(len(states), dtype=np.float64)
     _ttc(states, sizes, valid, touching, out)
     return out
+
+
+@njit(cache=True, nogil=True)
+@no_type_check
+def _meets(path, size, track, valid, size_o):
+    for t in range(len(path)):
+        if valid[t] and overlaps(
+            path[t, 0], path[t, 1], path[t, 2], size[0], size[1],
+            track[t, 0], track[t, 1], track[t, 2], size_o[0], size_o[1],
+        ):  # fmt: skip
+            return True
+    return False
+
+
+@njit(cache=True, nogil=True)
+@no_type_check
+def _modes_meet(paths, sizes, situation, slot, others, valid, other_sizes, out):
+    for n in range(len(paths)):
+        b, size = situation[n], sizes[n]
+        for a in range(others.shape[1]):
+            track, there, size_o = others[b, a], valid[b, a], other_sizes[b, a]
+            if a == slot[n] or _meets(paths[n, 0], size, track, there, size_o):
+                continue
+            for m in range(out.shape[1]):
+                if not out[n, m]:
+                    out[n, m] = _meets(paths[n, m + 1], size, track, there, size_o)
+
+
+def modes_meet(
+    paths: Float[np.ndarray, "n paths t 4"],
+    sizes: Float[np.ndarray, "n 2"],
+    situation: Int[np.ndarray, " n"],
+    slot: Int[np.ndarray, " n"],
+    others: Float[np.ndarray, "b a t 4"],
+    valid: Bool[np.ndarray, "b a t"],
+    other_sizes: Float[np.ndarray, "b a 2"],
+) -> Bool[np.ndarray, "n paths-1"]:
+    """(n, paths - 1) which paths but the first ever meet anybody of the situation at that tick.
+
+    The slot of each target is left out, and whoever meets its first path, which is the truth.
+    """
+    out = np.zeros((len(paths), paths.shape[1] - 1), dtype=bool)
+    _modes_meet(paths, sizes, situation, slot, others, valid, other_sizes, out)
+    return out

@@ -14,6 +14,7 @@ from asp_env.metrics.open_loop import (
     Selection,
     displacement,
     errors_over_time,
+    inconsistency,
     moving,
     open_loop_errors,
     select_mode,
@@ -111,6 +112,32 @@ def test_best_by_final_error() -> None:
         open_loop_errors(modes, log_probs, ALONG_X[None], np.ones((1, 4), bool), "best-of-3")
     )
     assert (found["ADE"], found["FDE"]) == (0.75, 0.0)
+
+
+def test_best_by_mean_error() -> None:
+    """The rule is passed on: by ADE the mode that ends wrong is the best, by FDE the other."""
+    ends_right, ends_wrong = ALONG_X.copy(), ALONG_X.copy()
+    ends_right[:3, 1] = 1
+    ends_wrong[3, 1] = 1
+    told = (np.stack([ends_right, ends_wrong])[None], np.log([[0.5, 0.5]]), ALONG_X[None])
+    known = np.ones((1, 4), bool)
+    found = values(open_loop_errors(*told, known, "best-of-3", "ade"))
+    assert (found["ADE"], found["FDE"]) == (0.25, 1.0)
+    over_time = errors_over_time(*told, known, "best-of-3", "ade", dt_s=0.25)
+    assert over_time["L2@1s"].value.tolist() == [1.0]
+
+
+def test_inconsistency() -> None:
+    """Forecasts of 4 ticks made one tick apart share 3: off by 0, 1 and 2 m at those, mean 1.
+
+    The earlier one says 2, 3, 4 m for what the later one calls its ticks 1, 2 and 3.
+    """
+    later = np.array([(2.0, 0.0), (3.0, 1.0), (4.0, 2.0), (9.0, 9.0)])
+    pair = np.stack([ALONG_X] * 2), np.stack([later] * 2)
+    found = inconsistency(*pair, np.array([True, False]), apart=1)
+    assert found.value[0] == pytest.approx(1.0)
+    assert found.valid.tolist() == [True, False]
+    assert not inconsistency(*pair, np.array([True, True]), apart=4).valid.any()
 
 
 def test_equals() -> None:
