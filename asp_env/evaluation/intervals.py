@@ -1,6 +1,8 @@
 """Means with intervals by bootstrap over recordings: snippets of one recording are no new data."""
 
+from collections.abc import Callable
 from dataclasses import dataclass
+from functools import lru_cache
 
 import numpy as np
 from jaxtyping import Float, Shaped
@@ -29,27 +31,72 @@ def mean(values: Shaped[np.ndarray, " n"], groups: Shaped[np.ndarray, " n"]) -> 
     return ratio(values, np.ones(len(values)), groups)
 
 
+def difference(
+    values: Shaped[np.ndarray, "*seeds n"],
+    other: Shaped[np.ndarray, "*other_seeds n"],
+    groups: Shaped[np.ndarray, " n"],
+) -> Estimate:
+    """Mean of values less other values of the same samples: paired, so that what is common cancels.
+
+    Below zero as a whole, the interval says that `values` are lower on average; it speaks of other
+    recordings, not of other seeds, which are averaged sample by sample before anything else.
+
+    Args:
+        values: one per sample, or one per seed and sample.
+        other: as `values`, of any number of seeds.
+        groups: which recording each sample is from.
+    """
+    return mean(_over_seeds(values) - _over_seeds(other), groups)
+
+
+def _over_seeds(values: Shaped[np.ndarray, "*seeds n"]) -> Float[np.ndarray, " n"]:
+    return values.reshape(-1, values.shape[-1]).mean(axis=0, dtype=np.float64)
+
+
 def ratio(
     numerators: Shaped[np.ndarray, " n"],
     denominators: Shaped[np.ndarray, " n"],
     groups: Shaped[np.ndarray, " n"],
 ) -> Estimate:
     """Sum over sum, both resampled together, so that a ratio of two methods is paired."""
-    _, index = np.unique(groups, return_inverse=True)
-    top = np.bincount(index.reshape(-1), weights=numerators)
-    bottom = np.bincount(index.reshape(-1), weights=denominators)
-    value = float(top.sum() / bottom.sum())
-    if len(top) < 2:
-        return Estimate(value=value, low=None, high=None, n=len(numerators))
-    drawn = _draws(len(top))
+    parts = np.stack([numerators, denominators], axis=-1)
+    return of_sums(parts, groups, lambda sums: sums[..., 0] / sums[..., 1])
+
+
+def of_sums(
+    parts: Shaped[np.ndarray, "n ..."],
+    groups: Shaped[np.ndarray, " n"],
+    statistic: Callable[[np.ndarray], np.ndarray],
+) -> Estimate:
+    """Any function of sums over samples, and its interval from resampling groups.
+
+    Args:
+        parts: what each sample adds to the sums.
+        groups: which recording each sample is from.
+        statistic: from sums (…, *parts) to values (…).
+    """
+    names, index = np.unique(groups, return_inverse=True)
+    flat = parts.reshape(len(parts), -1)
+    columns = [
+        np.bincount(index.reshape(-1), weights=flat[:, k], minlength=len(names))
+        for k in range(flat.shape[1])
+    ]
+    sums = np.stack(columns, axis=-1)
+    value = float(statistic(sums.sum(axis=0).reshape(parts.shape[1:])))
+    if len(names) < 2:
+        return Estimate(value=value, low=None, high=None, n=len(parts))
+    drawn = (_draws(len(names)) @ sums).reshape(RESAMPLES, *parts.shape[1:])
     with np.errstate(invalid="ignore", divide="ignore"):
-        samples = (drawn @ top) / (drawn @ bottom)
+        samples = statistic(drawn)
     tail = (1 - LEVEL) / 2
     low, high = np.nanquantile(samples, [tail, 1 - tail])
-    return Estimate(value=value, low=float(low), high=float(high), n=len(numerators))
+    return Estimate(value=value, low=float(low), high=float(high), n=len(parts))
 
 
+@lru_cache(maxsize=64)
 def _draws(groups: int) -> Float[np.ndarray, "resamples groups"]:
     """How often each group is drawn in each resample; the same for everybody, so paired."""
     rng = np.random.default_rng(0)
-    return rng.multinomial(groups, np.full(groups, 1 / groups), RESAMPLES).astype(float)
+    drawn = rng.multinomial(groups, np.full(groups, 1 / groups), RESAMPLES).astype(float)
+    drawn.flags.writeable = False
+    return drawn

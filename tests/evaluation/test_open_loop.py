@@ -28,7 +28,7 @@ def _evaluate(data: Path, *predictors: str, **options) -> dict[tuple[str, ...], 
 def test_constant_velocity_is_right_about_constant_velocity(tmp_path):
     """Two cars that go straight on at 8 and 11 m/s: every error is zero to 2 mm.
 
-    One recording gives no interval.
+    The NLL is that of a Gaussian of 1 m at its centre, log 2π. One recording gives no interval.
     """
     westward = Drive(kind=AgentClass.CAR, start=(95.0, 1.75, np.pi, 11.0))
     write_crossing(tmp_path, drives=((car(-95, 8), westward),), seconds=14.0)
@@ -37,7 +37,8 @@ def test_constant_velocity_is_right_about_constant_velocity(tmp_path):
     assert {key[0] for key in errors} == {"constant-velocity", "constant-turn-rate"}
     for key, row in errors.items():
         # brier-FDE adds (1 - p)², and p is 1
-        assert row.value == pytest.approx(0.0, abs=2e-3), key
+        exact = np.log(2 * np.pi) if key[3] == "NLL" else 0.0
+        assert row.value == pytest.approx(exact, abs=2e-3), key
         assert (row.low, row.high) == (None, None)
 
 

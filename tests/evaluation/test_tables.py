@@ -21,19 +21,49 @@ def _row(metric: str, value: float, **fields) -> Row:
     return Row(metric=metric, value=value, **(known | fields))
 
 
-def test_open_loop_has_a_table_for_every_subset_and_selection():
-    """Two subsets and two selections are four tables with a line for each predictor."""
-    rows = [
-        _row("FDE", 1.0, predictor=name, subset=subset, selection=selection)
-        for name in ("constant-velocity", "ffw-asp:runs/a")
-        for subset in ("all", "moving")
-        for selection in ("most-probable", "best-of-3")
-    ]
-    tables = open_loop_tables(rows)
-    assert len(tables) == 4
+def _open_loop(*names: str, subsets: tuple[str, ...] = ("all", "moving")) -> list[Row]:
+    """Rows of every metric that is printed; moving targets have twice the errors of all."""
+    metrics = {
+        "": {"NLL": 5.0, "ECE": 0.05, "off-road": 0.01, "overlap": 0.02, "infeasible": 0.03},
+        "most-probable": {"FDE": 1.0, "ADE": 0.5, "miss": 0.2, "MAE": 0.3, "MSE": 12.25},
+        "best-of-3": {"FDE": 0.8, "ADE": 0.4, "miss": 0.1, "MAE": 0.2, "MSE": 10.5},
+    }
+    return [
+        _row(metric, value * (1 + (subset == "moving")), predictor=name, subset=subset,
+             selection=selection)
+        for name in names
+        for subset in subsets
+        for selection, values in metrics.items()
+        for metric, value in values.items()
+    ]  # fmt: skip
+
+
+def test_open_loop_is_told_of_moving_targets():
+    """A table for either selection and one for all else, a line for each predictor."""
+    tables = open_loop_tables(_open_loop("constant-velocity", "ffw-asp:runs/a"))
+    assert len(tables) == 3
     lines = _printed(tables[0])
-    assert "all targets, most-probable" in lines[0]
+    assert "moving targets, most-probable" in lines[0]
     assert [line.split()[0] for line in lines[-2:]] == ["constant-velocity", "ffw-asp"]
+    assert "2.00 [1.90, 2.10]" in lines[-1]
+    assert "moving targets, best-of-3" in _printed(tables[1])[0]
+
+
+def test_the_other_metrics_fit_80_columns():
+    """MAE and MSE of both selections, then what all modes have in common."""
+    names = ("constant-turn-rate", "constant-velocity")
+    lines = _printed(open_loop_tables(_open_loop(*names), names)[2])
+    assert max(len(line) for line in lines) <= 80
+    told = next(line for line in lines if line.startswith("constant-turn-rate *"))
+    assert told.split()[2:] == [
+        "0.60", "24.50", "0.40", "21.00", "10.00", "0.10", "0.02", "0.04", "0.06",
+    ]  # fmt: skip
+
+
+def test_where_nobody_moves_all_are_shown():
+    """Data of waiting vehicles have tables too."""
+    lines = _printed(open_loop_tables(_open_loop("oracle", subsets=("all",)))[0])
+    assert "all targets, most-probable" in lines[0]
     assert "1.00 [0.90, 1.10]" in lines[-1]
 
 

@@ -43,6 +43,47 @@ NOTES = {
     "brier-FDE": _note(
         "Brier FDE", "m", "lower", "FDE plus (1 - p)², p being the judged mode's probability."
     ),
+    "NLL": _note(
+        "NLL",
+        "nats",
+        "lower",
+        "Negative log density of the true end under Gaussians of 1 m around the modes' ends.",
+    ),
+    "ECE": _note(
+        "ECE",
+        "",
+        "lower",
+        "Expected calibration error of the modes' probabilities of ending nearest, in ten bins.",
+    ),
+    "Brier": _note(
+        "Brier", "", "lower", "Squared error of the modes' probabilities of ending nearest, summed."
+    ),
+    "off-road": _note(
+        "Off road",
+        "%",
+        "lower",
+        "Share of modes whose centre leaves the drivable area by over 0.3 m; of targets that keep "
+        "to it.",
+    ),
+    "overlap": _note(
+        "Overlap",
+        "%",
+        "lower",
+        "Share of modes whose box meets that of another road user where the two were recorded "
+        "apart.",
+    ),
+    "infeasible": _note(
+        "Infeasible",
+        "%",
+        "lower",
+        "Share of modes that accelerate by over 10.4 m/s² or curve by over 0.3 1/m.",
+    ),
+    "inconsistency": _note(
+        "Inconsistency",
+        "m",
+        "lower",
+        "Distance between most probable forecasts made 0.6 s apart, where they speak of one time.",
+    ),
     "score": _note(
         "Score",
         "%",

@@ -20,7 +20,7 @@ from asp_env.evaluation.report.payload import (
 )
 from asp_env.evaluation.report.results import Results, distinct, read_results
 from asp_env.evaluation.report.summary import cards, manifest
-from asp_env.evaluation.report.tables import tables
+from asp_env.evaluation.report.tables import kinds, tables
 
 ASSETS = files("asp_env.evaluation.report") / "assets"
 SCRIPTS = ("draw.js", "pictures.js", "replay.js", "page.js")
@@ -122,6 +122,7 @@ def _sections(
             + figures.get("final-errors", "")
             + figures.get("errors-over-time", ""),
         ),
+        "kinds": ("Which targets are hard?", kinds(results.open_loop)),
         "pictures": ("What do they look like?", PICTURES if data["pictures"] else ""),
         "driving": (
             "How does the car drive with them?",

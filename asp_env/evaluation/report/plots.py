@@ -22,7 +22,7 @@ def colours(predictors: Sequence[str]) -> dict[str, str]:
 
 def final_errors(results: Sequence[Result], colour: dict[str, str]) -> str | None:
     """Bars of FDE by subset and predictor with their intervals, a panel per selection."""
-    results = [r for r in results if r.metric == "FDE" and r.at_s is None]
+    results = [r for r in results if r.metric == "FDE" and r.at_s is None and ":" not in r.subset]
     if not results:
         return None
     selections = distinct((r.selection for r in results), first=SELECTIONS)

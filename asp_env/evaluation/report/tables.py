@@ -7,15 +7,18 @@ from asp_env.evaluation.report.notes import MetricNote, note
 from asp_env.evaluation.report.results import Entrant, Result, best, distinct, entrants
 
 SUBSETS = ("all", "moving")
+KIND_METRIC = "FDE"
+"""What is shown of kinds of targets: subsets such as `manoeuvre:left`."""
+
 SELECTIONS = ("most-probable", "best-of-3", "")
 """A metric without a selection speaks of all modes together."""
 
 
 def tables(results: Sequence[Result]) -> str:
-    """All tables of some results; metrics over time are left to the plots."""
+    """All tables of some results; metrics over time are left to the plots, kinds to `kinds`."""
     groups: dict[tuple[str, str], list[Result]] = {}
     for result in results:
-        if result.at_s is None:
+        if result.at_s is None and ":" not in result.subset:
             groups.setdefault((result.data, result.horizon_s), []).append(result)
     parts = [
         f"<figure class='results'>{_caption(group[0])}{_tabs(group)}</figure>"
@@ -24,9 +27,45 @@ def tables(results: Sequence[Result]) -> str:
     return "".join(parts)
 
 
-def _caption(one: Result) -> str:
+def kinds(results: Sequence[Result]) -> str:
+    """FDE by manoeuvre and by class: a table for each and for each selection."""
+    groups: dict[tuple[str, str, str], list[Result]] = {}
+    for result in results:
+        what, is_kind, _ = result.subset.partition(":")
+        if is_kind and result.metric == KIND_METRIC and result.at_s is None:
+            groups.setdefault((result.data, result.horizon_s, what), []).append(result)
+    parts = []
+    for (*_, what), group in groups.items():
+        found = distinct((result.selection for result in group), first=SELECTIONS)
+        inner = "".join(
+            _kind_table([result for result in group if result.selection == selection])
+            for selection in found
+        )
+        caption = _caption(group[0], f"{KIND_METRIC} by {what}")
+        parts.append(f"<figure class='results'>{caption}{inner}</figure>")
+    return "".join(parts)
+
+
+def _kind_table(results: Sequence[Result]) -> str:
+    columns: dict[str, dict[Entrant, Result]] = {}
+    for result in results:
+        columns.setdefault(result.subset.partition(":")[2], {})[result.entrant] = result
+    counts = {kind: max(r.n or 0 for r in column.values()) for kind, column in columns.items()}
+    headings = "".join(
+        f"<th>{escape(kind.replace('_', ' '))}<small>n = {count:.0f}</small></th>"
+        for kind, count in counts.items()
+    )
+    return _grid(
+        results[0].selection.replace("-", " "),
+        headings,
+        list(columns.values()),
+        entrants(results),
+    )
+
+
+def _caption(one: Result, *what: str) -> str:
     horizon = [f"horizon {one.horizon_s} s"] if one.horizon_s else []
-    details = " · ".join(escape(text) for text in (*horizon, *one.fixed))
+    details = " · ".join(escape(text) for text in (*what, *horizon, *one.fixed))
     return f"<figcaption><b>{escape(one.data)}</b> <span>{details}</span></figcaption>"
 
 
@@ -59,21 +98,32 @@ def _selection_table(heading: str, results: Sequence[Result]) -> str:
     cells: dict[str, dict[Entrant, Result]] = {}
     for result in results:
         cells.setdefault(result.metric, {})[result.entrant] = result
-    bold = {metric: _bold(list(column.values())) for metric, column in cells.items()}
-    body = []
-    for entrant in entrants(results):
-        values = "".join(
-            _cell(column.get(entrant), bold[metric]) for metric, column in cells.items()
-        )
-        kind = " class='privileged'" if entrant.privileged else ""
-        body.append(f"<tr{kind}>{_row_head(entrant)}{values}</tr>")
     names = "".join(
         f"<th title='{escape(note(metric).text, quote=True)}'>"
         f"{escape(note(metric).label)}{_unit(note(metric))}</th>"
         for metric in cells
     )
+    return _grid(heading, names, list(cells.values()), entrants(results))
+
+
+def _grid(
+    heading: str,
+    names: str,
+    columns: Sequence[dict[Entrant, Result]],
+    rows: Sequence[Entrant],
+) -> str:
+    """A table with a row for each entrant; the best value of each column is bold."""
+    bold = [_bold(list(column.values())) for column in columns]
+    body = []
+    for entrant in rows:
+        values = "".join(
+            _cell(column.get(entrant), best_of)
+            for column, best_of in zip(columns, bold, strict=True)
+        )
+        kind = " class='privileged'" if entrant.privileged else ""
+        body.append(f"<tr{kind}>{_row_head(entrant)}{values}</tr>")
     return (
-        f"<div class='scroll'><table style='min-width: {14 + 6 * len(cells)}rem'>"
+        f"<div class='scroll'><table style='min-width: {14 + 6 * len(columns)}rem'>"
         f"<thead><tr><th>{escape(heading)}</th>{names}</tr></thead>"
         f"<tbody>{''.join(body)}</tbody></table></div>"
     )
