@@ -1,7 +1,6 @@
 """The lines of a road map as short polylines of equally many points, ready to be chosen from."""
 
 import math
-from collections import OrderedDict
 from dataclasses import dataclass
 
 import numpy as np
@@ -78,25 +77,3 @@ def _cut(
 
 def _at(line: np.ndarray, arc: np.ndarray, at: np.ndarray) -> np.ndarray:
     return np.stack([np.interp(at, arc, line[:, axis]) for axis in (0, 1)], axis=-1)
-
-
-class PieceCache:
-    """The pieces of the maps that were used last, each worked out once."""
-
-    def __init__(self, size: int = 256) -> None:
-        """Keeps the pieces of up to `size` maps, about 60 kB each."""
-        self._size = size
-        self._entries: OrderedDict[int, tuple[RoadMap, LanePieces]] = OrderedDict()
-
-    def __call__(self, road_map: RoadMap) -> LanePieces:
-        """The pieces of `road_map`."""
-        # The entry holds its map, so an id cannot pass to another map while the entry lives.
-        entry = self._entries.get(id(road_map))
-        if entry is None:
-            entry = (road_map, lane_pieces(road_map))
-        # Threads may share the cache: one of them may have taken out what another has just read.
-        self._entries[id(road_map)] = entry
-        self._entries.move_to_end(id(road_map))
-        while len(self._entries) > self._size:
-            self._entries.popitem(last=False)
-        return entry[1]

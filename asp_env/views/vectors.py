@@ -24,7 +24,8 @@ from jaxtyping import Bool, Float
 from asp_env.data.classes import AgentClass
 from asp_env.data.scene import Scene
 from asp_env.errors import AspEnvError
-from asp_env.views.lane_pieces import KINDS, POINTS, PieceCache
+from asp_env.views.boundaries import MapCache
+from asp_env.views.lane_pieces import KINDS, POINTS, LanePieces, lane_pieces
 from asp_env.views.neighbourhood import place_agents, place_lines
 
 GROUPS = {
@@ -80,7 +81,13 @@ class VectorView:
     lines: int = 64
     own_past: bool = True
     """Whether the target's own states before now are shown."""
-    _pieces: PieceCache = field(default_factory=PieceCache, init=False, repr=False, compare=False)
+    _pieces: MapCache[LanePieces] = field(
+        default_factory=lambda: MapCache(lane_pieces, size=256),
+        init=False,
+        repr=False,
+        compare=False,
+    )
+    """About 60 kB for each map; batches come from many."""
 
     history: ClassVar[int] = 15
     """Past ticks that a scene must have."""

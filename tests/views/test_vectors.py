@@ -16,7 +16,7 @@ from asp_env.data.geometry import to_frame
 from asp_env.data.road_map import LineType, Ragged, RoadMap
 from asp_env.data.scene import Scene
 from asp_env.errors import AspEnvError
-from asp_env.views.lane_pieces import KINDS, PieceCache, lane_pieces
+from asp_env.views.lane_pieces import KINDS, lane_pieces
 from asp_env.views.vectors import AGENT_FIELDS, LINE_FIELDS, Vectors, VectorView
 from tests.views.scenes import busy_scene, cross_map, make_map, make_scene, standing, traffic
 
@@ -290,15 +290,3 @@ def test_pixels_are_refused() -> None:
     assert VectorView.make(own_past=False) == VectorView(own_past=False)
     with pytest.raises(AspEnvError, match="no pictures"):
         VectorView.make((90, 60))
-
-
-def test_each_map_is_worked_out_once() -> None:
-    """The same map gives the same pieces; the one least used lately goes first."""
-    cache = PieceCache(2)
-    maps = [make_map([(LineType.CURB, [(0, 0), (i, 1)])]) for i in range(3)]
-    first, second = cache(maps[0]), cache(maps[1])
-    assert cache(maps[0]) is first
-    cache(maps[2])
-    assert cache(maps[0]) is first
-    assert cache(maps[1]) is not second
-    np.testing.assert_array_equal(cache(maps[1]).points, second.points)
