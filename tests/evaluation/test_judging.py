@@ -201,6 +201,25 @@ def test_modes_are_counted_one_by_one() -> None:
     assert ece.selection == ""
 
 
+def test_each_rule_is_best_at_what_it_looks_at(found: Judgement) -> None:
+    """Snippet by snippet no other rule has a lower FDE than `fde`, or a lower ADE than `ade`."""
+    recordings = (make_recording(), make_recording(seed=1))
+    by: dict[str, Judgement] = {"fde": found}
+    for rule in ("ade", "paper"):
+        by[rule] = judge(
+            {"forks": Forks()},
+            index_of(*recordings),
+            scenes=recordings,
+            recorded=recordings,
+            best_by=rule,
+        )
+    for metric, best in (("FDE", "fde"), ("ADE", "ade")):
+        lowest = by[best].of("forks", metric, "best-of-3").values
+        others = [by[rule].of("forks", metric, "best-of-3").values for rule in by if rule != best]
+        assert all((lowest <= other).all() for other in others)
+        assert any((lowest < other).any() for other in others)
+
+
 def test_one_mode_has_no_calibration(found: Judgement) -> None:
     """Only the forks have a Brier score and an ECE."""
     assert [each.name for each in found.modes] == ["forks"]

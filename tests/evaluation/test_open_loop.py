@@ -92,6 +92,10 @@ def test_the_manifest_says_what_was_judged(crossings, recordings):
     assert told["snippets"] > told["moving snippets"] > 50
     assert told["predictors"] == {"constant-velocity": {}, "constant-turn-rate": {}}
     assert told["privileged"] == []
+    assert told["best_by"] == "fde"
+    other = evaluate(Evaluate(data=str(crossings), out=NOWHERE, best_by="paper")).manifest
+    assert other["best_by"] == "paper"
+    assert "within 5°" in other["best-of-3"]
 
 
 def test_running_twice_gives_the_same_bits(crossings):
