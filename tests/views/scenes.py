@@ -6,6 +6,7 @@ from collections.abc import Sequence
 import numpy as np
 from jaxtyping import Float
 
+from asp_env.data.classes import AgentClass
 from asp_env.data.road_map import LineType, Ragged, RoadMap
 from asp_env.data.scene import Scene
 from asp_env.views.chauffeurnet import ChauffeurNet
@@ -17,13 +18,16 @@ PICTURES = (COARSE, ChauffeurNet.make((90, 60), ego_trail=False), MTP.make((90, 
 """Every view of pictures, small."""
 
 
-def make_map(lines: Sequence[tuple[LineType, Sequence[Sequence[float]]]] = ()) -> RoadMap:
-    """A map of nothing but lines."""
+def make_map(
+    lines: Sequence[tuple[LineType, Sequence[Sequence[float]]]] = (),
+    drivable: Sequence[Sequence[Sequence[float]]] = (),
+) -> RoadMap:
+    """A map of nothing but lines and rings of drivable area."""
     return RoadMap(
         name="by hand",
         lines=Ragged.pack([np.array(points, dtype=np.float64) for _, points in lines]),
         line_types=np.array([int(kind) for kind, _ in lines], dtype=np.int64),
-        drivable=Ragged.pack([]),
+        drivable=Ragged.pack([np.array(ring, dtype=np.float64) for ring in drivable]),
         lanes=Ragged.pack([]),
         successors=np.zeros((0, 2), dtype=np.int64),
     )
@@ -35,10 +39,14 @@ def make_scene(
     valid: np.ndarray | None = None,
     size_m: tuple[float, float] = CAR_M,
     sizes_m: np.ndarray | None = None,
+    classes: np.ndarray | None = None,
     targets: Sequence[tuple[int, int]] = ((0, 0),),
     maps: tuple[RoadMap, ...] = (),
 ) -> Scene:
-    """A scene of given states; situation i lies on map i of several, or on the only one."""
+    """A scene of given states, of cars by default.
+
+    Situation i lies on map i of several, or on the only one.
+    """
     situations, agents, num_ticks, _ = states.shape
     maps = maps or (make_map(),)
     sizes = np.tile(np.array(size_m), (situations, agents, 1)) if sizes_m is None else sizes_m
@@ -47,7 +55,7 @@ def make_scene(
         actions=np.zeros((situations, agents, num_ticks - 1, 2), dtype=np.float32),
         valid=np.ones((situations, agents, num_ticks), dtype=bool) if valid is None else valid,
         sizes=sizes.astype(np.float32),
-        classes=np.zeros((situations, agents), dtype=np.int64),
+        classes=np.zeros((situations, agents), dtype=np.int64) if classes is None else classes,
         ids=np.tile(np.arange(agents), (situations, 1)),
         tick=np.zeros(situations, dtype=np.int64),
         targets=np.array(targets, dtype=np.int64).reshape(-1, 2),
@@ -71,23 +79,23 @@ def channel(name: str) -> int:
 
 
 def cross_map(turn_rad: float = 0.0, shift_m: tuple[float, float] = (0.0, 0.0)) -> RoadMap:
-    """Curbs, solid and dashed lines around the origin, turned and then moved."""
+    """Lines and a crossing of two roads around the origin, turned and then moved."""
     cos, sin = math.cos(turn_rad), math.sin(turn_rad)
+
+    def move(points: Sequence[tuple[float, float]]) -> list[tuple[float, float]]:
+        return [(cos * x - sin * y + shift_m[0], sin * x + cos * y + shift_m[1]) for x, y in points]
+
+    roads = [
+        [(-60, -4), (60, -4), (60, 4), (-60, 4)],
+        [(-4, -60), (-4, -4), (-4, 4), (-4, 60), (4, 60), (4, -60)],
+    ]
     lines = [
         (LineType.CURB, [(-60, 4), (-5, 5), (-4, 60)]),
         (LineType.SOLID, [(60, -4), (5, -3), (3, -60)]),
         (LineType.DASHED, [(-60, 0), (60, 0)]),
         (LineType.VIRTUAL, [(0, -60), (0, 60)]),
     ]
-    return make_map(
-        [
-            (
-                kind,
-                [(cos * x - sin * y + shift_m[0], sin * x + cos * y + shift_m[1]) for x, y in line],
-            )
-            for kind, line in lines
-        ]
-    )
+    return make_map([(kind, move(line)) for kind, line in lines], [move(ring) for ring in roads])
 
 
 def traffic(seed: int, *, situations: int = 1, agents: int = 6) -> np.ndarray:
@@ -105,11 +113,16 @@ def traffic(seed: int, *, situations: int = 1, agents: int = 6) -> np.ndarray:
 
 
 def busy_scene(seed: int = 0) -> Scene:
-    """Three situations on two maps, five targets out of order, some agents absent for a while."""
+    """Three situations on two maps, five targets out of order, some agents absent for a while.
+
+    Agents of all classes that overlap here and there.
+    """
     states = traffic(seed, situations=3)
-    valid = np.random.default_rng(seed).random(states.shape[:3]) < 0.8
+    rng = np.random.default_rng(seed)
+    valid = rng.random(states.shape[:3]) < 0.8
+    classes = rng.integers(0, len(AgentClass), states.shape[:2])
     targets = [(2, 0), (0, 3), (0, 0), (1, 2), (2, 5)]
     for situation, slot in targets:
         valid[situation, slot, -1] = True
     maps = (cross_map(), cross_map(0.4, (3.0, 2.0)))
-    return make_scene(states, valid=valid, targets=targets, maps=maps)
+    return make_scene(states, valid=valid, classes=classes, targets=targets, maps=maps)

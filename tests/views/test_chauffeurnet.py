@@ -94,6 +94,16 @@ def test_trail_of_a_left_hand_curve_lies_on_the_left() -> None:
     assert columns.max() <= 121
 
 
+def test_without_the_ego_trail() -> None:
+    """Its channel stays and is empty; all others are as they were."""
+    scene = busy_scene()
+    shown, hidden = (ChauffeurNet(ego_trail=trail).draw(scene) for trail in (True, False))
+    others = [i for i, name in enumerate(ChauffeurNet.channels) if name != "ego_trail"]
+    assert shown[:, channel("ego_trail")].any()
+    assert not hidden[:, channel("ego_trail")].any()
+    np.testing.assert_array_equal(hidden[:, others], shown[:, others])
+
+
 def test_snapshots_are_those_of_the_paper() -> None:
     """An agent seen at state s alone is drawn in the channel of s, and nowhere if there is none."""
     for state in range(16):

@@ -105,7 +105,7 @@ def test_senseless_numbers_draw_nothing(place: int, bad: float) -> None:
     numbers = [5.0, 5.0, 1.0, 0.0, 2.0, 1.0]
     numbers[place] = bad
     canvas = np.zeros((HEIGHT, WIDTH), dtype=np.uint8)
-    fill_box(canvas, *numbers, 255)
+    fill_box(canvas, *numbers, value=255)
     assert not canvas.any()
 
 
