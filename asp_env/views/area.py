@@ -3,8 +3,9 @@
 A pixel belongs to a ring when its centre lies inside by the even-odd rule, and to the area when it
 belongs to any ring. Each row of a picture is written from the crossings of its middle with all
 rings: that is exact and keeps no grid of the map, and at 360x360 pixels it takes a quarter of the
-time of `cv2.fillPoly` and a sixth of that of looking each pixel up in a grid. Edges are followed from their upper end to their lower one, so rings that
-share an edge share no pixel and leave none out.
+time of `cv2.fillPoly` and a sixth of that of looking each pixel up in a grid of 0.1 m. Edges are
+followed from their upper end to their lower one, so rings that share an edge share no pixel and
+leave none out.
 """
 
 from typing import NamedTuple, no_type_check

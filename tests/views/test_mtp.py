@@ -144,8 +144,9 @@ def test_left_hand_curve_lies_on_the_left() -> None:
         [20 * np.sin(angle), 20 - 20 * np.cos(angle), angle, np.full(16, 6.0)], axis=1
     )
     red = MTP().draw(make_scene(states))[0, 0]
-    # Two seconds ago, at an angle of 0.6: 11.29 m back and 3.49 m to the left.
-    assert red[288 + 56, 180 - 17] == 102
+    # Two seconds ago, at an angle of 0.6, its centre was 11.29 m back and 3.49 m to the left, and a
+    # point 1.8 m behind that 12.78 m and 4.51 m: 63.9 rows and 22.5 columns.
+    assert red[288 + 63, 180 - 23] == 102
     assert red[298:, 185:].max() == 0
 
 
@@ -169,11 +170,9 @@ def test_who_lies_above(swapped: bool) -> None:
     """Humans above objects above vehicles at one tick; what is newer above all that is older."""
 
     def two(below: AgentClass, above: AgentClass, states: tuple[int, int]) -> tuple[int, ...]:
-        return (
-            picture_of_two(above, below, states[::-1])
-            if swapped
-            else picture_of_two(below, above, states)
-        )
+        if swapped:
+            return picture_of_two(above, below, (states[1], states[0]))
+        return picture_of_two(below, above, states)
 
     car, thing, human = AgentClass.CAR, AgentClass.OTHER, AgentClass.PEDESTRIAN
     assert two(car, thing, (15, 15)) == VIOLET
