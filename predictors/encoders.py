@@ -64,20 +64,22 @@ class PictureEncoder(nn.Module):
         assert isinstance(seen, Tensor)
         device = seen.device.type
         dtype = torch.bfloat16 if torch.is_autocast_enabled(device) else torch.float32
-        # Small integers are moved to channels-last before they grow: there is less to move.
-        seen = seen.contiguous(memory_format=torch.channels_last)
         if self._width is None:
-            pixels = seen.to(dtype) * (1 / 255)
+            # Small integers are moved to channels-last before they grow: there is less to move.
+            pixels = seen.contiguous(memory_format=torch.channels_last).to(dtype) * (1 / 255)
         else:
             pixels = unpack_bits(seen, self._width).to(dtype)
         return self.ahead(self.body(pixels.contiguous(memory_format=torch.channels_last)))
 
 
 def unpack_bits(packed: UInt8[Tensor, "n c h bytes"], width: int) -> UInt8[Tensor, "n c h w"]:
-    """Bits along rows as 0 and 1, the highest bit first, as `asp_env.views.packing` packs them."""
-    shifts = torch.arange(7, -1, -1, dtype=torch.uint8, device=packed.device)
-    bits = (packed[..., None] >> shifts) & 1
-    return bits.flatten(-2)[..., :width]
+    """Bits along rows as 0 and 1, the highest bit first, as `asp_env.views.packing` packs them.
+
+    In channels-last order, where bits of one place in a byte lie side by side: one operation each.
+    """
+    channels_last = packed.permute(0, 2, 3, 1).contiguous()
+    bits = torch.stack([(channels_last >> shift) & 1 for shift in range(7, -1, -1)], dim=3)
+    return bits.flatten(2, 3)[:, :, :width].permute(0, 3, 1, 2)
 
 
 def load_resnet18(network: nn.Module, path: Path) -> None:

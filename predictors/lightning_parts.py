@@ -89,6 +89,7 @@ class Fit(pl.LightningModule):
             self.network.parameters(),
             lr=self.config.learning_rate,
             weight_decay=self.config.weight_decay,
+            fused=True,
         )
         if self.config.schedule == "plateau":
             plateau = ReduceLROnPlateau(
