@@ -1,34 +1,100 @@
-"""A network so small that it trains in a second."""
+"""Networks so small that they train in a second: of every trainable predictor, for every view."""
 
 import dataclasses
+from collections.abc import Sequence
 from pathlib import Path
+from typing import Any
 
+import numpy as np
 import torch
 
+from asp_env import registry
+from asp_env.data.recording import Recording
+from asp_env.data.snippets import index_snippets
 from asp_env.views import make_view
-from predictors.checkpoint import save_learned
-from predictors.ffw_asp import FFWASP, FFWASPConfig
-from predictors.learned import NetworkShape
+from predictors.batch import Batch, Labels
+from predictors.checkpoint import save_learned, shape_for
+from predictors.network import AbstractNetwork, LearnedPlug, NetworkConfig, NetworkShape
 from predictors.recipes import TrainingConfig, recipe
+from predictors.samples import Batches
+from tests.builders import make_recording
 from tests.data.levelx_files import write_map, write_recording
 
-NETWORK = FFWASPConfig(
-    encoder="small", features=8, gru_width=8, gru_layers=1, skip=True, hidden=8, integrator="heun"
-)
+PIXELS = (36, 24)
+RANGE = (4.0, 0.5)
+
+SIZES = {"features": 8, "hidden": 8, "gru_width": 8, "gru_layers": 1}
+"""What configurations of networks are shrunk to, as far as they have such fields."""
 
 
-def tiny_config(**changes: object) -> TrainingConfig:
-    """The `cpu` recipe with four epochs of three batches of eight 36x24 rasters."""
+def pixels_of(view: str) -> tuple[int, int] | None:
+    """The pictures that tests draw."""
+    if view.startswith("vectors"):
+        return None
+    return (36, 36) if view == "mtp" else PIXELS
+
+
+def tiny_network(
+    predictor: str, view: str = "chauffeurnet", *, preset: str = "cpu", **changes: Any
+) -> NetworkConfig:
+    """A preset's network with 8 of everything, but of what the preset leaves out."""
+    config = recipe(predictor, preset, view=view, horizon_s=3.0).network
+    small: dict[str, Any] = {n: size for n, size in SIZES.items() if getattr(config, n, 0)}
+    small["encoder"] = "vector" if view.startswith("vectors") else "small"
+    return dataclasses.replace(config, **{**small, **changes})
+
+
+def tiny_config(
+    predictor: str = "ffw-asp", view: str = "chauffeurnet", **changes: Any
+) -> TrainingConfig:
+    """The `cpu` recipe with four epochs of three batches of eight 36x24 pictures."""
+    config = recipe(predictor, "cpu", view=view, horizon_s=3.0)
     config = dataclasses.replace(
-        recipe("ffw-asp", "cpu", view="chauffeurnet", horizon_s=3.0),
-        network=NETWORK,
-        height_px=36,
-        width_px=24,
-        epochs=4,
+        config,
+        network=tiny_network(predictor, view),
+        pixels=pixels_of(view),
+        epochs=4 - config.pretraining_epochs,
         snippets_per_epoch=24,
         batch_size=8,
     )
     return dataclasses.replace(config, **changes)
+
+
+def tiny_shape(view: str = "chauffeurnet", horizon: int = 15) -> NetworkShape:
+    """What a network for 36x24 pictures, or for vectors, is made for."""
+    drawn = make_view(view, pixels=pixels_of(view))
+    return shape_for(drawn, history=15, horizon=horizon, dt_s=0.2, action_range=RANGE)
+
+
+def make_network(
+    predictor: str, config: NetworkConfig, shape: NetworkShape, *, seed: int = 0
+) -> AbstractNetwork:
+    """A network whose random weights do not touch the global state."""
+    plug: LearnedPlug = registry.find("predictors", predictor)
+    with torch.random.fork_rng(devices=[]):
+        torch.manual_seed(seed)
+        return plug.network(config, shape)
+
+
+def draw_samples(
+    rows: Sequence[int],
+    *,
+    view: str = "chauffeurnet",
+    horizon_s: float = 3.0,
+    later_ticks: Sequence[int] = (),
+    recording: Recording | None = None,
+) -> tuple[Batch, Labels]:
+    """Some snippets of the made-up crossing as one batch."""
+    recordings = [make_recording() if recording is None else recording]
+    index = index_snippets(recordings, dt_s=0.2, horizon_s=horizon_s)
+    batches = Batches(
+        recordings,
+        index.select(np.array(rows)),
+        view=make_view(view, pixels=pixels_of(view)),
+        batch_size=len(rows),
+        later_ticks=later_ticks,
+    )
+    return next(iter(batches))
 
 
 def write_data(folder: Path, *, recordings: int = 3, cars: int = 4) -> str:
@@ -41,24 +107,28 @@ def write_data(folder: Path, *, recordings: int = 3, cars: int = 4) -> str:
     return str(folder)
 
 
-def save_random(folder: Path, *, seed: int = 0) -> Path:
-    """A checkpoint of the tiny network with random weights; the folder."""
-    plug = FFWASP
-    view = make_view("chauffeurnet", height_px=36, width_px=24)
-    shape = NetworkShape(
-        raster=view.shape, history=15, horizon=15, dt_s=0.2, action_range=(4.0, 0.5)
-    )
-    with torch.random.fork_rng():
-        torch.manual_seed(seed)
-        network = plug.network(NETWORK, shape)
+def save_random(
+    folder: Path,
+    predictor: str = "ffw-asp",
+    view: str = "chauffeurnet",
+    *,
+    horizon: int = 15,
+    seed: int = 0,
+    temperature: float = 1.0,
+) -> Path:
+    """A checkpoint of a tiny network with random weights; the folder."""
+    plug: LearnedPlug = registry.find("predictors", predictor)
+    config, shape = tiny_network(predictor, view), tiny_shape(view, horizon)
+    network = make_network(predictor, config, shape, seed=seed)
     folder.mkdir(parents=True)
     save_learned(
         folder,
         plug=plug,
-        network_config=NETWORK,
+        network_config=config,
         shape=shape,
-        view=view,
+        view=make_view(view, pixels=pixels_of(view)),
         weights=network.state_dict(),
+        temperature=temperature,
         provenance={
             "trained_on": {"source": "nothing", "split": "recording", "parts": {}},
             "config": {"preset": "tiny"},
