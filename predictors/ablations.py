@@ -96,6 +96,7 @@ _OF_ALL = {
     "no-trail": Variant(change=no_trail),
     "causal": Variant(change=causal),
     "long": Variant(change=long),
+    "annealed": Variant(change=_network(annealed=True)),
 }
 _OF_ACTIONS = _OF_ALL | {
     "euler": Variant(change=_network(integrator="euler")),
