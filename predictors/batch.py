@@ -11,8 +11,7 @@ from asp_env.data.geometry import states_to_frame
 from asp_env.data.scene import Scene
 from asp_env.data.snippets import Future
 from asp_env.dynamics import wrap_angle
-from asp_env.views import PictureView, SceneView
-from asp_env.views.packing import pack_bits
+from asp_env.views import BinaryView, PictureView, SceneView
 from predictors.vector_encoder import VectorTensors
 
 Seen = UInt8[Tensor, "n c h w"] | VectorTensors
@@ -63,7 +62,9 @@ def make_labels(scene: Scene, future: Future, later: tuple[Batch, ...] = ()) -> 
 
 
 def _seen(scene: Scene, view: SceneView) -> Seen:
+    if isinstance(view, BinaryView):
+        return torch.from_numpy(view.draw_packed(scene))
     drawn = view.draw(scene)
     if isinstance(view, PictureView):
-        return torch.from_numpy(pack_bits(drawn) if view.binary else drawn)
+        return torch.from_numpy(drawn)
     return VectorTensors(*(torch.from_numpy(array) for array in drawn))

@@ -14,7 +14,7 @@ from torch import Tensor
 
 from asp_env.data.parts import TrainedOn
 from asp_env.errors import AspEnvError, CheckpointError, unknown_name
-from asp_env.views import PictureView, SceneView, view_from_config
+from asp_env.views import BinaryView, SceneView, view_from_config
 from predictors.chaining import CHAININGS
 from predictors.learned import Learned
 from predictors.network import AbstractNetwork, LearnedPlug, NetworkShape
@@ -147,7 +147,7 @@ def read_config(folder: Path) -> dict[str, Any]:
 
 def shape_for(view: SceneView, **numbers: Any) -> NetworkShape:
     """The shape of a network that looks at a view; the other fields by name."""
-    packed = isinstance(view, PictureView) and view.binary
+    packed = isinstance(view, BinaryView)
     return NetworkShape(seen=view.shape, packed=packed, **numbers)
 
 

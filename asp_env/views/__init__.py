@@ -6,7 +6,7 @@ A view is made from its configuration, which a checkpoint stores, and draws any 
 from collections.abc import Mapping
 from importlib import import_module
 from types import MappingProxyType
-from typing import Any, ClassVar, NamedTuple, Protocol, runtime_checkable
+from typing import Any, NamedTuple, Protocol, runtime_checkable
 
 import numpy as np
 
@@ -70,9 +70,6 @@ class SceneView(Protocol):
 class PictureView(SceneView, Protocol):
     """A view that draws pictures of named channels."""
 
-    binary: ClassVar[bool]
-    """Whether every value is 0 or 255, so that pictures can be packed to bits."""
-
     @property
     def channels(self) -> tuple[str, ...]:
         """What each channel shows."""
@@ -85,6 +82,15 @@ class PictureView(SceneView, Protocol):
 
     def draw(self, scene: Scene, out: np.ndarray | None = None) -> np.ndarray:
         """One uint8 picture (targets, *shape) per target, into `out` if given."""
+        ...
+
+
+@runtime_checkable
+class BinaryView(PictureView, Protocol):
+    """A view whose pictures hold 0 and 255 alone, and can be had as bits."""
+
+    def draw_packed(self, scene: Scene) -> np.ndarray:
+        """The pictures of `draw` as `packing.pack_bits` packs them."""
         ...
 
 

@@ -66,7 +66,6 @@ class ChauffeurNet:
         "ego_trail",
         *(f"agents_{i}" for i in range(len(SNAPSHOTS))),
     )
-    binary: ClassVar[bool] = True
     """Every value is 0 or 255."""
     history: ClassVar[int] = SNAPSHOTS[-1]
     """Past ticks that a scene must have."""

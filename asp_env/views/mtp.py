@@ -154,7 +154,6 @@ class MTP:
 
     name: ClassVar[str] = "mtp"
     channels: ClassVar[tuple[str, ...]] = ("red", "green", "blue")
-    binary: ClassVar[bool] = False
     """Values are colours, not 0 and 255 alone."""
     history: ClassVar[int] = FADE_TICKS
     """Past ticks that a scene must have."""

@@ -46,7 +46,6 @@ def test_channels() -> None:
     """Red, green and blue, 3x360x360 by default, from two seconds of history."""
     assert MTP().shape == (3, 360, 360)
     assert MTP.channels == ("red", "green", "blue")
-    assert not MTP.binary
     assert 0.2 * MTP.history == 2.0
 
 
