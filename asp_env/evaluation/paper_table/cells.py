@@ -1,0 +1,190 @@
+"""The cells of the table: what is trained and judged, and what has to be there before."""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from itertools import product
+from typing import Any
+
+from asp_env.errors import AspEnvError, unknown_name
+
+SEGMENT_S = 3.0
+"""Runs for longer horizons start from the weights of one for this, of the same seed."""
+
+PHYSICAL = ("constant-velocity", "constant-turn-rate")
+"""These learn nothing; every table has them."""
+
+CAUSAL = "causal"
+"""The variant whose histories know nothing that came later; the physical ones have it too."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Cell:
+    """One predictor for one horizon at one site."""
+
+    site: str
+    predictor: str
+    horizon_s: float
+    view: str = ""
+    """What it looks at; for a variant without the trail, the view with it."""
+    preset: str = ""
+    """Where it is another than the table's."""
+    variant: str = ""
+    """A change of the recipe by name; none for the table itself."""
+    seed: int | None = None
+    """None for one that learns nothing."""
+    start: "Cell | None" = None
+    """The cell whose weights it goes on from."""
+
+    @property
+    def label(self) -> str:
+        """Predictor, preset and variant."""
+        return "-".join(part for part in (self.predictor, self.preset, self.variant) if part)
+
+    @property
+    def name(self) -> str:
+        """Where it lies below the folders of runs, errors and logs."""
+        parts = [self.site, self.view, self.label, f"{self.horizon_s:g}s"]
+        if self.seed is not None:
+            parts.append(f"seed{self.seed}")
+        return "/".join(part for part in parts if part)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Entrant:
+    """A predictor of the table, by its recipe."""
+
+    predictor: str
+    preset: str = ""
+    """Where it is another than the table's."""
+
+    @classmethod
+    def from_name(cls, name: str) -> "Entrant":
+        """Of `ssp-asp` or `ssp-asp:ours`."""
+        predictor, _, preset = name.partition(":")
+        return cls(predictor=predictor, preset=preset)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Ablation:
+    """A variant of a predictor."""
+
+    predictor: str
+    name: str
+    horizons_s: tuple[float, ...]
+    """Those that it says something about."""
+    goes_on: bool
+    """Whether a run for more than 3 s goes on from the weights of one for 3 s."""
+
+
+def choose_ablations(
+    names: Sequence[str], variants: Mapping[str, Mapping[str, Any]]
+) -> list[Ablation]:
+    """The ablations of some names.
+
+    Args:
+        names: `none`, `all`, a name (of every predictor that has it) or `predictor:name`.
+        variants: by predictor and name; each with `horizons_s` and `goes_on`.
+
+    Raises:
+        AspEnvError: no predictor has it.
+    """
+    known = sorted({name for of in variants.values() for name in of})
+    chosen = []
+    for given in names:
+        if given == "none":
+            continue
+        predictor, _, name = given.rpartition(":")
+        found = [
+            Ablation(
+                predictor=each,
+                name=variant,
+                horizons_s=tuple(of[variant].horizons_s),
+                goes_on=of[variant].goes_on,
+            )
+            for each, of in variants.items()
+            for variant in of
+            if name in ("all", variant) and predictor in ("", each)
+        ]
+        if not found:
+            raise unknown_name("ablation", given, ["none", "all", *known])
+        chosen += [each for each in found if each not in chosen]
+    return chosen
+
+
+def plan_cells(
+    *,
+    sites: Sequence[str],
+    entrants: Sequence[Entrant],
+    views: Sequence[str],
+    horizons_s: Sequence[float],
+    seeds: Sequence[int],
+    ablations: Sequence[Ablation] = (),
+    ablation_view: str = "",
+) -> list[Cell]:
+    """All cells, in the order in which they are best run: a whole table for one seed, then more.
+
+    A cell stands behind the one that it starts from, even if nobody asked for that one.
+    Ablations are of the first site and one view.
+    """
+    cells: list[Cell] = []
+    histories = ["", CAUSAL] if any(each.name == CAUSAL for each in ablations) else [""]
+    for site, horizon_s, predictor, variant in product(sites, horizons_s, PHYSICAL, histories):
+        _add(cells, Cell(site=site, predictor=predictor, horizon_s=horizon_s, variant=variant))
+    for seed, site, horizon_s in product(seeds, sites, sorted(horizons_s)):
+        for view, entrant in product(views, entrants):
+            _add(cells, _base(site, view, entrant, horizon_s, seed))
+    for seed, ablation in product(seeds, ablations):
+        for horizon_s in sorted(set(horizons_s) & set(ablation.horizons_s)):
+            _add(cells, _changed(sites[0], ablation_view, ablation, horizon_s, seed))
+    return cells
+
+
+def _base(site: str, view: str, entrant: Entrant, horizon_s: float, seed: int) -> Cell:
+    start = _base(site, view, entrant, SEGMENT_S, seed) if horizon_s > SEGMENT_S else None
+    return Cell(
+        site=site,
+        predictor=entrant.predictor,
+        preset=entrant.preset,
+        view=view,
+        horizon_s=horizon_s,
+        seed=seed,
+        start=start,
+    )
+
+
+def _changed(site: str, view: str, ablation: Ablation, horizon_s: float, seed: int) -> Cell:
+    start = None
+    if horizon_s > SEGMENT_S and ablation.goes_on:
+        if SEGMENT_S in ablation.horizons_s:
+            start = _changed(site, view, ablation, SEGMENT_S, seed)
+        else:
+            start = _base(site, view, Entrant(predictor=ablation.predictor), SEGMENT_S, seed)
+    return Cell(
+        site=site,
+        predictor=ablation.predictor,
+        view=view,
+        variant=ablation.name,
+        horizon_s=horizon_s,
+        seed=seed,
+        start=start,
+    )
+
+
+def _add(cells: list[Cell], cell: Cell) -> None:
+    if cell.start is not None:
+        _add(cells, cell.start)
+    if cell not in cells:
+        cells.append(cell)
+
+
+def site_names(data: Sequence[str]) -> list[str]:
+    """A name for each DATA: its folder's, fit for a path.
+
+    Raises:
+        AspEnvError: two have the same.
+    """
+    names = [each.rstrip("/").rpartition("/")[2].replace(":", "-") for each in data]
+    for name in names:
+        if names.count(name) > 1 or not name.strip("."):
+            raise AspEnvError(f"DATA: {name!r} names {names.count(name)} sites; one each is needed")
+    return names

@@ -1,0 +1,177 @@
+"""One cell in a process of its own: `python -m asp_env.evaluation.paper_table.worker JOB`.
+
+JOB is JSON. The process ends when its standard input does, so that it never outlives the command
+that started it and two never train the same run.
+"""
+
+import dataclasses
+import hashlib
+import json
+import os
+import sys
+import threading
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Literal
+
+from asp_env import registry
+from asp_env.data.causal import causal_histories
+from asp_env.data.clock import DEFAULT_DT_S, ticks
+from asp_env.data.predictor import load_predictor
+from asp_env.data.source import open_data
+from asp_env.errors import AspEnvError
+from asp_env.evaluation.paper_table.errors import judge_snippets, snippets_to_judge, stamp_of
+
+FINISHED = "config.json"
+"""A run that has it is finished."""
+
+FAILED, ABANDONED = 2, 3
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Judging:
+    """What a predictor is judged on, and where its errors go."""
+
+    predictor: str
+    """The name that it is loaded by, less its run."""
+    run: str
+    """Its run; empty for one that learns nothing."""
+    data: str
+    part: Literal["test", "all"]
+    horizon_s: float
+    history: Literal["recorded", "causal"] = "recorded"
+    """For one that learns nothing; the others have what they were trained on."""
+    per_recording: int | None = None
+    errors: str
+    """Path of its errors, less the suffix."""
+    data_hash: str
+    chainings: tuple[str, ...] = ()
+    """Ways to chain segments that are judged besides its own, if it chains any."""
+
+    @property
+    def stamp(self) -> str:
+        """A hash of everything that decides the errors, the finished run included."""
+        fields = dataclasses.asdict(self)
+        content = {k: v for k, v in fields.items() if k not in ("data", "run", "errors")}
+        text = json.dumps(content, sort_keys=True).encode()
+        if self.run:
+            text += (Path(self.run) / FINISHED).read_bytes()
+        return hashlib.sha256(text).hexdigest()
+
+    @property
+    def done(self) -> bool:
+        """Whether the errors are there already."""
+        if self.run and not (Path(self.run) / FINISHED).exists():
+            return False
+        return stamp_of(errors_path(self.errors)) == self.stamp
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Job:
+    """What one process does: train, if need be, then judge."""
+
+    train: dict[str, Any] | None
+    """Options of the command `train` that are no paths, and `out` and `start`."""
+    judging: Judging | None
+    """None for a run that others start from, and nobody asked for."""
+
+    @property
+    def trained(self) -> bool:
+        """Whether there is nothing to train."""
+        return self.train is None or (Path(self.train["out"]) / FINISHED).exists()
+
+    @property
+    def done(self) -> bool:
+        """Whether there is nothing to do."""
+        return self.trained and (self.judging is None or self.judging.done)
+
+    def dump(self) -> str:
+        """As JSON."""
+        return json.dumps(dataclasses.asdict(self))
+
+    @classmethod
+    def load(cls, text: str) -> "Job":
+        """From what `dump` gave."""
+        fields = json.loads(text)
+        judging = fields["judging"]
+        if judging is not None:
+            judging = Judging(**judging | {"chainings": tuple(judging["chainings"])})
+        return cls(train=fields["train"], judging=judging)
+
+    def run(self) -> None:
+        """Does what is not done yet.
+
+        Raises:
+            AspEnvError: the run or the data are bad.
+        """
+        if self.train is not None and not self.trained:
+            paths = {
+                name: Path(self.train[name])
+                for name in ("out", "start")
+                if self.train.get(name) is not None
+            }
+            registry.find("commands", "train")(**self.train | paths).run()
+        if self.judging is not None and not self.judging.done:
+            judge(self.judging)
+
+
+def errors_path(stem: str, chaining: str = "") -> Path:
+    """Where the errors of a cell lie, under a way to chain that is not its own."""
+    return Path(f"{stem}@{chaining}.npz" if chaining else f"{stem}.npz")
+
+
+def judge(judging: Judging) -> None:
+    """Judges a predictor and keeps its errors; those of its own chaining last, as a seal.
+
+    Raises:
+        AspEnvError: it cannot be loaded, or there is nothing to judge on.
+    """
+    name = f"{judging.predictor}:{judging.run}" if judging.run else judging.predictor
+    dt_s = DEFAULT_DT_S
+    horizon = ticks(judging.horizon_s, dt_s)
+    own = load_predictor(name, horizon=horizon, dt_s=dt_s)
+    predictors = {"": own}
+    if "chaining" in own.about:
+        for chaining in judging.chainings:
+            other = load_predictor(f"{name}@{chaining}", horizon=horizon, dt_s=dt_s)
+            predictors[chaining] = other
+    recordings = open_data(judging.data)
+    index = snippets_to_judge(
+        recordings,
+        horizon_s=judging.horizon_s,
+        dt_s=dt_s,
+        part=judging.part,
+        per_recording=judging.per_recording,
+    )
+    causal = own.about.get("history", judging.history) == "causal"
+    scenes = causal_histories(recordings) if causal else recordings
+    found = judge_snippets(
+        predictors, index, scenes=scenes, recorded=recordings, stamp=judging.stamp
+    )
+    for chaining in reversed(found):
+        found[chaining].save(errors_path(judging.errors, chaining))
+
+
+def main(argv: Sequence[str]) -> int:
+    """Runs a job; 2 with a line on stderr where the input is bad."""
+    (text,) = argv
+    threading.Thread(target=_watch_input, daemon=True).start()
+    try:
+        Job.load(text).run()
+    except AspEnvError as error:
+        sys.stderr.write(f"asp-env: {' '.join(str(error).split())}\n")
+        return FAILED
+    return 0
+
+
+def _watch_input() -> None:
+    """Ends the process, whatever it is at, when whoever started it is gone."""
+    # Of the descriptor itself: a lock of a buffer that is held here would spoil an orderly end.
+    while os.read(0, 1):
+        pass
+    os._exit(ABANDONED)
+
+
+if __name__ == "__main__":
+    sys.exit(main(sys.argv[1:]))

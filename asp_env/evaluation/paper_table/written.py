@@ -1,0 +1,146 @@
+"""What is written and printed of findings: long form, page, and tables in the paper's shape."""
+
+import io
+import os
+import tempfile
+from collections.abc import Iterator, Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+from rich.console import Console
+from rich.table import Table
+from rich.terminal_theme import DEFAULT_TERMINAL_THEME
+
+from asp_env.evaluation.output import Row, write_manifest, write_metrics
+from asp_env.evaluation.paper_table import printed
+from asp_env.evaluation.paper_table.cells import Cell
+from asp_env.evaluation.paper_table.errors import Errors
+from asp_env.evaluation.paper_table.results import SUBSETS, Findings, Key, Number, best_features
+from asp_env.evaluation.paper_table.sites import Site
+from asp_env.evaluation.paper_table.worker import Judging, errors_path
+from asp_env.metrics.open_loop import SELECTIONS
+
+REPORT, TEXT = "report.html", "table.txt"
+PAGE_WIDTH = 200
+
+PAGE = """<!DOCTYPE html>
+<html lang="en"><head><meta charset="UTF-8"><title>The paper's table</title>
+<style>{stylesheet} body {{ color: {foreground}; background: {background}; }}
+pre {{ font-family: ui-monospace, Menlo, Consolas, monospace; line-height: 1.25; }}</style></head>
+<body><h1>The table of Janjoš et al. (2021) on other data</h1><pre>{code}</pre></body></html>
+"""
+
+
+def read_findings(judged: Mapping[Cell, Judging]) -> Findings:
+    """What was kept of the cells that are finished."""
+    errors: dict[Key, dict[int, Errors]] = {}
+    features: dict[Key, list[dict[str, float]]] = {}
+    for cell, judging in judged.items():
+        if not judging.done:
+            continue
+        seed = -1 if cell.seed is None else cell.seed
+        for chaining in ("", *judging.chainings):
+            path = errors_path(judging.errors, chaining)
+            if path.exists():
+                errors.setdefault(Key.of(cell, chaining), {})[seed] = Errors.load(path)
+        if judging.run:
+            features.setdefault(Key.of(cell), []).append(best_features(Path(judging.run)))
+    return Findings(errors=errors, features=features)
+
+
+def tables(findings: Findings, sites: Sequence[Site], width: int) -> list[Table]:
+    """All tables, in the paper's shape where they fit, and site by site where they do not."""
+    places = {(key.site, key.horizon_s): key for key in findings.errors}
+    names = [site.name for site in sites]
+    columns = [places[place] for place in sorted(places, key=lambda p: (names.index(p[0]), p[1]))]
+    if not columns:
+        return []
+    if printed.width_for(len(columns)) <= width:
+        groups = [columns]
+    else:
+        groups = [[c for c in columns if c.site == name] for name in names]
+    found = []
+    for subset in SUBSETS:
+        for selection in SELECTIONS:
+            for group in filter(None, groups):
+                found.append(printed.main_table(findings, names, group, selection, subset))
+                found.append(printed.difference_table(findings, names, group, selection, subset))
+    for column in columns:
+        if any(key.variant and key.view and _same_place(key, column) for key in findings.errors):
+            found.append(printed.ablation_table(findings, column, SUBSETS[0]))
+    return found
+
+
+def _same_place(key: Key, column: Key) -> bool:
+    return (key.site, key.horizon_s) == (column.site, column.horizon_s)
+
+
+def rows(findings: Findings, sites: Mapping[str, Site], preset: str) -> list[Row]:
+    """The long form: means, deviations over seeds, differences, and what is known of features."""
+    found: list[Row] = []
+    for key in findings.errors:
+        site = sites[key.site]
+        who: dict[str, Any] = {
+            "data": site.judged_on,
+            "predictor": key.predictor,
+            "trained_on": site.data if key.view else "",
+            "view": key.view,
+            "preset": _preset(key, preset),
+            "chaining": key.chaining,
+            "horizon_s": key.horizon_s,
+        }
+        for number in findings.numbers(key):
+            found += _row(who, number)
+        for other in findings.references(key):
+            for number in findings.differences(key, other):
+                found += _row(who, number, f" less {other.predictor}")
+        base = findings.base(key)
+        if base is not None:
+            for number in findings.differences(key, base):
+                found += _row(who, number, " less the recipe")
+        for name, values in _features(findings, key).items():
+            value = sum(values) / len(values)
+            found.append(Row(**who, metric=name, value=value, n=len(values)))
+    return found
+
+
+def _row(who: Mapping[str, Any], number: Number, ending: str = "") -> Iterator[Row]:
+    estimate, metric = number.estimate, number.metric + ending
+    where = {**who, "selection": number.selection, "subset": number.subset, "n": estimate.n}
+    yield Row(**where, metric=metric, value=estimate.value, low=estimate.low, high=estimate.high)
+    if number.spread is not None:
+        yield Row(**where, metric=f"{metric}, deviation over seeds", value=number.spread)
+
+
+def _features(findings: Findings, key: Key) -> dict[str, list[float]]:
+    by_name: dict[str, list[float]] = {}
+    for seed in findings.features.get(key, ()):
+        for name, value in seed.items():
+            by_name.setdefault(name, []).append(value)
+    return by_name
+
+
+def _preset(key: Key, preset: str) -> str:
+    """As checkpoints call it: the recipe, and its change."""
+    if not key.view:
+        return key.variant
+    return "+".join(part for part in (key.preset or preset, key.variant) if part)
+
+
+def write(
+    out: Path, found: Sequence[Row], shown: Sequence[Table], manifest: Mapping[str, Any]
+) -> None:
+    """Replaces the results in the table's folder, each file whole."""
+    with tempfile.TemporaryDirectory(dir=out, prefix=".fresh") as aside:
+        folder = Path(aside)
+        write_metrics(folder, found)
+        write_manifest(folder, "table", **manifest)
+        page = Console(record=True, width=PAGE_WIDTH, file=io.StringIO())
+        for table in shown:
+            page.print(table, "")
+        text = page.export_text(clear=False)
+        (folder / TEXT).write_text(text, encoding="utf-8")
+        html = page.export_html(theme=DEFAULT_TERMINAL_THEME, code_format=PAGE)
+        (folder / REPORT).write_text(html, encoding="utf-8")
+        for path in list(folder.iterdir()):
+            os.replace(path, out / path.name)
