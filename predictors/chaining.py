@@ -73,5 +73,5 @@ def prune(chains: Chains, keep: int) -> Chains:
 
 def pick(chains: Chains, rows: Int[Tensor, "n k"]) -> Chains:
     """Some chains of each target."""
-    target = torch.arange(len(rows), device=rows.device)[:, None]
+    target = torch.arange(rows.shape[0], device=rows.device)[:, None]  # len() is fixed in an export
     return Chains(*(field[target, rows] for field in chains))
