@@ -91,9 +91,12 @@ class Table:
         with _claimed(self.out, self._fixed(list(sites.values()))):
             jobs = {cell: self._job(cell, sites[cell.site]) for cell in cells}
             campaign = Campaign(jobs, self.out, console)
-            if self.jobs:
-                campaign.run(self.jobs)
-            judged = {cell: job.judging for cell, job in jobs.items() if job.judging is not None}
+            campaign.run(self.jobs)
+            judged = {
+                cell: job.judging
+                for cell, job in jobs.items()
+                if job.judging is not None and cell not in campaign.failed
+            }
             findings = read_findings(judged)
             known = list(sites.values())
             write(
@@ -147,14 +150,24 @@ class Table:
                 ablation_view=self.ablation_view,
             )
             for cell in cells:
-                if cell.seed is not None:
-                    options = self._recipe(cell) | {"data": "", "out": Path()}
-                    train(**options).config_for(cell.horizon_s)
+                self._recipe(cell)
         except ModuleNotFoundError as error:
             raise MissingExtraError(str(error.name), "train", "training") from error
         return cells
 
-    def _recipe(self, cell: Cell) -> dict[str, Any]:
+    def _recipe(self, cell: Cell) -> dict[str, Any] | None:
+        """What the configuration of a cell's run must be, but for its data; None without one.
+
+        Raises:
+            AspEnvError: there is no such recipe.
+        """
+        if cell.seed is None:
+            return None
+        train = registry.find("commands", "train")
+        config = train(**self._options(cell), data="", out=Path()).config_for(cell.horizon_s)
+        return json.loads(json.dumps(asdict(config)))
+
+    def _options(self, cell: Cell) -> dict[str, Any]:
         """The options of `train` that are not about data and folders."""
         return {
             "predictor": cell.predictor,
@@ -174,11 +187,12 @@ class Table:
         if cell.seed is not None:
             start = None if cell.start is None else str(self.out / "runs" / cell.start.name)
             where = {"data": site.data, "validation": site.validation}
-            train = {**self._recipe(cell), **where, "out": str(run), "start": start}
+            train = {**self._options(cell), **where, "out": str(run), "start": start}
         if cell.horizon_s not in self.horizons:
-            return Job(train=train, judging=None)
+            return Job(train=train, judging=None, recipe=self._recipe(cell))
         return Job(
             train=train,
+            recipe=self._recipe(cell),
             judging=Judging(
                 predictor=cell.predictor,
                 run="" if train is None else str(run),

@@ -13,6 +13,7 @@ from typing import final
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
+from asp_env.errors import AspEnvError
 from asp_env.evaluation.paper_table.cells import Cell
 from asp_env.evaluation.paper_table.worker import Job
 
@@ -37,6 +38,10 @@ class Costs:
     def total_cpu_s(self) -> float:
         """Of all cells."""
         return sum(cell["cpu_s"] for cell in self._cells.values())
+
+    def cpu_s(self, name: str) -> float:
+        """Of one cell."""
+        return self._cells.get(name, {}).get("cpu_s", 0.0)
 
     def add(self, name: str, *, cpu_s: float, wall_s: float) -> None:
         """Adds a process that has ended, whatever became of it."""
@@ -83,13 +88,15 @@ class Campaign:
         return self._failed
 
     def run(self, processes: int) -> None:
-        """Runs what is not finished, so many processes at a time."""
+        """Runs what is not finished, so many processes at a time; with 0 nothing."""
         waiting = []
         for cell, job in self._jobs.items():
-            if job.done:
+            if self._fits(cell, job) and job.done:
                 self._done.add(cell)
-            else:
+            elif cell not in self._failed:
                 waiting.append(cell)
+        if not processes:
+            return
         columns = (
             TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(),
             TimeRemainingColumn(),
@@ -108,6 +115,14 @@ class Campaign:
                         time.sleep(POLL_S)
             finally:
                 self._stop()
+
+    def _fits(self, cell: Cell, job: Job) -> bool:
+        try:
+            job.check()
+        except AspEnvError as error:
+            self._failed[cell] = str(error)
+            self._tell(cell, len(self._jobs))
+        return cell not in self._failed
 
     def _start(self, waiting: Sequence[Cell], processes: int) -> list[Cell]:
         """Starts the first cells that can be; those that still wait."""
@@ -174,7 +189,9 @@ class Campaign:
             self._ended(cell, running, 0)
 
     def _tell(self, cell: Cell, left: int) -> None:
-        what = f"failed: {self._failed[cell]}" if cell in self._failed else "finished"
+        what = f"finished, {self._costs.cpu_s(cell.name):.0f} s of CPU time"
+        if cell in self._failed:
+            what = f"failed: {self._failed[cell]}"
         self._console.print(
             f"{cell.name}: {what} ({left} to go)", soft_wrap=True, highlight=False, markup=False
         )

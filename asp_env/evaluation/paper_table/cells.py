@@ -16,6 +16,9 @@ PHYSICAL = ("constant-velocity", "constant-turn-rate")
 CAUSAL = "causal"
 """The variant whose histories know nothing that came later; the physical ones have it too."""
 
+GIVEN = (CAUSAL, "no-trail", "long")
+"""Variants of what every predictor is given: compared with others of the same alone."""
+
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Cell:

@@ -1,6 +1,6 @@
 """The table in the paper's shape, the differences, and the ablations, for terminals and pages."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 
 from rich import box
 from rich.table import Table
@@ -11,6 +11,7 @@ from asp_env.evaluation.paper_table.paper import CAVEAT, DATA, PAPER, paper_numb
 from asp_env.evaluation.paper_table.results import (
     FEATURES,
     ORACLE,
+    Choice,
     Findings,
     Key,
     Number,
@@ -19,8 +20,9 @@ from asp_env.evaluation.paper_table.results import (
 
 SHOWN = ("MAE", "MSE", "FDE")
 MARK = "*"
-COLUMN_WIDTH = 25
-LABELS_WIDTH = 32
+SURE = f"{MARK} the interval excludes zero"
+COLUMN_WIDTH = 26
+LABEL_WIDTH = 28
 
 Line = tuple[str, str, str, str, str]
 """View, predictor, preset, variant, chaining: a line of the table over all its columns."""
@@ -28,11 +30,11 @@ Line = tuple[str, str, str, str, str]
 
 def width_for(columns: int) -> int:
     """Characters that a table of so many columns needs."""
-    return LABELS_WIDTH + columns * COLUMN_WIDTH
+    return LABEL_WIDTH + columns * COLUMN_WIDTH
 
 
 def main_table(
-    findings: Findings, sites: Sequence[str], columns: Sequence[Key], selection: str, subset: str
+    findings: Findings, sites: Sequence[str], columns: Sequence[Key], choice: Choice
 ) -> Table:
     """View and predictor by site and horizon: MAE / MSE / FDE, and the paper's below each.
 
@@ -40,96 +42,84 @@ def main_table(
         findings: what was measured.
         sites: all of them, in order: the first is set beside inD, the second beside rounD.
         columns: one key of each site and horizon that is shown.
-        selection: of modes.
-        subset: of snippets.
+        choice: selection of modes and subset of snippets.
     """
     table = _table(
-        f"{subset} targets, {selection}: MAE m / MSE m² / FDE m\n"
-        "mean over seeds; [95 % interval over recordings] and ± deviation over seeds of FDE"
+        f"{choice.subset} targets, {choice.selection}: MAE m / MSE m² / FDE m, mean over seeds\n"
+        "[95 % interval over recordings] and ± deviation over seeds of FDE"
     )
     table.caption = (
-        f"paper: Janjoš et al. 2021 on {' and '.join(DATA)}; {CAVEAT}; it does not say which mode"
-        f"\n{MARK} is handed the recorded future"
+        f"paper: Janjoš et al. 2021 on {' and '.join(DATA)}, which mode is not said;\n{CAVEAT}\n"
+        f"{MARK} is handed the recorded future"
     )
     _heads(table, sites, columns)
-    lines = _lines(findings, columns, lambda key: key.is_base)
-    for view, predictor in PAPER:
-        line = (view, predictor, "", "", "")
-        if line not in lines:
-            lines.append(line)
-    last = ""
-    for line in sorted(lines, key=lambda line: _view_rank(line[0], lines)):
-        cells = []
-        for column in columns:
-            cell = _numbers(findings, _key(line, column), selection, subset)
-            paper = paper_numbers(line[0], line[1], sites.index(column.site), column.horizon_s)
-            if paper is not None and not any(line[2:]):
-                said = " / ".join(f"{value:.2f}" for value in paper)
-                cell.append(f"{chr(10) if cell else ''}paper {said}", style="dim")
-            cells.append(cell)
-        table.add_row("" if line[0] == last else line[0], _name(line), *cells)
-        last = line[0]
+    lines = _lines(findings, columns, lambda key: not key.variant)
+    lines += [line for each in PAPER if (line := (*each, "", "", "")) not in lines]
+    for view, members in _by_view(lines).items():
+        _section(table, view)
+        for line in members:
+            cells = []
+            for column in columns:
+                cell = _means(findings.numbers(_key(line, column), choice))
+                paper = paper_numbers(line[0], line[1], sites.index(column.site), column.horizon_s)
+                if paper is not None and not any(line[2:]):
+                    said = " / ".join(f"{value:.2f}" for value in paper)
+                    cell.append(f"{chr(10) if cell else ''}paper {said}", style="dim")
+                cells.append(cell)
+            table.add_row(_name(line), *cells)
     return table
 
 
 def difference_table(
-    findings: Findings, sites: Sequence[str], columns: Sequence[Key], selection: str, subset: str
+    findings: Findings, sites: Sequence[str], columns: Sequence[Key], choice: Choice
 ) -> Table:
     """View, predictor and whom it is compared with by site and horizon."""
     table = _table(
-        f"{subset} targets, {selection}: less another's MAE m / MSE m² / FDE m\n"
+        f"{choice.subset} targets, {choice.selection}: what is between MAE m / MSE m² / FDE m\n"
         "paired over snippets and seeds; [95 % interval over recordings] of FDE"
     )
-    table.caption = f"{MARK} the interval excludes zero"
+    table.caption = SURE
     _heads(table, sites, columns)
-    for line in _lines(findings, columns, lambda key: key.is_base):
-        names = {
-            reference.predictor
-            for column in columns
-            if _key(line, column) in findings.errors
-            for reference in findings.references(_key(line, column))
-        }
-        for name in sorted(names):
-            cells = []
-            for column in columns:
-                key = _key(line, column)
-                found = _reference(findings, key, name)
-                cells.append(Text() if found is None else _difference(findings, key, found,
-                             selection, subset))  # fmt: skip
-            table.add_row(line[0], f"{_name(line)} less {_upper(name)}", *cells)
+    for view, members in _by_view(_lines(findings, columns, lambda k: not k.variant)).items():
+        _section(table, view)
+        for line in members:
+            keys = [_key(line, column) for column in columns]
+            others = [{each.predictor: each for each in findings.references(key)} for key in keys]
+            for name in dict.fromkeys(name for each in others for name in each):
+                cells = [
+                    _less(findings.differences(key, each[name], choice)) if name in each else ""
+                    for key, each in zip(keys, others, strict=True)
+                ]
+                table.add_row(f"{_name(line)}\n  less {_upper(name)}", *cells)
     return table
 
 
-def ablation_table(findings: Findings, column: Key, subset: str) -> Table:
+def ablation_table(findings: Findings, column: Key, choice: Choice) -> Table:
     """Predictor and change: what it makes of the line without it, and of the features."""
     table = _table(
-        f"{column.site}, {column.horizon_s:g} s, {subset} targets: a change less the recipe "
-        "without it\nMAE m / MSE m² / FDE m, paired over snippets and seeds; [95 % interval] of FDE"
+        f"{column.site}, {column.horizon_s:g} s, {choice.subset} targets, {choice.selection}\n"
+        "a change less the recipe without it: MAE m / MSE m² / FDE m\n"
+        "paired over snippets and seeds; [95 % interval over recordings] of FDE"
     )
-    table.caption = (
-        f"{MARK} the interval excludes zero; on validation: R² of ẑ, sd and rank of z"
-    )
-    for heading in ("view", "predictor", "most probable", "best of 3", "FDE less DKM's"):
-        table.add_column(heading)
-    for heading in ("R²", "sd", "rank"):
-        table.add_column(heading, justify="right")
-    for line in _lines(findings, [column], lambda key: key.view != ""):
-        key = _key(line, column)
-        base = findings.base(key)
-        features = _features(findings, key)
-        if base is None and not (any(features) and key.is_base):
-            continue
-        cells = [
-            Text("the recipe") if base is None else _difference(findings, key, base, each, subset)
-            for each in ("most-probable", "best-of-3")
-        ]
-        dkm = _reference(findings, key, "dkm")
-        less = (
-            Text()
-            if dkm is None
-            else _difference(findings, key, dkm, "most-probable", subset, shown=("FDE",))
-        )
-        table.add_row(line[0], _name(line), *cells, less, *features)
+    table.caption = f"{SURE}\nR² of ẑ, deviation and effective rank of z on validation"
+    table.add_column("", no_wrap=True)
+    for heading in ("change", "FDE less DKM's"):
+        table.add_column(heading, no_wrap=True)
+    for heading in ("R²", "dev.", "rank"):
+        table.add_column(heading, justify="right", no_wrap=True)
+    lines = _lines(findings, [column], lambda key: key.view != "" and not key.chaining)
+    changed = {(line[0], line[1]) for line in lines if line[3]}
+    for view, members in _by_view([each for each in lines if each[:2] in changed]).items():
+        _section(table, view)
+        for line in sorted(members, key=lambda line: [each[1] for each in members].index(line[1])):
+            key = _key(line, column)
+            base = findings.base(key)
+            change = Text("the recipe")
+            if base is not None:
+                change = _less(findings.differences(key, base, choice))
+            dkm = next((k for k in findings.references(key) if k.predictor == "dkm"), None)
+            less = _less(findings.differences(key, dkm, choice), ("FDE",)) if dkm else Text()
+            table.add_row(_name(line), change, less, *_features(findings, key))
     return table
 
 
@@ -138,12 +128,17 @@ def _table(title: str) -> Table:
 
 
 def _heads(table: Table, sites: Sequence[str], columns: Sequence[Key]) -> None:
-    table.add_column("view")
-    table.add_column("predictor")
+    table.add_column("")
     for column in columns:
         site = sites.index(column.site)
-        beside = f"\npaper: {DATA[site]}" if site < len(DATA) else ""
-        table.add_column(f"{column.site}, {column.horizon_s:g} s{beside}", no_wrap=False)
+        beside = f"\nbeside {DATA[site]}" if site < len(DATA) else ""
+        heading = f"{column.site}\n{column.horizon_s:g} s{beside}"
+        table.add_column(heading, min_width=COLUMN_WIDTH - 1)
+
+
+def _section(table: Table, view: str) -> None:
+    if view:
+        table.add_row(Text(view, style="bold"))
 
 
 def _lines(findings: Findings, columns: Sequence[Key], wanted: Callable[[Key], bool]) -> list[Line]:
@@ -151,14 +146,17 @@ def _lines(findings: Findings, columns: Sequence[Key], wanted: Callable[[Key], b
     places = {(column.site, column.horizon_s) for column in columns}
     found = (
         (key.view, key.predictor, key.preset, key.variant, key.chaining)
-        for key in findings.errors
+        for key in findings.sums
         if (key.site, key.horizon_s) in places and wanted(key)
     )
     return list(dict.fromkeys(found))
 
 
-def _view_rank(view: str, lines: Sequence[Line]) -> int:
-    return [line[0] for line in lines].index(view)
+def _by_view(lines: Sequence[Line]) -> dict[str, list[Line]]:
+    found: dict[str, list[Line]] = {}
+    for line in lines:
+        found.setdefault(line[0], []).append(line)
+    return found
 
 
 def _key(line: Line, column: Key) -> Key:
@@ -178,38 +176,16 @@ def _upper(predictor: str) -> str:
     return predictor if predictor.startswith("constant") else predictor.upper()
 
 
-def _pick(numbers: Sequence[Number], selection: str, subset: str) -> dict[str, Number]:
-    return {
-        number.metric: number
-        for number in numbers
-        if (number.selection, number.subset) == (selection, subset)
-    }
-
-
-def _numbers(findings: Findings, key: Key, selection: str, subset: str) -> Text:
-    if key not in findings.errors:
-        return Text()
-    found = _pick([*findings.numbers(key)], selection, subset)
+def _means(found: Mapping[str, Number]) -> Text:
     if not found:
         return Text()
     text = Text(" / ".join(f"{found[metric].estimate.value:.2f}" for metric in SHOWN))
     spread = found["FDE"].spread
     about = _interval(found["FDE"].estimate) + ("" if spread is None else f" ±{spread:.2f}")
-    if about:
-        text.append(f"\n{about.strip()}", style="dim")
-    return text
+    return text.append(f"\n{about.strip()}", style="dim") if about else text
 
 
-def _difference(
-    findings: Findings,
-    key: Key,
-    other: Key,
-    selection: str,
-    subset: str,
-    *,
-    shown: Sequence[str] = SHOWN,
-) -> Text:
-    found = _pick([*findings.differences(key, other)], selection, subset)
+def _less(found: Mapping[str, Number], shown: Sequence[str] = SHOWN) -> Text:
     if not found:
         return Text()
     text = Text()
@@ -220,21 +196,13 @@ def _difference(
         text.append(" / " if number else "")
         text.append(f"{estimate.value:+.2f}{MARK if sure else ''}", style=style)
     interval = _interval(found["FDE"].estimate)
-    if interval:
-        text.append(f"\n{interval}", style="dim")
-    return text
+    return text.append(f"\n{interval}", style="dim") if interval else text
 
 
 def _interval(estimate: Estimate) -> str:
     if estimate.low is None or estimate.high is None:
         return ""
     return f"[{estimate.low:.2f}, {estimate.high:.2f}]"
-
-
-def _reference(findings: Findings, key: Key, name: str) -> Key | None:
-    if key not in findings.errors:
-        return None
-    return next((each for each in findings.references(key) if each.predictor == name), None)
 
 
 def _features(findings: Findings, key: Key) -> list[str]:

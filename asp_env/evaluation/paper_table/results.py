@@ -1,19 +1,22 @@
 """From kept errors to numbers: means, differences in pairs, and what training said of features."""
 
 import csv
+import dataclasses
+import hashlib
 import json
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
+from itertools import product
 from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
-from jaxtyping import Bool, Float
+from jaxtyping import Float, Int
 
 from asp_env.errors import AspEnvError
 from asp_env.evaluation import intervals
 from asp_env.evaluation.intervals import Estimate
-from asp_env.evaluation.paper_table.cells import Cell
+from asp_env.evaluation.paper_table.cells import CAUSAL, GIVEN, Cell
 from asp_env.evaluation.paper_table.errors import METRICS, Errors
 from asp_env.metrics.open_loop import SELECTIONS
 
@@ -26,6 +29,19 @@ FEATURES = ("feature R2", "feature standard deviation", "feature effective rank"
 
 ORACLE = "oracle"
 """The chaining that is handed the recorded future."""
+
+NO_SEED = -1
+"""Stands for the seed of what learns nothing."""
+
+
+class Choice(NamedTuple):
+    """What a table speaks of."""
+
+    selection: str
+    subset: str
+
+
+CHOICES = tuple(Choice(each, subset) for subset, each in product(SUBSETS, SELECTIONS))
 
 
 class Key(NamedTuple):
@@ -53,31 +69,57 @@ class Key(NamedTuple):
             horizon_s=cell.horizon_s,
         )
 
-    @property
-    def is_base(self) -> bool:
-        """Whether nothing was changed of the recipe."""
-        return not self.variant
-
 
 class Number(NamedTuple):
     """What a line says of one metric."""
 
-    selection: str
-    subset: str
-    metric: str
     estimate: Estimate
     spread: float | None
     """Standard deviation over seeds; None of one seed."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
+class Sums:
+    """Errors summed over the snippets of each of R recordings; every mean is made of them."""
+
+    errors: Float[np.ndarray, "r subsets selections metrics"]
+    counts: Int[np.ndarray, "r subsets"]
+    digest: str
+    """Of which snippets they are."""
+
+    @classmethod
+    def of(cls, errors: Errors) -> "Sums":
+        """Of all snippets of one run."""
+        _, group = np.unique(errors.recording, return_inverse=True)
+        recordings = int(group.max()) + 1
+        sums = np.zeros((recordings, len(SUBSETS), len(SELECTIONS), len(METRICS)))
+        counts = np.zeros((recordings, len(SUBSETS)), dtype=np.int64)
+        for number, subset in enumerate(SUBSETS):
+            keep = errors.moving if subset == "moving" else np.ones_like(errors.moving)
+            values = np.moveaxis(errors.values, -1, 0)[keep].astype(np.float64)
+            np.add.at(sums[:, number], group[keep], values)
+            counts[:, number] = np.bincount(group[keep], minlength=recordings)
+        content = np.stack([errors.recording, errors.track, errors.tick, errors.moving])
+        digest = hashlib.sha256(content.astype(np.int64).tobytes()).hexdigest()
+        return cls(errors=sums, counts=counts, digest=digest)
+
+    def chosen(self, choice: Choice) -> Float[np.ndarray, "r metrics"]:
+        """Of one selection and subset."""
+        return self.errors[:, SUBSETS.index(choice.subset), [*SELECTIONS].index(choice.selection)]
+
+    def counted(self, choice: Choice) -> Int[np.ndarray, " r"]:
+        """How many snippets of each recording a choice has."""
+        return self.counts[:, SUBSETS.index(choice.subset)]
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
 class Findings:
     """All that was kept of a table's cells."""
 
-    errors: Mapping[Key, Mapping[int, Errors]] = field(default_factory=dict)
-    """By seed; -1 for what learns nothing."""
+    sums: Mapping[Key, Mapping[int, Sums]] = field(default_factory=dict)
+    """By seed."""
     features: Mapping[Key, Sequence[Mapping[str, float]]] = field(default_factory=dict)
-    """Of each seed, what its best epoch said of features."""
+    """Of each seed, what its best epoch said of features; nothing where none are predicted."""
 
     def __post_init__(self) -> None:
         """Checks that what is compared in pairs makes pairs.
@@ -85,86 +127,87 @@ class Findings:
         Raises:
             AspEnvError: two lines of one site and horizon speak of different snippets.
         """
-        first: dict[tuple[str, float], Errors] = {}
-        for key, by_seed in self.errors.items():
+        first: dict[tuple[str, float], str] = {}
+        for key, by_seed in self.sums.items():
             for each in by_seed.values():
-                other = first.setdefault((key.site, key.horizon_s), each)
-                if not each.same_snippets(other):
+                if each.digest != first.setdefault((key.site, key.horizon_s), each.digest):
                     raise AspEnvError(
                         f"errors at {key.site} for {key.horizon_s:g} s are of different snippets: "
                         "remove the folder errors and start again"
                     )
 
-    def numbers(self, key: Key) -> Iterator[Number]:
-        """Means over snippets of errors that were first averaged over seeds, snippet by snippet."""
-        by_seed = self.errors[key]
-        for selection, subset, metric, keep, groups in self._choices(key):
-            values = np.stack([each.of(selection, metric)[keep] for each in by_seed.values()])
-            of_seeds = values.mean(axis=1, dtype=np.float64)
-            yield Number(
-                selection=selection,
-                subset=subset,
-                metric=metric,
-                estimate=intervals.mean(_over_seeds(values), groups),
-                spread=float(of_seeds.std(ddof=1)) if len(of_seeds) > 1 else None,
-            )
+    def numbers(self, key: Key, choice: Choice) -> dict[str, Number]:
+        """A line's means by metric; nothing where it or the subset is empty.
 
-    def differences(self, key: Key, other: Key) -> Iterator[Number]:
-        """A line's means less another's, paired; over the seeds that both have.
+        Errors are averaged over seeds first, snippet by snippet; then over snippets.
+        """
+        return _numbers(list(self.sums.get(key, {}).values()), None, choice)
+
+    def differences(self, key: Key, other: Key, choice: Choice) -> dict[str, Number]:
+        """A line's means less another's, paired, over the seeds that both have.
 
         What learns nothing is compared with every seed. Nothing if there is no seed in common.
         """
-        mine, theirs = self.errors[key], self.errors[other]
-        if -1 not in mine and -1 not in theirs:
+        mine, theirs = self.sums.get(key, {}), self.sums.get(other, {})
+        if NO_SEED not in mine and NO_SEED not in theirs:
             both = sorted(set(mine) & set(theirs))
             mine = {seed: mine[seed] for seed in both}
             theirs = {seed: theirs[seed] for seed in both}
-        if not mine or not theirs:
-            return
-        for selection, subset, metric, keep, groups in self._choices(key):
-            values, others = (
-                np.stack([each.of(selection, metric)[keep] for each in side.values()])
-                for side in (mine, theirs)
-            )
-            paired = len(values) == len(others) > 1
-            of_seeds = (values - others).mean(axis=1, dtype=np.float64) if paired else None
-            yield Number(
-                selection=selection,
-                subset=subset,
-                metric=metric,
-                estimate=intervals.mean(_over_seeds(values) - _over_seeds(others), groups),
-                spread=None if of_seeds is None else float(of_seeds.std(ddof=1)),
-            )
+        return _numbers(list(mine.values()), list(theirs.values()), choice)
 
     def references(self, key: Key) -> Iterator[Key]:
-        """The lines that one is compared with: those of `REFERENCES`, with the same change."""
+        """The lines that one is compared with.
+
+        Those of `REFERENCES` with the same change; else without, but where the change is one of
+        what everybody is given.
+        """
+        places = [(key.view, key.variant), ("", key.variant)]
+        if key.variant not in GIVEN:
+            places.append((key.view, ""))
+        if key.variant != CAUSAL:
+            places.append(("", ""))
         for name in REFERENCES:
-            for view in dict.fromkeys(("", key.view)):
-                reference = key._replace(predictor=name, preset="", view=view, chaining="")
-                if reference != key and reference in self.errors:
-                    yield reference
+            for view, variant in dict.fromkeys(places):
+                other = key._replace(
+                    predictor=name, preset="", view=view, variant=variant, chaining=""
+                )
+                if other in self.sums and other != key:
+                    yield other
+                    break
 
     def base(self, key: Key) -> Key | None:
         """The line without the change."""
         base = key._replace(variant="")
-        return base if base in self.errors and not key.is_base else None
-
-    def _choices(
-        self, key: Key
-    ) -> Iterator[
-        tuple[str, str, str, Bool[np.ndarray, " n"], Float[np.ndarray, " m"] | np.ndarray]
-    ]:
-        first = next(iter(self.errors[key].values()))
-        for subset in SUBSETS:
-            keep = first.moving if subset == "moving" else np.ones(len(first.moving), dtype=bool)
-            if keep.any():
-                for selection in SELECTIONS:
-                    for metric in METRICS:
-                        yield selection, subset, metric, keep, first.recording[keep]
+        return base if base in self.sums and key.variant else None
 
 
-def _over_seeds(values: Float[np.ndarray, "seeds n"]) -> Float[np.ndarray, " n"]:
-    return values.mean(axis=0, dtype=np.float64)
+def _numbers(
+    sides: Sequence[Sums], others: Sequence[Sums] | None, choice: Choice
+) -> dict[str, Number]:
+    """Means of one side, or of one less the other, by metric."""
+    if not sides or (others is not None and not others):
+        return {}
+    counts = sides[0].counted(choice)
+    total = int(counts.sum())
+    if not total:
+        return {}
+    of_seeds = np.stack([each.chosen(choice) for each in sides])
+    sums = of_seeds.mean(axis=0)
+    if others is not None:
+        of_others = np.stack([each.chosen(choice) for each in others])
+        sums = sums - of_others.mean(axis=0)
+        of_seeds = of_seeds - of_others  # one line of what learns nothing stands for every seed
+    seeds = of_seeds.sum(axis=1) / total
+    there = counts > 0
+    groups = np.arange(int(there.sum()))
+    found = {}
+    for column, metric in enumerate(METRICS):
+        estimate = intervals.ratio(sums[there, column], counts[there].astype(float), groups)
+        found[metric] = Number(
+            estimate=dataclasses.replace(estimate, n=total),
+            spread=float(seeds[:, column].std(ddof=1)) if len(seeds) > 1 else None,
+        )
+    return found
 
 
 def excludes_zero(estimate: Estimate) -> bool:

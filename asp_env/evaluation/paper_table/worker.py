@@ -75,6 +75,24 @@ class Job:
     """Options of the command `train` that are no paths, and `out` and `start`."""
     judging: Judging | None
     """None for a run that others start from, and nobody asked for."""
+    recipe: dict[str, Any] | None = None
+    """What the run's configuration must be, as far as both name its fields."""
+
+    def check(self) -> None:
+        """Looks whether a finished run is the one that was asked for.
+
+        Raises:
+            AspEnvError: it was trained by another recipe.
+        """
+        if self.train is None or self.recipe is None or not self.trained:
+            return
+        out = Path(self.train["out"])
+        found = json.loads((out / FINISHED).read_text())["provenance"]["config"]
+        if other := _unlike(found, self.recipe):
+            raise AspEnvError(
+                f"{out} was trained with other {', '.join(other)} than the recipe has now: "
+                "delete it to train it again, or choose another --out"
+            )
 
     @property
     def trained(self) -> bool:
@@ -97,7 +115,7 @@ class Job:
         judging = fields["judging"]
         if judging is not None:
             judging = Judging(**judging | {"chainings": tuple(judging["chainings"])})
-        return cls(train=fields["train"], judging=judging)
+        return cls(train=fields["train"], judging=judging, recipe=fields["recipe"])
 
     def run(self) -> None:
         """Does what is not done yet.
@@ -105,6 +123,7 @@ class Job:
         Raises:
             AspEnvError: the run or the data are bad.
         """
+        self.check()
         if self.train is not None and not self.trained:
             paths = {
                 name: Path(self.train[name])
@@ -114,6 +133,17 @@ class Job:
             registry.find("commands", "train")(**self.train | paths).run()
         if self.judging is not None and not self.judging.done:
             judge(self.judging)
+
+
+def _unlike(found: dict[str, Any], expected: dict[str, Any]) -> list[str]:
+    """Fields that both have and that differ; not where the data were read from."""
+    names = []
+    for name in sorted((set(found) & set(expected)) - {"validation"}):
+        if isinstance(expected[name], dict) and isinstance(found[name], dict):
+            names += _unlike(found[name], expected[name])
+        elif found[name] != expected[name]:
+            names.append(name)
+    return names
 
 
 def errors_path(stem: str, chaining: str = "") -> Path:

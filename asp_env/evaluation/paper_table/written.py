@@ -15,10 +15,18 @@ from asp_env.evaluation.output import Row, write_manifest, write_metrics
 from asp_env.evaluation.paper_table import printed
 from asp_env.evaluation.paper_table.cells import Cell
 from asp_env.evaluation.paper_table.errors import Errors
-from asp_env.evaluation.paper_table.results import SUBSETS, Findings, Key, Number, best_features
+from asp_env.evaluation.paper_table.results import (
+    CHOICES,
+    NO_SEED,
+    Choice,
+    Findings,
+    Key,
+    Number,
+    Sums,
+    best_features,
+)
 from asp_env.evaluation.paper_table.sites import Site
 from asp_env.evaluation.paper_table.worker import Judging, errors_path
-from asp_env.metrics.open_loop import SELECTIONS
 
 REPORT, TEXT = "report.html", "table.txt"
 PAGE_WIDTH = 200
@@ -33,24 +41,24 @@ pre {{ font-family: ui-monospace, Menlo, Consolas, monospace; line-height: 1.25;
 
 def read_findings(judged: Mapping[Cell, Judging]) -> Findings:
     """What was kept of the cells that are finished."""
-    errors: dict[Key, dict[int, Errors]] = {}
+    sums: dict[Key, dict[int, Sums]] = {}
     features: dict[Key, list[dict[str, float]]] = {}
     for cell, judging in judged.items():
         if not judging.done:
             continue
-        seed = -1 if cell.seed is None else cell.seed
+        seed = NO_SEED if cell.seed is None else cell.seed
         for chaining in ("", *judging.chainings):
             path = errors_path(judging.errors, chaining)
             if path.exists():
-                errors.setdefault(Key.of(cell, chaining), {})[seed] = Errors.load(path)
+                sums.setdefault(Key.of(cell, chaining), {})[seed] = Sums.of(Errors.load(path))
         if judging.run:
             features.setdefault(Key.of(cell), []).append(best_features(Path(judging.run)))
-    return Findings(errors=errors, features=features)
+    return Findings(sums=sums, features=features)
 
 
 def tables(findings: Findings, sites: Sequence[Site], width: int) -> list[Table]:
     """All tables, in the paper's shape where they fit, and site by site where they do not."""
-    places = {(key.site, key.horizon_s): key for key in findings.errors}
+    places = {(key.site, key.horizon_s): key for key in findings.sums}
     names = [site.name for site in sites]
     columns = [places[place] for place in sorted(places, key=lambda p: (names.index(p[0]), p[1]))]
     if not columns:
@@ -60,14 +68,14 @@ def tables(findings: Findings, sites: Sequence[Site], width: int) -> list[Table]
     else:
         groups = [[c for c in columns if c.site == name] for name in names]
     found = []
-    for subset in SUBSETS:
-        for selection in SELECTIONS:
-            for group in filter(None, groups):
-                found.append(printed.main_table(findings, names, group, selection, subset))
-                found.append(printed.difference_table(findings, names, group, selection, subset))
+    for choice in CHOICES:
+        for group in filter(None, groups):
+            found.append(printed.main_table(findings, names, group, choice))
+            found.append(printed.difference_table(findings, names, group, choice))
     for column in columns:
-        if any(key.variant and key.view and _same_place(key, column) for key in findings.errors):
-            found.append(printed.ablation_table(findings, column, SUBSETS[0]))
+        if any(key.variant and key.view and _same_place(key, column) for key in findings.sums):
+            moving = (choice for choice in CHOICES if choice.subset == "moving")
+            found += [printed.ablation_table(findings, column, choice) for choice in moving]
     return found
 
 
@@ -78,7 +86,7 @@ def _same_place(key: Key, column: Key) -> bool:
 def rows(findings: Findings, sites: Mapping[str, Site], preset: str) -> list[Row]:
     """The long form: means, deviations over seeds, differences, and what is known of features."""
     found: list[Row] = []
-    for key in findings.errors:
+    for key in findings.sums:
         site = sites[key.site]
         who: dict[str, Any] = {
             "data": site.judged_on,
@@ -89,27 +97,29 @@ def rows(findings: Findings, sites: Mapping[str, Site], preset: str) -> list[Row
             "chaining": key.chaining,
             "horizon_s": key.horizon_s,
         }
-        for number in findings.numbers(key):
-            found += _row(who, number)
-        for other in findings.references(key):
-            for number in findings.differences(key, other):
-                found += _row(who, number, f" less {other.predictor}")
         base = findings.base(key)
-        if base is not None:
-            for number in findings.differences(key, base):
-                found += _row(who, number, " less the recipe")
+        others = [(f" less {each.predictor}", each) for each in findings.references(key)]
+        others += [] if base is None else [(" less the recipe", base)]
+        for choice in CHOICES:
+            found += _rows(who, choice, findings.numbers(key, choice))
+            for ending, other in others:
+                found += _rows(who, choice, findings.differences(key, other, choice), ending)
         for name, values in _features(findings, key).items():
             value = sum(values) / len(values)
             found.append(Row(**who, metric=name, value=value, n=len(values)))
     return found
 
 
-def _row(who: Mapping[str, Any], number: Number, ending: str = "") -> Iterator[Row]:
-    estimate, metric = number.estimate, number.metric + ending
-    where = {**who, "selection": number.selection, "subset": number.subset, "n": estimate.n}
-    yield Row(**where, metric=metric, value=estimate.value, low=estimate.low, high=estimate.high)
-    if number.spread is not None:
-        yield Row(**where, metric=f"{metric}, deviation over seeds", value=number.spread)
+def _rows(
+    who: Mapping[str, Any], choice: Choice, numbers: Mapping[str, Number], ending: str = ""
+) -> Iterator[Row]:
+    for metric, (estimate, spread) in numbers.items():
+        name = metric + ending
+        where = {**who, **choice._asdict(), "n": estimate.n}
+        low, high = estimate.low, estimate.high
+        yield Row(**where, metric=name, value=estimate.value, low=low, high=high)
+        if spread is not None:
+            yield Row(**where, metric=f"{name}, deviation over seeds", value=spread)
 
 
 def _features(findings: Findings, key: Key) -> dict[str, list[float]]:
