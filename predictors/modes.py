@@ -4,11 +4,11 @@ import math
 from typing import Literal
 
 import torch
-from jaxtyping import Float, Int
+from jaxtyping import Bool, Float, Int
 from torch import Tensor
 from torch.nn import functional
 
-Assignment = Literal["angle", "distance"]
+Assignment = Literal["angle", "distance", "angle-random"]
 Classification = Literal["cross-entropy", "softmax"]
 
 MAX_ANGLE_RAD = math.radians(5.0)
@@ -29,19 +29,46 @@ def best_mode(
 
     `distance` takes the mode with the lowest mean L2 distance. `angle` (Cui et al. 2019, and the
     paper) takes it among the modes whose last point lies within 5° of the label's last point, seen
-    from the agent; where there is none it takes the lowest distance of all, for which the published
-    code draws a random mode. A label that ends within 2 m has no direction: distance alone.
+    from the agent; where there is none it takes the lowest distance of all. A label that ends
+    within 2 m has no direction: distance alone. `angle-random` is `angle` but in losses, where it
+    takes `chance_mode` if there is none.
     """
-    distance = torch.linalg.vector_norm(positions - label[:, None], dim=-1).mean(dim=-1)
-    if assignment == "angle":
-        end, label_end = positions[:, :, -1], label[:, None, -1]
-        cross = end[..., 0] * label_end[..., 1] - end[..., 1] * label_end[..., 0]
-        dot = (end * label_end).sum(dim=-1)
-        aside = torch.atan2(cross, dot).abs() > MAX_ANGLE_RAD
-        has_direction = torch.linalg.vector_norm(label_end, dim=-1) >= STANDING_M
-        excluded = aside & has_direction & ~aside.all(dim=1, keepdim=True)
-        distance = distance.masked_fill(excluded, math.inf)
+    distance = _distances_m(positions, label)
+    if assignment != "distance":
+        aside = _aside(positions, label)
+        distance = distance.masked_fill(aside & ~aside.all(dim=1, keepdim=True), math.inf)
     return distance.argmin(dim=1)
+
+
+def chance_mode(
+    positions: Float[Tensor, "n m t 2"], label: Float[Tensor, "n t 2"]
+) -> Int[Tensor, " n"]:
+    """As `best_mode` by angle, but where no mode is within 5° any one, as in the published code.
+
+    Without that, a mode that wins all labels at first may keep them: others never learn. Chance is
+    read off the last bits of the distances, so that equal weights and labels draw alike.
+    """
+    aside = _aside(positions, label)
+    bits = _distances_m(positions, label).float().contiguous().view(torch.int32).long()
+    drawn = (bits * 2_654_435_761 >> 8 & 0xFFFF).argmax(dim=1)
+    return torch.where(aside.all(dim=1), drawn, best_mode(positions, label, "angle"))
+
+
+def _distances_m(
+    positions: Float[Tensor, "n m t 2"], label: Float[Tensor, "n t 2"]
+) -> Float[Tensor, "n m"]:
+    return torch.linalg.vector_norm(positions - label[:, None], dim=-1).mean(dim=-1)
+
+
+def _aside(
+    positions: Float[Tensor, "n m t 2"], label: Float[Tensor, "n t 2"]
+) -> Bool[Tensor, "n m"]:
+    """Whether a mode ends in another direction than the label does, if that has one."""
+    end, label_end = positions[:, :, -1], label[:, None, -1]
+    cross = end[..., 0] * label_end[..., 1] - end[..., 1] * label_end[..., 0]
+    dot = (end * label_end).sum(dim=-1)
+    has_direction = torch.linalg.vector_norm(label_end, dim=-1) >= STANDING_M
+    return (torch.atan2(cross, dot).abs() > MAX_ANGLE_RAD) & has_direction
 
 
 def mode_terms(
@@ -63,7 +90,10 @@ def mode_terms(
         classification: what its improbability costs.
         share: of the training that is over, for annealing; None trains the best mode alone.
     """
-    best = best_mode(positions.detach(), label, assignment)
+    if assignment == "angle-random":
+        best = chance_mode(positions.detach(), label)
+    else:
+        best = best_mode(positions.detach(), label, assignment)
     if share is None:
         regression = regression_loss(positions, label, best)
     else:

@@ -93,11 +93,13 @@ class TrainingConfig:
 
 def _paper(predictor: str, network: NetworkConfig, view: str, horizon_s: float) -> TrainingConfig:
     """The schedule of the paper at full size: Adam at 1e-4, batches of 32, 10 epochs."""
-    vectors = view.startswith("vectors")
+    network = dataclasses.replace(network, assignment="angle-random")
+    if view.startswith("vectors"):
+        network = dataclasses.replace(network, encoder="vector")
     return TrainingConfig(
         predictor=predictor,
         preset="paper",
-        network=dataclasses.replace(network, encoder="vector") if vectors else network,
+        network=network,
         view=view,
         pixels=None,
         horizon_s=horizon_s,
