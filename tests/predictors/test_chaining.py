@@ -1,0 +1,120 @@
+"""Chains of segments, on two chains made by hand that three modes each follow."""
+
+import math
+
+import pytest
+import torch
+
+from predictors.chaining import Chains, grow, pick, prune, starts
+
+FIRST = (0.3, 0.7)
+"""Probabilities of the modes of the first segment."""
+
+THEN = ((0.2, 0.5, 0.3), (0.6, 0.1, 0.3))
+"""Of the modes that follow each of them."""
+
+
+def line(end: float, angle_deg: float, ticks: int = 2) -> torch.Tensor:
+    """States on the way from the agent to a point."""
+    angle = math.radians(angle_deg)
+    share = torch.arange(1, ticks + 1) / ticks
+    x, y = share * end * math.cos(angle), share * end * math.sin(angle)
+    return torch.stack([x, y, torch.full_like(x, angle), torch.full_like(x, end)], dim=-1)
+
+
+def chains_of(states: list[torch.Tensor], probabilities: list[float], number: float) -> Chains:
+    """Chains of one target; actions and features hold the number of their row."""
+    rows = torch.arange(float(len(states))) + number
+    return Chains(
+        states=torch.stack(states)[None],
+        actions=rows[None, :, None, None].repeat(1, 1, states[0].shape[0], 2),
+        log_probs=torch.tensor([probabilities]).log(),
+        z=rows[None, :, None],
+    )
+
+
+@pytest.fixture
+def first() -> Chains:
+    """Straight on for 10 m with 0.3, or to the left for 8 m with 0.7."""
+    return chains_of([line(10, 0), line(8, 40)], list(FIRST), 0)
+
+
+@pytest.fixture
+def second() -> Chains:
+    """Three modes after each, in rows numbered from 10 on."""
+    return chains_of([line(20 + k, 0) for k in range(6)], [p for row in THEN for p in row], 10)
+
+
+def probabilities(chains: Chains) -> list[float]:
+    """Of the only target's chains."""
+    return chains.log_probs[0].exp().tolist()
+
+
+def test_full_is_every_pair_with_its_product(first: Chains, second: Chains) -> None:
+    """Six chains of 4 ticks with p·p', which sum to one, in the order of the first segment."""
+    grown = grow(starts(first, "full"), second)
+    products = [p * then for p, row in zip(FIRST, THEN, strict=True) for then in row]
+    assert probabilities(grown) == pytest.approx(products)
+    assert sum(probabilities(grown)) == pytest.approx(1)
+    assert grown.states.shape == (1, 6, 4, 4)
+    for row in range(6):
+        assert torch.equal(grown.states[0, row, :2], first.states[0, row // 3])
+        assert torch.equal(grown.states[0, row, 2:], second.states[0, row])
+        assert grown.actions[0, row, :, 0].tolist() == [row // 3, row // 3, row + 10, row + 10]
+    assert torch.equal(grown.z, second.z)
+
+
+def test_beam_keeps_the_most_probable_of_full(first: Chains, second: Chains) -> None:
+    """Of .06 .15 .09 .42 .07 .21 the three: .42, .21 and .15, over their sum of .78."""
+    kept = prune(grow(starts(first, "beam"), second), 3)
+    assert probabilities(kept) == pytest.approx([0.42 / 0.78, 0.21 / 0.78, 0.15 / 0.78])
+    assert kept.z[0, :, 0].tolist() == [13, 15, 11]
+    assert kept.actions[0, :, 0, 0].tolist() == [1, 1, 0]
+    assert torch.equal(kept.states[0, 0, 2:], second.states[0, 3])
+
+
+def test_beam_of_fewer_chains_keeps_them_all(first: Chains) -> None:
+    """Two chains with room for three: both, the more probable one first."""
+    kept = prune(first, 3)
+    assert probabilities(kept) == pytest.approx([0.7, 0.3])
+    assert kept.z[0, :, 0].tolist() == [1, 0]
+
+
+def test_top1_goes_on_from_the_most_probable(first: Chains, second: Chains) -> None:
+    """From the mode of 0.7, and the probabilities are those of the last segment alone."""
+    begun = starts(first, "top1")
+    assert begun.z.tolist() == [[[1.0]]]
+    assert torch.equal(begun.states[0, 0], first.states[0, 1])
+    grown = grow(begun, pick(second, torch.tensor([[3, 4, 5]])))
+    assert probabilities(grown) == pytest.approx(THEN[1])
+    assert grown.actions[0, :, 0, 0].tolist() == [1, 1, 1]
+
+
+@pytest.mark.parametrize(("angle", "row"), [(1.0, 0), (38.0, 1)])
+def test_oracle_goes_on_from_the_mode_of_the_label(first: Chains, angle: float, row: int) -> None:
+    """A label straight on takes the first mode although it is improbable; to the left the second.
+
+    Only the label's ticks of the first segment count: it ends elsewhere.
+    """
+    label = torch.cat([line(9, angle), line(50, -angle)])[None, :, :2]
+    begun = starts(first, "oracle", label=label)
+    assert begun.z.tolist() == [[[float(row)]]]
+    assert begun.log_probs.tolist() == [[0.0]]
+
+
+def test_oracle_matches_as_the_losses_do(first: Chains) -> None:
+    """A label of 6.2 m at 1°: within 5° it is the straight mode, by distance the other one."""
+    bent = first._replace(states=torch.stack([line(10, 0), line(6, 12)])[None])
+    label = line(6.2, 1)[None, :, :2]
+    by_angle = starts(bent, "oracle", label=label, assignment="angle")
+    by_distance = starts(bent, "oracle", label=label, assignment="distance")
+    assert by_angle.z.tolist() == [[[0.0]]]
+    assert by_distance.z.tolist() == [[[1.0]]]
+
+
+def test_targets_are_chained_apart(first: Chains) -> None:
+    """Two targets with opposite probabilities go on from different modes."""
+    both = Chains(*(torch.cat([field, field]) for field in first))
+    both = both._replace(log_probs=torch.tensor([FIRST, FIRST[::-1]]).log())
+    assert starts(both, "top1").z[:, 0, 0].tolist() == [1, 0]
+    assert prune(both, 1).z[:, 0, 0].tolist() == [1, 0]
