@@ -24,6 +24,11 @@ class Diagnosis:
             self._encoded.append(features.encoded.float().cpu())
             self._predicted.append(features.predicted.float().cpu())
 
+    def join(self, other: "Diagnosis") -> None:
+        """Keeps what another one kept, of batches that another process saw."""
+        self._encoded += other._encoded
+        self._predicted += other._predicted
+
     def finish(self) -> dict[str, float]:
         """The numbers by name, of all that was added; nothing where nothing was."""
         if not self._encoded:
@@ -39,7 +44,7 @@ class Diagnosis:
 
 
 def effective_rank(features: Float[Tensor, "n z"]) -> float:
-    """exp of the entropy of the normalised singular values of centred features (Roy & Vetterli).
+    """The exponential of the entropy of centred features' singular values (Roy & Vetterli 2007).
 
     1 where all features follow one line, z where they fill all directions alike; 0 where nothing
     varies.

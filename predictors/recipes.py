@@ -123,7 +123,7 @@ def _small(
         pixels=None if vectors else pixels,
         horizon_s=horizon_s,
         standing_share=0.25,
-        epochs=10,
+        epochs=8,
         snippets_per_epoch=6_000,
         max_validation_snippets=2_000,
         batch_size=64,
@@ -184,7 +184,7 @@ def ssp_asp_paper(view: str, horizon_s: float) -> TrainingConfig:
 
 
 def ssp_asp_cpu(view: str, horizon_s: float) -> TrainingConfig:
-    """The same structure, small, under Heun; pre-training takes two of the ten epochs."""
+    """The same structure, small, under Heun; pre-training takes two of the eight epochs."""
     network = SSPASPConfig(gru_width=128, integrator="heun")
     config = _small("ssp-asp", "cpu", network, view, horizon_s)
     return _pretrained(config, horizon_s, 2, of=config.epochs)
