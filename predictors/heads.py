@@ -45,7 +45,9 @@ class RecurrentReader(nn.Module):
         self, context: Float[Tensor, "n context"], actions: Float[Tensor, "n t 2"]
     ) -> Float[Tensor, "n width"]:
         """The last state of the last layer."""
-        if context.is_cuda:  # where one kernel for all ticks is faster than fewer multiplications
+        # Where one kernel for all ticks is faster than fewer multiplications, and for ONNX, which
+        # knows a GRU as a whole.
+        if context.is_cuda or torch.compiler.is_exporting():
             repeated = context[:, None].expand(-1, actions.shape[1], -1)
             return self.gru(torch.cat([repeated, actions], dim=-1))[0][:, -1]
         width = context.shape[1]
