@@ -51,6 +51,8 @@ class TrainingConfig:
     batch_size: int = 32
     learning_rate: float = 1e-4
     weight_decay: float = 0.0
+    gradient_clip: float | None = None
+    """The largest norm of a gradient; longer ones are shortened."""
     schedule: Literal["plateau", "one-cycle"] = "plateau"
     """`plateau` divides the learning rate by 5 after 3 epochs without improvement; `one-cycle`
     raises it over the first tenth of all steps and lowers it along a cosine to zero."""
@@ -112,9 +114,7 @@ def _small(
     """Minutes on two cores: pictures of a quarter of the resolution, a small encoder, one cycle."""
     vectors = view.startswith("vectors")
     pixels = (90, 90) if view == "mtp" else (90, 60)
-    network = dataclasses.replace(
-        network, encoder="vector" if vectors else "small", features=128 if vectors else 256
-    )
+    network = dataclasses.replace(network, encoder="vector" if vectors else "small", features=256)
     return TrainingConfig(
         predictor=predictor,
         preset=preset,
@@ -129,8 +129,9 @@ def _small(
         batch_size=64,
         learning_rate=1e-3,
         weight_decay=1e-2,
+        gradient_clip=5.0,
         schedule="one-cycle",
-        precision="bf16-mixed",
+        precision="32-true" if vectors else "bf16-mixed",
         threads=1,
     )
 

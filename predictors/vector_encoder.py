@@ -53,7 +53,7 @@ class VectorEncoder(nn.Module):
         shape: VectorShape,
         features: int,
         *,
-        width: int = 128,
+        width: int = 64,
         layers: int = 2,
         heads: int = 4,
     ) -> None:
