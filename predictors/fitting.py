@@ -3,20 +3,16 @@
 import ctypes
 import dataclasses
 import json
-import logging
 import platform
 import shutil
-import sys
-import warnings
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, nullcontext
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
 import lightning.pytorch as pl
 import torch
-from lightning.pytorch.loggers import CSVLogger, TensorBoardLogger
 from safetensors.torch import load_file
 
 from asp_env import registry
@@ -24,6 +20,7 @@ from asp_env.errors import AspEnvError
 from asp_env.views import make_view
 from predictors.calibration import temperature_on
 from predictors.checkpoint import CONFIG, save_learned, shape_for, write_json
+from predictors.hardware import LOGS, Hardware, make_trainer, quiet
 from predictors.lightning_parts import Fit, KeepBest, TellEpochs
 from predictors.network import LearnedPlug
 from predictors.recipes import SEGMENT_S, TrainingConfig
@@ -34,12 +31,25 @@ from predictors.training_data import VALIDATION_BATCH, open_training_data
 
 RUN = "run.json"
 STATE = "unfinished"
-LOGS = "logs"
 BEFORE = "3s"
 
 
-def train(config: TrainingConfig, data: str, out: Path, *, start: Path | None = None) -> Path:
+ONE_PROCESS = Hardware()
+
+
+def train(
+    config: TrainingConfig,
+    data: str,
+    out: Path,
+    *,
+    start: Path | None = None,
+    hardware: Hardware = ONE_PROCESS,
+) -> Path:
     """Trains a predictor, or goes on with a run that was killed.
+
+    With several devices the running program is started again for each of them, with the arguments
+    of its command line, and has to arrive here; nodes see the same `out` and data. The first
+    process alone writes. A run may go on on other hardware than it began on.
 
     Args:
         config: everything that decides the weights, besides the data and the start.
@@ -48,13 +58,15 @@ def train(config: TrainingConfig, data: str, out: Path, *, start: Path | None = 
             `config.json`, `weights.safetensors` and `README.md`, of the epoch with the lowest
             `validation FDE moving`.
         start: the folder of a finished run, or a file of ResNet18 weights, to start from.
+        hardware: what to work on.
 
     Returns:
         `out`.
 
     Raises:
         AspEnvError: the folder holds a finished run, or one of another configuration, or something
-            else; the data or the start are bad; or the loss is not finite.
+            else; the data or the start are bad; the hardware is not there; or the loss is not
+            finite.
     """
     chosen = open_training_data(config, data)
     run = {"config": dataclasses.asdict(config), "data_hash": chosen.data_hash}
@@ -62,7 +74,9 @@ def train(config: TrainingConfig, data: str, out: Path, *, start: Path | None = 
         run["validation_hash"] = chosen.validation_hash
     plug: LearnedPlug = registry.find("predictors", config.predictor)
     view = make_view(config.view, pixels=config.pixels)
-    begin = Start.read(start, plug) if start is not None else None
+    begin = None
+    if start is not None:
+        begin = Start.read(start, plug, view=view, dt_s=config.dt_s)
     if begin is not None:
         run["start"] = begin.weights_hash
     resumed = _resumes(out, run)
@@ -91,15 +105,27 @@ def train(config: TrainingConfig, data: str, out: Path, *, start: Path | None = 
             (chosen.validation, VALIDATION_BATCH),
         )
     ]
-    if not resumed:
-        (out / STATE).mkdir(parents=True)
-        write_json(run, out / STATE / RUN)
-    best = _fit(
-        Fit(network, config=config, training=batches[0], validation=batches[1]), config, out
+    state = out / STATE
+    best = KeepBest(best=state / "best.safetensors", state=state / "state.safetensors")
+    started = f"from-epoch-{_epochs_done(best.state_path):02d}"
+    trainer = make_trainer(
+        config, hardware, out=out, started=started, callbacks=[best, TellEpochs()]
     )
+    if trainer.is_global_zero:
+        state.mkdir(parents=True, exist_ok=True)
+        if not resumed:
+            write_json(run, state / RUN)
+        shutil.rmtree(out / LOGS / started, ignore_errors=True)
+    module = Fit(network, config=config, training=batches[0], validation=batches[1])
+    _fit(trainer, module, best.state_path, hardware)
+    if not trainer.is_global_zero:
+        trainer.strategy.barrier()
+        return out
 
-    weights = load_file(out / STATE / "best.safetensors")
+    weights = load_file(best.best_path)
     network.load_state_dict(weights)
+    with torch.compiler.set_stance("force_eager") if hardware.compiled else nullcontext():
+        temperature = temperature_on(network, batches[1])
     save_learned(
         out,
         plug=plug,
@@ -107,7 +133,7 @@ def train(config: TrainingConfig, data: str, out: Path, *, start: Path | None = 
         shape=shape,
         view=view,
         weights=weights,
-        temperature=temperature_on(network, batches[1]),
+        temperature=temperature,
         provenance={
             **run,
             "trained_on": dataclasses.asdict(chosen.trained_on),
@@ -118,10 +144,13 @@ def train(config: TrainingConfig, data: str, out: Path, *, start: Path | None = 
             "not_started": new,
             "best_epoch": best.best_epoch,
             "best_value": best.best_value,
+            "processes": trainer.world_size,
+            "compiled": hardware.compiled,
             "versions": _versions(),
         },
     )
-    shutil.rmtree(out / STATE)
+    shutil.rmtree(state)
+    trainer.strategy.barrier()
     return out
 
 
@@ -132,6 +161,7 @@ def train_stages(
     out: Path,
     *,
     start: Path | None = None,
+    hardware: Hardware = ONE_PROCESS,
 ) -> Path:
     """Trains for a horizon; one above 3 s goes on from a run for 3 s in `out/3s`, made if need be.
 
@@ -141,6 +171,7 @@ def train_stages(
         data: DATA.
         out: the run's folder.
         start: where to start from instead.
+        hardware: what to work on.
 
     Raises:
         AspEnvError: as `train`.
@@ -149,8 +180,8 @@ def train_stages(
     if start is None and horizon_s > SEGMENT_S:
         start = out / BEFORE
         if not (start / CONFIG).exists():
-            train(config_for(SEGMENT_S), data, start)
-    return train(config, data, out, start=start)
+            train(config_for(SEGMENT_S), data, start, hardware=hardware)
+    return train(config, data, out, start=start, hardware=hardware)
 
 
 def _resumes(out: Path, run: dict[str, Any]) -> bool:
@@ -168,43 +199,19 @@ def _resumes(out: Path, run: dict[str, Any]) -> bool:
                 "give another --out, or delete it"
             )
         return True
-    if out.exists() and (not out.is_dir() or any(each.name != BEFORE for each in out.iterdir())):
+    # A kill right after the folder was made left it without a word of what it is.
+    known = (BEFORE, STATE)
+    if out.exists() and (not out.is_dir() or any(each.name not in known for each in out.iterdir())):
         raise AspEnvError(f"{out} holds something that is no run: give another --out")
     return False
 
 
-def _fit(module: Fit, config: TrainingConfig, out: Path) -> KeepBest:
-    state = out / STATE / "state.safetensors"
-    best = KeepBest(best=out / STATE / "best.safetensors", state=state)
-    started = f"from-epoch-{_epochs_done(state):02d}"
-    shutil.rmtree(out / LOGS / started, ignore_errors=True)
+def _fit(trainer: pl.Trainer, module: Fit, state: Path, hardware: Hardware) -> None:
     _keep_freed_memory()
-    for name in ("lightning.pytorch", "lightning.fabric"):
-        logging.getLogger(name).setLevel(logging.WARNING)
-    with warnings.catch_warnings():
-        # Lightning advises on loaders, loggers and folders; what matters here raises.
-        warnings.filterwarnings("ignore", module="lightning|torch")
-        trainer = pl.Trainer(
-            accelerator="auto",
-            devices=1,
-            precision=config.precision,
-            max_epochs=config.all_epochs,
-            callbacks=[best, TellEpochs()],
-            logger=[
-                CSVLogger(out, name=LOGS, version=started),
-                TensorBoardLogger(out, name=LOGS, version=started),
-            ],
-            plugins=[SafetensorsIO()],
-            enable_checkpointing=False,
-            enable_model_summary=False,
-            enable_progress_bar=sys.stderr.isatty(),
-            num_sanity_val_steps=0,
-            reload_dataloaders_every_n_epochs=1,
-            log_every_n_steps=50,
-        )
-        with _threads(config.threads):
-            trainer.fit(module, ckpt_path=str(state) if state.exists() else None)
-    return best
+    if hardware.compiled:
+        module.network.get_submodule("encoder").compile()
+    with quiet(), _threads(module.config.threads):
+        trainer.fit(module, ckpt_path=str(state) if state.exists() else None)
 
 
 @contextmanager

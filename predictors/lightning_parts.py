@@ -17,7 +17,8 @@ from asp_env.metrics.open_loop import moving, open_loop_errors
 from predictors.batch import Batch, Labels
 from predictors.checkpoint import save_weights
 from predictors.diagnosis import Diagnosis
-from predictors.network import AbstractNetwork, Moment
+from predictors.hardware import gathered, share_buffers
+from predictors.network import AbstractNetwork, Features, Moment
 from predictors.recipes import TrainingConfig
 from predictors.samples import Batches, epoch_rows
 
@@ -62,26 +63,40 @@ class Fit(pl.LightningModule):
         self.config = config
         self._training = training
         self._validation = validation
-        self._errors: list[dict[str, np.ndarray]] = []
+        self._of_epoch = training
+        self._sums: dict[str, Tensor] = {}
+        self._found: list[dict[str, np.ndarray]] = []
         self._diagnosis = Diagnosis()
         count = len(training.snippets)
         self._per_epoch = min(config.snippets_per_epoch or count, count)
         self._steps = config.all_epochs * -(-self._per_epoch // config.batch_size)
 
     def train_dataloader(self) -> Iterable[tuple[Batch, Labels]]:
-        """The batches of the present epoch; asked for anew before each."""
-        return self._training.reordered(
-            epoch_rows(
-                len(self._training.snippets),
-                per_epoch=self._per_epoch,
-                epoch=self.current_epoch,
-                seed=self.config.seed,
-            )
+        """This process's share of the batches of the present epoch; asked for anew before each."""
+        rows = epoch_rows(
+            len(self._training.snippets),
+            per_epoch=self._per_epoch,
+            epoch=self.current_epoch,
+            seed=self.config.seed,
         )
+        self._of_epoch = self._training.reordered(rows).dealt(
+            self.trainer.global_rank, self.trainer.world_size
+        )
+        self._sums.clear()
+        return self._of_epoch
 
     def val_dataloader(self) -> Iterable[tuple[Batch, Labels]]:
-        """All validation batches."""
+        """This process's share of all validation batches."""
+        self._validation = self._validation.dealt(self.trainer.global_rank, self.trainer.world_size)
         return self._validation
+
+    def transfer_batch_to_device(
+        self, batch: Any, device: torch.device, dataloader_idx: int
+    ) -> Any:
+        """As Lightning does, but for what is there already, which it takes milliseconds to see."""
+        if device.type == "cpu":
+            return batch
+        return super().transfer_batch_to_device(batch, device, dataloader_idx)
 
     def configure_optimizers(self) -> Any:
         """Adam (with decoupled weight decay, if any) and the schedule of the configuration."""
@@ -120,58 +135,77 @@ class Fit(pl.LightningModule):
         if isinstance(scheduler, ReduceLROnPlateau):
             scheduler.step(loss)
 
-    def training_step(self, sample: tuple[Batch, Labels]) -> Tensor:
-        """The loss of one batch.
+    def training_step(self, sample: tuple[Batch, Labels], batch_idx: int) -> Tensor:
+        """The loss of one batch, weighted so that the mean over processes is that of all targets.
 
         Raises:
-            AspEnvError: it is not finite.
+            AspEnvError: it is not finite, in whatever process.
         """
         batch, labels = sample
         pretraining = self.current_epoch < self.config.pretraining_epochs
         moment = Moment(share=self.global_step / self._steps, pretraining=pretraining)
         terms: dict[str, Tensor] = self.network.training_loss(batch, labels, moment)
-        if not torch.isfinite(terms["loss"]):
+        finite = bool(torch.isfinite(terms["loss"]))
+        if not self.trainer.strategy.reduce_boolean_decision(finite):
             raise AspEnvError(
                 f"the loss is not finite in epoch {self.current_epoch}: lower the learning rate, "
                 "or look for faults in the data with asp-env inspect"
             )
-        self.log_dict(
-            {f"training {name}": value.detach() for name, value in terms.items()},
-            on_step=False,
-            on_epoch=True,
-            batch_size=len(labels.states),
-        )
-        return terms["loss"]
+        own = self._of_epoch.own(batch_idx)
+        for name, value in terms.items():
+            self._sums[name] = self._sums.get(name, 0.0) + own * value.detach().double()
+        if batch_idx + 1 == len(self._of_epoch):
+            sums = torch.stack(list(self._sums.values()))
+            means = self.trainer.strategy.reduce(sums, reduce_op="sum") / self._per_epoch
+            for name, mean in zip(self._sums, means.float(), strict=True):
+                self.log(f"training {name}", mean, on_step=False, on_epoch=True, batch_size=1)
+        return terms["loss"] * (own * self._of_epoch.ranks / self._of_epoch.rows(batch_idx))
 
-    def validation_step(self, sample: tuple[Batch, Labels]) -> None:
-        """Adds up the loss and keeps every target's errors."""
+    def on_validation_epoch_start(self) -> None:
+        """All processes evaluate the same network."""
+        share_buffers(self.network)
+
+    def validation_step(self, sample: tuple[Batch, Labels], batch_idx: int) -> None:
+        """Keeps the loss and every target's errors."""
         batch, labels = sample
         modes = self.network(batch)
-        count = len(labels.states)
+        own = self._validation.own(batch_idx)
         terms: dict[str, Tensor] = self.network.loss(batch, modes, labels, Moment())
-        self._diagnosis.add(self.network.features(batch, labels))
-        self.log(VALIDATION_LOSS, terms["loss"], batch_size=count)
+        features = self.network.features(batch, labels)
+        self._diagnosis.add(features and Features(*(each[:own] for each in features)))
         truth = labels.states[..., :2].cpu().numpy()
         valid = np.ones(truth.shape[:2], dtype=bool)
-        now = np.zeros((count, 4), dtype=np.float32)
+        now = np.zeros((len(truth), 4), dtype=np.float32)
         now[:, 3] = batch.motion[:, 0].cpu().numpy()
         positions = modes.states[..., :2].float().cpu().numpy()
         log_probs = modes.logits.float().log_softmax(dim=-1).cpu().numpy()
-        found = {"moving": moving(now, truth, valid)}
+        found = {
+            "loss": np.full(len(truth), float(terms["loss"])),
+            "moving": moving(now, truth, valid),
+        }
         for selection in ("most-probable", "best-of-3"):
             errors = open_loop_errors(positions, log_probs, truth, valid, selection)
             found[selection] = errors["FDE"].value
-        self._errors.append(found)
+        self._found.append({name: values[:own] for name, values in found.items()})
 
     def on_validation_epoch_end(self) -> None:
-        """Logs the mean errors over the subset `moving`; over all where nothing moves."""
-        joined = {key: np.concatenate([e[key] for e in self._errors]) for key in self._errors[0]}
-        self._errors.clear()
+        """Logs the loss, and the mean errors over the subset `moving`; over all if none moves."""
+        mine = {key: np.concatenate([each[key] for each in self._found]) for key in self._found[0]}
+        shares = gathered((mine, self._diagnosis))
+        joined = {key: np.concatenate([share[key] for share, _ in shares]) for key in mine}
+        self._diagnosis = Diagnosis()
+        for _, diagnosis in shares:
+            self._diagnosis.join(diagnosis)
+        values = self._diagnosis.finish()
+        self._found.clear()
         of = joined["moving"] if joined["moving"].any() else np.ones_like(joined["moving"])
-        self.log(SELECTED_BY, float(joined["most-probable"][of].mean()), prog_bar=True)
-        self.log(f"{SELECTED_BY} best of 3", float(joined["best-of-3"][of].mean()))
-        for name, value in self._diagnosis.finish().items():
-            self.log(name, value)
+        values[VALIDATION_LOSS] = float(joined["loss"].mean())
+        values[SELECTED_BY] = float(joined["most-probable"][of].mean())
+        values[f"{SELECTED_BY} best of 3"] = float(joined["best-of-3"][of].mean())
+        # What decides must be the same to the last bit everywhere, on whatever machines.
+        values = self.trainer.strategy.broadcast(values)
+        for name, value in values.items():
+            self.log(name, value, prog_bar=name == SELECTED_BY)
 
     def optimizer_step(self, *args: Any, **kwargs: Any) -> None:
         """Takes the step, and tells the network of it."""
@@ -185,8 +219,8 @@ class KeepBest(pl.Callback):
 
     def __init__(self, *, best: Path, state: Path) -> None:
         """Where the best weights and the state of the run are written."""
-        self._best_path = best
-        self._state_path = state
+        self.best_path = best
+        self.state_path = state
         self.best_value = math.inf
         self.best_epoch = -1
 
@@ -207,11 +241,12 @@ class KeepBest(pl.Callback):
         if learned and value < self.best_value:
             self.best_value, self.best_epoch = value, trainer.current_epoch
             network: nn.Module = pl_module.get_submodule("network")
-            save_weights(network.state_dict(), self._best_path)
+            if trainer.is_global_zero:
+                save_weights(network.state_dict(), self.best_path)
         # Lightning would take this step after the state is saved, and a resumed run would lack it.
         if learned and fit is not None:
             fit.step_plateau(float(trainer.callback_metrics[VALIDATION_LOSS]))
-        trainer.save_checkpoint(self._state_path)
+        trainer.save_checkpoint(self.state_path)
 
 
 @final
@@ -221,7 +256,7 @@ class TellEpochs(pl.Callback):
     def on_train_epoch_end(self, trainer: pl.Trainer, pl_module: pl.LightningModule) -> None:
         """Writes it to standard error."""
         del pl_module
-        if trainer.progress_bar_callback is not None:
+        if trainer.progress_bar_callback is not None or not trainer.is_global_zero:
             return
         found = trainer.callback_metrics
         sys.stderr.write(

@@ -1,5 +1,6 @@
 """Training data: snippets drawn on the fly, in the order of an epoch."""
 
+import copy
 from collections import deque
 from collections.abc import Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
@@ -66,17 +67,37 @@ class Batches:
         self._later_ticks = tuple(later_ticks)
         self._view = view
         self._batch_size = batch_size
+        self._rank = 0
+        self.ranks = 1
 
     def reordered(self, rows: Int[np.ndarray, " m"]) -> "Batches":
         """Batches of the snippets at some rows, in their order."""
-        return Batches(
-            self._recordings,
-            self.snippets.select(rows),
-            view=self._view,
-            batch_size=self._batch_size,
-            later_ticks=self._later_ticks,
-            histories=self._histories,
-        )
+        other = copy.copy(self)
+        other.snippets = self.snippets.select(rows)
+        return other
+
+    def dealt(self, rank: int, ranks: int) -> "Batches":
+        """One of `ranks` shares of every batch, dealt like cards.
+
+        A share of nothing, where a batch is smaller than `ranks`, holds one snippet of another's.
+        """
+        other = copy.copy(self)
+        other._rank, other.ranks = rank, ranks
+        return other
+
+    def rows(self, number: int) -> int:
+        """How many snippets a batch holds in all shares together."""
+        return min(self._batch_size, len(self.snippets) - number * self._batch_size)
+
+    def share(self, number: int) -> Int[np.ndarray, " n"]:
+        """Which snippets of the order a batch is drawn of here."""
+        first = number * self._batch_size
+        last = first + self.rows(number)
+        return np.arange(min(first + self._rank, last - 1), last, self.ranks)
+
+    def own(self, number: int) -> int:
+        """How many of `share` are not another's: all of them, or none."""
+        return len(range(self._rank, self.rows(number), self.ranks))
 
     def __len__(self) -> int:
         """How many batches there are."""
@@ -93,9 +114,7 @@ class Batches:
                 yield ready
 
     def _make(self, number: int) -> tuple[Batch, Labels]:
-        first = number * self._batch_size
-        rows = np.arange(first, min(first + self._batch_size, len(self.snippets)))
-        chosen = self.snippets.select(rows)
+        chosen = self.snippets.select(self.share(number))
         scene = gather_scene(self._histories, chosen)
         later = tuple(
             make_batch(

@@ -46,6 +46,19 @@ class Train:
     max_snippets: int | None = None
     """Learn from no more than so many, chosen at random."""
 
+    precision: Literal["32-true", "bf16-mixed"] | None = None
+    """Of the encoder, instead of the preset's; all that follows it is always float32."""
+    devices: int | Literal["auto"] = 1
+    """Processes on each node, with a GPU each if there are GPUs; auto is one per GPU. They share
+    every batch."""
+    nodes: int = 1
+    """Machines that take part. The same command is started on each, with OUT and DATA in folders
+    that all of them see, and with MASTER_ADDR, MASTER_PORT and NODE_RANK set or by torchrun."""
+    strategy: Literal["auto", "ddp"] = "auto"
+    """How processes work together; ddp takes it also where there is but one."""
+    compile: bool = False
+    """Compile the encoder with torch.compile: some tens of seconds at first, faster later."""
+
     def run(self) -> None:
         """Trains.
 
@@ -55,14 +68,27 @@ class Train:
         try:
             from predictors.ablations import variant
             from predictors.fitting import train, train_stages
+            from predictors.hardware import Hardware, is_first_process
         except ModuleNotFoundError as error:
             raise MissingExtraError(str(error.name), "train", "training") from error
 
+        hardware = Hardware(
+            devices=self.devices, nodes=self.nodes, strategy=self.strategy, compiled=self.compile
+        )
         if self.variant is not None and not variant(self.predictor, self.variant).goes_on:
-            run = train(self.config_for(self.horizon), self.data, self.out, start=self.start)
+            config = self.config_for(self.horizon)
+            run = train(config, self.data, self.out, start=self.start, hardware=hardware)
         else:
-            run = train_stages(self.config_for, self.horizon, self.data, self.out, start=self.start)
-        Console().print(f"wrote {run}: name it as {self.predictor}:{run}")
+            run = train_stages(
+                self.config_for,
+                self.horizon,
+                self.data,
+                self.out,
+                start=self.start,
+                hardware=hardware,
+            )
+        if is_first_process():
+            Console().print(f"wrote {run}: name it as {self.predictor}:{run}")
 
     @staticmethod
     def variants(predictor: str) -> Mapping[str, Any]:
@@ -89,6 +115,7 @@ class Train:
             history=self.history,
             max_snippets=self.max_snippets,
             epochs=config.epochs if self.epochs is None else self.epochs,
+            precision=config.precision if self.precision is None else self.precision,
         )
         if self.variant is not None:
             config = variant(self.predictor, self.variant).apply(config, self.variant)
