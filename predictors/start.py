@@ -1,12 +1,14 @@
 """Where a run starts from, other than from random weights."""
 
 import hashlib
+import json
 from dataclasses import dataclass
 from pathlib import Path
 
 from torch import Tensor
 
 from asp_env.errors import CheckpointError
+from asp_env.views import SceneView
 from predictors.checkpoint import WEIGHTS, read_config, read_weights
 from predictors.encoders import load_resnet18
 from predictors.network import AbstractNetwork, LearnedPlug
@@ -24,11 +26,11 @@ class Start:
     """None for a ResNet18."""
 
     @classmethod
-    def read(cls, path: Path, plug: LearnedPlug) -> "Start":
+    def read(cls, path: Path, plug: LearnedPlug, *, view: SceneView, dt_s: float) -> "Start":
         """From the folder of a run, or a file of ResNet18 weights.
 
         Raises:
-            CheckpointError: it is missing, damaged, or of another predictor.
+            CheckpointError: it is missing, damaged, or of another predictor, view or time step.
         """
         if path.is_file():
             digest = hashlib.sha256(path.read_bytes()).hexdigest()
@@ -38,6 +40,15 @@ class Start:
             raise CheckpointError(
                 f"{path} holds the predictor {config['predictor']!r}, which {plug.name!r} cannot "
                 "start from"
+            )
+        # Pictures of the same size may still show other things: weights would fit, and be wrong.
+        if config.get("view") != json.loads(json.dumps(view.config())):
+            raise CheckpointError(
+                f"{path} has another view than this run: start from one of the same"
+            )
+        if config.get("dt_s") != dt_s:
+            raise CheckpointError(
+                f"{path} was trained for a time step of {config.get('dt_s')} s, not of {dt_s:g} s"
             )
         weights = read_weights(path / WEIGHTS)
         try:
@@ -68,7 +79,7 @@ class Start:
         encoder = {name for name in own if name.startswith("encoder.")}
         if not encoder <= set(fitting):
             raise CheckpointError(
-                f"{self.path} has another encoder or view than this run: start from one of the same"
+                f"{self.path} has another encoder than this run: start from one of the same"
             )
         network.load_state_dict(fitting, strict=False)
         return sorted(set(own) - set(fitting))

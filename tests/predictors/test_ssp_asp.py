@@ -14,6 +14,7 @@ from predictors.batch import Batch, Labels
 from predictors.modes import best_mode, into_frame, mode_terms
 from predictors.network import Modes, Moment
 from predictors.ssp_asp import SSPASPConfig, SSPASPNetwork
+from predictors.vector_encoder import VectorTensors
 from tests.predictors.tiny import RANGE, draw_samples, make_network, tiny_network, tiny_shape
 
 ROWS = (3, 8, 20, 30, 41, 55)
@@ -118,7 +119,8 @@ def test_later_scenes_are_seen_from_there(sample: tuple[Batch, Labels]) -> None:
     for number, later in enumerate(labels.later):
         end = labels.states[:, 15 * number + 14]
         torch.testing.assert_close(later.motion[:, 0], end[:, 3])
-        agents = torch.as_tensor(later.seen.agents)
+        assert isinstance(later.seen, VectorTensors)
+        agents = later.seen.agents
         np.testing.assert_allclose(agents[:, 0, -1, :2], 0, atol=1e-5)
         past = labels.states[:, 15 * number : 15 * number + 15].numpy().astype(np.float64)
         seen = states_to_frame(past, end[:, None].numpy().astype(np.float64))
