@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 import torch
 
+from asp_env.data.classes import AgentClass
 from asp_env.data.snippets import gather_scene, index_snippets
 from asp_env.dynamics import MAX_ACCELERATION_MPS2, MAX_STEERING_RAD
 from asp_env.errors import AspEnvError
@@ -124,7 +125,7 @@ def test_states_follow_from_actions_by_hand(sample: tuple[Batch, Labels]) -> Non
 
 def test_motion_is_speed_acceleration_and_yaw_rate() -> None:
     """A car that brakes at 1 m/s² and turns left: its speed now, -1, and v·sin β / l_r rad/s."""
-    turning = Drive(kind=1, start=(0.0, 0.0, 3.0, 12.0), phases=((60.0, -1.0, 0.1),))
+    turning = Drive(kind=AgentClass.CAR, start=(0.0, 0.0, 3.0, 12.0), phases=((60.0, -1.0, 0.1),))
     recording = make_recording(drives=(turning,), duration_s=8.0)
     index = index_snippets([recording], dt_s=0.2, horizon_s=3.0)
     scene = gather_scene([recording], index.select(np.array([0])))
