@@ -3,6 +3,7 @@
 import dataclasses
 import hashlib
 import json
+import math
 import os
 from pathlib import Path
 from typing import Any
@@ -15,7 +16,7 @@ from torch import Tensor
 from asp_env.data.parts import TrainedOn
 from asp_env.errors import AspEnvError, CheckpointError, unknown_name
 from asp_env.views import BinaryView, SceneView, view_from_config
-from predictors.chaining import CHAININGS
+from predictors.chaining import CHAININGS, Chaining
 from predictors.learned import Learned
 from predictors.network import AbstractNetwork, LearnedPlug, NetworkShape
 
@@ -67,22 +68,23 @@ def save_learned(
     write_json(config, folder / CONFIG)
 
 
-def load_learned(
-    plug: LearnedPlug, argument: str, *, dt_s: float, chaining: str = "beam"
-) -> Learned:
+def load_learned(plug: LearnedPlug, argument: str, *, dt_s: float | None = None) -> Learned:
     """The predictor in a finished run's folder.
+
+    Args:
+        plug: of which predictor it must be.
+        argument: the folder, and behind an @ how segments are chained, if not by beam.
+        dt_s: the time step of the scenes to come; None takes the run's own.
 
     Raises:
         CheckpointError: it is missing, damaged, or of another predictor.
-        AspEnvError: it was trained for another time step, or there is no such chaining.
+        AspEnvError: it was trained for another time step, or does not chain as is asked.
     """
-    if chaining not in CHAININGS:
-        raise unknown_name("chaining", chaining, CHAININGS)
     if not argument:
         raise CheckpointError(
             f"predictor {plug.name} is trained: name its run as {plug.name}:RUN_DIR"
         )
-    folder = Path(argument)
+    folder, chaining = folder_and_chaining(argument)
     config = read_config(folder)
     if config["predictor"] != plug.name:
         raise CheckpointError(
@@ -91,35 +93,65 @@ def load_learned(
         )
     try:
         view, network, trained_on = _build(plug, config)
-        temperature = float(config["temperature"])
+        temperature = _positive("temperature", config["temperature"])
         training = config["provenance"].get("config", {})
-    except (KeyError, TypeError, ValueError, RuntimeError) as error:
+        _check_training(training, network.shape, view)
+        about = {
+            "trained_on": trained_on.source,
+            "view": view.name,
+            **{key: str(training[key]) for key in ("preset", "history") if key in training},
+        }
+    except (AttributeError, KeyError, OverflowError, RuntimeError, TypeError, ValueError) as error:
         raise CheckpointError(
             f"{folder / CONFIG} does not describe a {plug.name}: {_brief(error)}"
         ) from error
     shape = network.shape
-    if abs(shape.dt_s - dt_s) > 1e-6:
+    if dt_s is not None and abs(shape.dt_s - dt_s) > 1e-6:
         raise AspEnvError(
             f"{plug.name} in {folder} was trained for a time step of {shape.dt_s:g} s, "
             f"the scenes have {dt_s:g} s"
         )
+    if len(network.later_ticks) > 1:
+        about["chaining"] = chaining or "beam"
+    elif chaining is not None:
+        raise AspEnvError(
+            f"{plug.name} in {folder} forecasts {shape.horizon * shape.dt_s:g} s at once and chains "
+            f"nothing: name it without @{chaining}, as {plug.name}:{folder}"
+        )
     _load_weights(network, folder / WEIGHTS)
-    about = {
-        "trained_on": trained_on.source,
-        "view": view.name,
-        **{key: str(training[key]) for key in ("preset", "history") if key in training},
-        **({"chaining": chaining} if len(network.later_ticks) > 1 else {}),
-        "weights": hashlib.sha256((folder / WEIGHTS).read_bytes()).hexdigest()[:HASH_DIGITS],
-    }
     return Learned(
         name=plug.name,
         network=network,
         view=view,
         trained_on=trained_on,
-        about=about,
+        about={**about, "weights": weights_hash(folder)},
         temperature=temperature,
-        chaining=chaining,
+        chaining=chaining or "beam",
     )
+
+
+def folder_and_chaining(argument: str) -> tuple[Path, Chaining | None]:
+    """What stands before and behind the last @ of `RUN@chaining`.
+
+    A folder may have an @ in its own name: one that exists is taken as a whole.
+
+    Raises:
+        AspEnvError: there is no such chaining.
+    """
+    before, at, behind = argument.rpartition("@")
+    if not at or Path(argument).is_dir():
+        return Path(argument), None
+    for chaining in CHAININGS:
+        if behind == chaining:
+            return Path(before), chaining
+    if Path(before).is_dir():
+        raise unknown_name("chaining", behind, CHAININGS)
+    return Path(argument), None
+
+
+def weights_hash(folder: Path) -> str:
+    """The first digits of the hash of a run's weights, as tables show them."""
+    return hashlib.sha256((folder / WEIGHTS).read_bytes()).hexdigest()[:HASH_DIGITS]
 
 
 def read_config(folder: Path) -> dict[str, Any]:
@@ -155,18 +187,35 @@ def _build(
     plug: LearnedPlug, config: dict[str, Any]
 ) -> tuple[SceneView, AbstractNetwork, TrainedOn]:
     view = view_from_config(config["view"])
-    acceleration, steering = config["normaliser"]["action_range"]
+    acceleration, steering = (
+        _positive("action_range", limit) for limit in config["normaliser"]["action_range"]
+    )
     shape = shape_for(
         view,
-        history=int(config["history"]),
-        horizon=int(config["horizon"]),
-        dt_s=float(config["dt_s"]),
-        action_range=(float(acceleration), float(steering)),
+        history=int(_positive("history", config["history"])),
+        horizon=int(_positive("horizon", config["horizon"])),
+        dt_s=_positive("dt_s", config["dt_s"]),
+        action_range=(acceleration, steering),
     )
     trained_on = TrainedOn(**config["provenance"]["trained_on"])
     with torch.random.fork_rng(devices=[]):  # initial weights are drawn and at once replaced
         network = plug.network(plug.config(**config["network"]), shape)
     return view, network, trained_on
+
+
+def _positive(field: str, given: Any) -> float:
+    value = float(given)
+    if not (math.isfinite(value) and value > 0):
+        raise ValueError(f"{field} is {value:g}, expected a positive number")
+    return value
+
+
+def _check_training(training: dict[str, Any], shape: NetworkShape, view: SceneView) -> None:
+    """Weights may fit a network of another view or horizon that they were not trained for."""
+    found = {"view": view.name, "horizon_s": round(shape.horizon * shape.dt_s, 6)}
+    for field, value in found.items():
+        if training.get(field, value) != value:
+            raise ValueError(f"{field} is {value}, but it was trained with {training[field]}")
 
 
 def read_weights(path: Path) -> dict[str, Tensor]:

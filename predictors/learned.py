@@ -6,6 +6,8 @@ from typing import NamedTuple, final
 
 import numpy as np
 import torch
+from jaxtyping import Float
+from torch import Tensor
 
 from asp_env.data.forecast import Forecast, make_forecast
 from asp_env.data.geometry import from_frame
@@ -15,7 +17,7 @@ from asp_env.data.snippets import Future
 from asp_env.dynamics import wrap_angle
 from asp_env.errors import AspEnvError
 from asp_env.views import SceneView
-from predictors.batch import Labels, make_batch, make_labels
+from predictors.batch import Batch, Labels, make_batch, make_labels
 from predictors.chaining import Chaining
 from predictors.network import AbstractNetwork, Modes
 from predictors.physical import seen_for
@@ -66,10 +68,10 @@ class Learned:
         self.horizon = network.shape.horizon
         self.privileged = chaining == "oracle"
         self.trained_on: TrainedOn | None = trained_on
+        self.chaining: Chaining = chaining
+        self.network = network.eval()
         self._about = MappingProxyType(dict(about))
         self._temperature = temperature
-        self._chaining: Chaining = chaining
-        self._network = network.eval()
 
     @property
     def about(self) -> Mapping[str, str]:
@@ -118,13 +120,22 @@ class Learned:
         )
         return make_labels(scene.with_targets(scene.targets[known]), some)
 
+    def modes(self, batch: Batch, truth: Float[Tensor, "n t 2"] | None = None) -> Modes:
+        """What the network says of targets, in their own frames, as log-probabilities.
+
+        Args:
+            batch: of targets.
+            truth: their positions to come, which chaining by oracle alone reads.
+        """
+        if isinstance(self.network, SSPASPNetwork):
+            modes = self.network.chain(batch, self.chaining, truth)
+        else:
+            modes: Modes = self.network(batch)
+        return modes._replace(logits=(modes.logits / self._temperature).log_softmax(dim=-1))
+
     def _predict(self, scene: Scene, label: Labels | None, rows: slice) -> _Said:
         batch = make_batch(scene, self.view, self.history)
-        if isinstance(self._network, SSPASPNetwork):
-            truth = None if label is None else label.states[rows, :, :2]
-            modes = self._network.chain(batch, self._chaining, truth)
-        else:
-            modes: Modes = self._network(batch)
+        modes = self.modes(batch, None if label is None else label.states[rows, :, :2])
         now = scene.target_states.astype(np.float64)[:, None, None]
         local = modes.states.numpy()
         xy = from_frame(local[..., :2].astype(np.float64), now)
@@ -133,7 +144,7 @@ class Learned:
         return _Said(
             states=states,
             actions=None if modes.actions is None else modes.actions.numpy(),
-            log_probs=(modes.logits / self._temperature).log_softmax(dim=-1).numpy(),
+            log_probs=modes.logits.numpy(),
         )
 
 

@@ -343,10 +343,10 @@ class SSPASP:
 
         Raises:
             CheckpointError: the folder holds no finished run of this predictor.
-            AspEnvError: it was trained for another time step, or the chaining is unknown.
+            AspEnvError: it was trained for another time step, the chaining is unknown, or there is
+                one segment alone.
         """
         del horizon
         from predictors.checkpoint import load_learned
 
-        folder, _, chaining = argument.partition("@")
-        return load_learned(cls, folder, dt_s=dt_s, chaining=chaining or "beam")
+        return load_learned(cls, argument, dt_s=dt_s)
