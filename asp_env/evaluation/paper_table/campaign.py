@@ -109,7 +109,7 @@ class Campaign:
                     waiting = self._start(waiting, processes)
                     for cell in self._reap():
                         bar.advance(task)
-                        self._tell(cell, len(waiting))
+                        self._tell(cell, len(waiting) + len(self._running))
                     bar.update(task, description=", ".join(c.name for c in self._running))
                     if self._running:
                         time.sleep(POLL_S)

@@ -84,7 +84,8 @@ class Errors:
 def stamp_of(path: Path) -> str | None:
     """What kept errors were made of; None where there are none, or none that are whole."""
     try:
-        with np.load(path, allow_pickle=False) as file:
+        # NumPy leaves a file open that it was asked to open and that is damaged.
+        with path.open("rb") as opened, np.load(opened, allow_pickle=False) as file:
             return str(file["stamp"])
     except (OSError, KeyError, ValueError, BadZipFile):
         return None
