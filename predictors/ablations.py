@@ -12,7 +12,7 @@ from typing import Any
 
 from asp_env.errors import unknown_name
 from asp_env.views import VIEWS
-from predictors.recipes import SEGMENT_S, TrainingConfig
+from predictors.recipes import SEGMENT_S, TrainingConfig, recipe
 
 Change = Callable[[TrainingConfig], TrainingConfig]
 
@@ -87,9 +87,10 @@ def no_pretraining(config: TrainingConfig) -> TrainingConfig:
     return dataclasses.replace(config, pretraining_epochs=0, epochs=config.all_epochs)
 
 
-def twice_the_epochs(config: TrainingConfig) -> TrainingConfig:
+def all_epochs(config: TrainingConfig) -> TrainingConfig:
     """Those of a run for 3 s besides its own, for a run that does not go on from one."""
-    return dataclasses.replace(config, epochs=2 * config.epochs)
+    before = recipe(config.predictor, config.preset, view=config.view, horizon_s=SEGMENT_S)
+    return dataclasses.replace(config, epochs=before.all_epochs + config.epochs)
 
 
 _OF_ALL = {
@@ -116,7 +117,7 @@ VARIANTS: Mapping[str, Mapping[str, Variant]] = MappingProxyType(
         | {
             "skip": Variant(change=_network(skip=True)),
             "no-pretraining": Variant(change=no_pretraining),
-            "from-scratch": Variant(change=twice_the_epochs, horizons_s=(6.0,), goes_on=False),
+            "from-scratch": Variant(change=all_epochs, horizons_s=(6.0,), goes_on=False),
             "ema": Variant(change=_network(ema=0.99)),
             "stop-gradient": Variant(change=_network(stop_gradient=True)),
             "normalise": Variant(change=_network(normalise=True)),
