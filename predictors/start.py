@@ -71,9 +71,12 @@ class Start:
             load_resnet18(network, self.path)
             return []
         own = network.state_dict()
+        # A follower that the run had not yet begins where its leader stands.
+        followers = {f"target_{name}": value for name, value in self.weights.items()}
+        weights = followers | self.weights
         fitting = {
             name: value
-            for name, value in self.weights.items()
+            for name, value in weights.items()
             if name in own and own[name].shape == value.shape
         }
         encoder = {name for name in own if name.startswith("encoder.")}

@@ -1,5 +1,6 @@
 """Damaged, foreign and unfitting checkpoints: one line each."""
 
+import dataclasses
 import hashlib
 import json
 import pickle
@@ -7,14 +8,18 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 import torch
 from safetensors.torch import load_file, save_file
 
 from asp_env.data.predictor import load_predictor
+from asp_env.data.snippets import gather_scene, index_snippets
 from asp_env.errors import AspEnvError, CheckpointError
+from asp_env.views import make_view
 from predictors.resume import SafetensorsIO
-from tests.predictors.tiny import save_random
+from tests.builders import make_recording
+from tests.predictors.tiny import make_network, save_random, tiny_network, tiny_shape
 
 
 @pytest.fixture
@@ -74,11 +79,23 @@ FAULTS: dict[str, tuple[Callable[[Path], Any], str]] = {
     "predictor without a name": (lambda run: drop(run, "predictor"), "does not name"),
     "no view": (lambda run: drop(run, "view"), "does not describe a ffw-asp: 'view'"),
     "unknown view": (lambda run: change(run, view={"name": "moon"}), "unknown view 'moon'"),
+    "view of vectors": (
+        lambda run: change(run, view=make_view("vectors").config()),
+        "encoder small reads pictures, the view draws vectors",
+    ),
+    "view of other pictures": (
+        lambda run: change(run, view=make_view("mtp", pixels=(36, 36)).config()),
+        "does not fit|but it was trained with",
+    ),
+    "no temperature": (lambda run: drop(run, "temperature"), "does not describe a ffw-asp"),
+    "temperature of nothing": (lambda run: change(run, temperature=None), "does not describe"),
+    "no normaliser": (lambda run: change(run, normaliser={}), "does not describe"),
     "no horizon": (lambda run: drop(run, "horizon"), "does not describe"),
     "unknown field": (lambda run: change_network(run, colour=1), "colour"),
     "impossible field": (lambda run: change_network(run, modes=0), "modes is 0"),
     "field of another type": (lambda run: change_network(run, features="x"), "does not describe"),
     "other shapes": (lambda run: change_network(run, gru_width=9), "does not fit"),
+    "weights for another horizon": (lambda run: change(run, horizon=30), "does not fit"),
     "weights of another network": (
         lambda run: save_file({"w": torch.zeros(2)}, run / "weights.safetensors"),
         "does not fit",
@@ -112,6 +129,32 @@ def test_other_time_step_is_refused(run: Path) -> None:
 def test_predictor_keeps_the_horizon_it_was_trained_for(run: Path) -> None:
     """Asked for 30 ticks, a predictor of 15 forecasts 15."""
     assert load_predictor(f"ffw-asp:{run}", horizon=30, dt_s=0.2).horizon == 15
+
+
+def test_probabilities_are_those_of_the_temperature(run: Path) -> None:
+    """Logits are divided by what is stored: at 2 the log-odds between modes are half as large."""
+    recordings = [make_recording()]
+    scene = gather_scene(recordings, index_snippets(recordings, dt_s=0.2, horizon_s=3.0))
+    odds = []
+    for temperature in (1.0, 2.0):
+        change(run, temperature=temperature)
+        log_probs = load_predictor(f"ffw-asp:{run}", horizon=15, dt_s=0.2).predict(scene).log_probs
+        odds.append(log_probs[:, 1:] - log_probs[:, :1])
+    assert np.abs(odds[0]).max() > 0.05
+    np.testing.assert_allclose(odds[1], odds[0] / 2, atol=1e-5)
+
+
+def test_network_is_stored_as_it_is(run: Path) -> None:
+    """What is loaded holds the weights, shape and configuration that were saved, bit for bit."""
+    network = make_network("ffw-asp", tiny_network("ffw-asp"), tiny_shape())
+    stored = load_file(run / "weights.safetensors")
+    assert stored.keys() == network.state_dict().keys()
+    for name, value in network.state_dict().items():
+        assert torch.equal(stored[name], value), name
+    config = json.loads((run / "config.json").read_text())
+    assert config["network"] == dataclasses.asdict(network.config)
+    assert (config["history"], config["horizon"], config["dt_s"]) == (15, 15, 0.2)
+    assert tuple(config["normaliser"]["action_range"]) == network.shape.action_range
 
 
 def test_about_names_what_tables_show(run: Path) -> None:

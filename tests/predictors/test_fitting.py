@@ -1,13 +1,11 @@
-"""Training: what it writes, what it refuses, and that a killed run goes on as if nothing was."""
+"""Training: what it writes, and what it refuses."""
 
 import json
 from pathlib import Path
 
-import lightning.pytorch as pl
 import numpy as np
 import pytest
 import torch
-from lightning.pytorch.core.optimizer import LightningOptimizer
 from safetensors.torch import load_file
 
 from asp_env.data.parts import Split, snippet_parts
@@ -15,10 +13,9 @@ from asp_env.data.predictor import load_predictor
 from asp_env.data.snippets import SnippetIndex, gather_scene, index_snippets
 from asp_env.data.source import Recordings, open_data
 from asp_env.errors import AspEnvError
-from predictors import fitting, lightning_parts
+from predictors import training_data
 from predictors.fitting import train
-from predictors.lightning_parts import Fit, TellEpochs, one_cycle
-from predictors.recipes import TrainingConfig, recipe
+from predictors.lightning_parts import one_cycle
 from tests.predictors.tiny import tiny_config, write_data
 
 
@@ -34,83 +31,10 @@ def finished(data: str, tmp_path_factory: pytest.TempPathFactory) -> Path:
     return train(tiny_config(), data, tmp_path_factory.mktemp("runs") / "finished")
 
 
-class Killed(BaseException):
-    """What a kill looks like from inside: nothing catches it."""
-
-
-def kill_after_epoch_two(
-    self: TellEpochs, trainer: pl.Trainer, pl_module: pl.LightningModule
-) -> None:
-    """Right after the state of the second epoch is on the disk."""
-    del self, pl_module
-    if trainer.current_epoch == 1:
-        raise Killed
-
-
-def kill_in_epoch_three(self: Fit, batch: object, batch_idx: int) -> None:
-    """After one step of the third epoch, which is lost."""
-    del batch
-    if self.current_epoch == 2 and batch_idx == 1:
-        raise Killed
-
-
-KILLS = {
-    "between epochs": (TellEpochs, "on_train_epoch_end", kill_after_epoch_two),
-    "within an epoch": (Fit, "on_train_batch_start", kill_in_epoch_three),
-}
-
-
-@pytest.mark.parametrize("schedule", ["one-cycle", "plateau"])
-@pytest.mark.parametrize("kill", KILLS, ids=list(KILLS))
-def test_killed_run_ends_with_the_same_weights(
-    kill: str, schedule: str, data: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """Two epochs, a kill, and two more give the weights of four in a row, bit for bit.
-
-    On the plateau no epoch counts as better: the second and every later one divides the rate by 5.
-    """
-    monkeypatch.setattr(lightning_parts, "PLATEAU_PATIENCE", 0)
-    monkeypatch.setattr(lightning_parts, "PLATEAU_THRESHOLD", 0.99)
-    rates: list[float] = []
-    last: list[dict[str, torch.Tensor]] = []
-    monkeypatch.setattr(Fit, "on_train_epoch_start", lambda self: rates.append(rate_of(self)))
-    monkeypatch.setattr(Fit, "on_train_end", lambda self: last.append(self.network.state_dict()))
-    config = tiny_config(schedule=schedule, learning_rate=0.01)
-    with monkeypatch.context() as patched:
-        patched.setattr(*KILLS[kill])
-        with pytest.raises(Killed):
-            train(config, data, tmp_path / "killed")
-    assert not (tmp_path / "killed" / "config.json").exists()
-    del rates[2:]
-    train(config, data, tmp_path / "killed")
-    resumed_rates = rates.copy()
-    rates.clear()
-    train(config, data, tmp_path / "whole")
-    if schedule == "plateau":
-        assert rates == pytest.approx([0.01, 0.01, 0.002, 0.0004])
-    assert resumed_rates == rates
-    of_run = [load_file(tmp_path / run / "weights.safetensors") for run in ("killed", "whole")]
-    for resumed, whole in (last, of_run):
-        assert resumed.keys() == whole.keys()
-        for name, tensor in whole.items():
-            assert torch.equal(resumed[name], tensor), name
-    known = [
-        json.loads((tmp_path / run / "config.json").read_text()) for run in ("killed", "whole")
-    ]
-    assert known[0] == known[1]
-
-
-def rate_of(module: Fit) -> float:
-    """The learning rate at this moment."""
-    optimizer = module.optimizers()
-    assert isinstance(optimizer, LightningOptimizer)
-    return float(optimizer.param_groups[0]["lr"])
-
-
 def test_other_seed_gives_other_weights(data: str, finished: Path, tmp_path: Path) -> None:
     """The seed decides the weights: another one gives others."""
     other = train(tiny_config(seed=1), data, tmp_path / "run")
-    name = "head.0.weight"
+    name = "head.layers.0.weight"
     weights = [load_file(run / "weights.safetensors")[name] for run in (finished, other)]
     assert not torch.equal(*weights)
 
@@ -170,8 +94,8 @@ def test_loss_that_is_not_finite_stops_the_run(
     data: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """A NaN loss is one line, and no checkpoint is written."""
-    network = "predictors.ffw_asp.regression_loss"
-    monkeypatch.setattr(network, lambda *_: torch.tensor(float("nan"), requires_grad=True))
+    terms = "predictors.modes.regression_loss"
+    monkeypatch.setattr(terms, lambda *_: torch.tensor(float("nan"), requires_grad=True))
     with pytest.raises(AspEnvError, match="not finite in epoch 0"):
         train(tiny_config(), data, tmp_path / "run")
     assert not (tmp_path / "run" / "config.json").exists()
@@ -194,7 +118,7 @@ def test_nothing_to_select_on_is_one_line(
         _, trained_on = snippet_parts(recordings, index, split)
         return np.full(len(index), "train"), trained_on
 
-    monkeypatch.setattr(fitting, "snippet_parts", all_to_train)
+    monkeypatch.setattr(training_data, "snippet_parts", all_to_train)
     with pytest.raises(AspEnvError, match="no snippet is left for validation") as caught:
         train(tiny_config(), data, tmp_path / "run")
     assert "\n" not in str(caught.value)
@@ -219,33 +143,3 @@ def test_forecasts_do_not_depend_on_the_batch(data: str, finished: Path) -> None
 def test_one_cycle_by_hand(step: int, share: float) -> None:
     """Of 100 steps: up over the first ten, half in the middle of the rest, zero at the end."""
     assert one_cycle(step, 100) == pytest.approx(share, abs=1e-9)
-
-
-def test_paper_recipe_is_the_papers() -> None:
-    """ResNet18, GRU of 2x512, 3 modes, Euler; Adam at 1e-4, batches of 32, 10 epochs."""
-    config = recipe("ffw-asp", "paper", view="chauffeurnet", horizon_s=3.0)
-    network = config.network
-    assert (network.encoder, network.features) == ("resnet18", 512)
-    assert (network.gru_width, network.gru_layers, network.modes) == (512, 2, 3)
-    assert (network.skip, network.hidden) == (False, 0)
-    assert (network.integrator, network.assignment) == ("euler", "angle")
-    assert (config.learning_rate, config.batch_size, config.epochs) == (1e-4, 32, 10)
-    assert (config.schedule, config.weight_decay) == ("plateau", 0.0)
-    assert (config.height_px, config.width_px, config.snippets_per_epoch) == (360, 240, None)
-
-
-def test_unknown_names_list_the_known_ones() -> None:
-    """A misspelt predictor or preset is one line with a suggestion."""
-    with pytest.raises(AspEnvError, match="did you mean 'ffw-asp'"):
-        recipe("ffw", "cpu", view="chauffeurnet", horizon_s=3.0)
-    with pytest.raises(AspEnvError, match="known are cpu, paper"):
-        recipe("ffw-asp", "gpu", view="chauffeurnet", horizon_s=3.0)
-
-
-def test_impossible_numbers_are_refused() -> None:
-    """No epochs, or a share of standing targets above one, is refused at construction."""
-    with pytest.raises(AspEnvError, match="epochs is 0"):
-        tiny_config(epochs=0)
-    with pytest.raises(AspEnvError, match=r"standing_share is 1\.5"):
-        tiny_config(standing_share=1.5)
-    assert isinstance(tiny_config(), TrainingConfig)

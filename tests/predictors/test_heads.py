@@ -6,7 +6,7 @@ import torch
 from predictors.heads import ConnectedHead, RecurrentReader
 
 
-@pytest.mark.parametrize("layers", [1, 2])
+@pytest.mark.parametrize("layers", [1, 2, 3])
 def test_reader_is_a_gru_over_context_and_actions(layers: int) -> None:
     """The last state of torch's GRU that reads both at every tick, to 1e-6; and its gradients."""
     with torch.random.fork_rng(devices=[]):

@@ -10,7 +10,8 @@ from hypothesis import strategies as st
 from asp_env.data.classes import AgentClass
 from asp_env.data.snippets import gather_future, gather_scene, index_snippets
 from asp_env.errors import AspEnvError
-from asp_env.views import make_view
+from asp_env.views import make_picture_view
+from asp_env.views.packing import pack_bits
 from predictors.samples import (
     Batches,
     action_range,
@@ -24,7 +25,7 @@ EAST = Drive(kind=AgentClass.CAR, start=(-50.0, 2.0, 0.0, 10.0))
 WAITING = Drive(kind=AgentClass.CAR, start=(20.0, -2.0, 0.0, 0.0), appears_s=0.4)
 """Stands all the time, but is not there from the first frame: not parked."""
 
-SMALL = make_view("chauffeurnet", height_px=36, width_px=24)
+SMALL = make_picture_view("chauffeurnet", pixels=(36, 24))
 
 
 @given(
@@ -126,10 +127,10 @@ def test_batches_hold_every_snippet_in_order() -> None:
     batches = Batches(recordings, chosen, view=SMALL, batch_size=4)
     assert len(batches) == 3
     found = list(batches)
-    assert [len(batch.raster) for batch, _ in found] == [4, 4, 2]
+    assert [len(batch.actions) for batch, _ in found] == [4, 4, 2]
     scene = gather_scene(recordings, chosen)
-    rasters = np.concatenate([batch.raster.numpy() for batch, _ in found])
-    np.testing.assert_array_equal(rasters, SMALL.draw(scene))
+    packed = np.concatenate([np.asarray(batch.seen) for batch, _ in found])
+    np.testing.assert_array_equal(packed, pack_bits(SMALL.draw(scene)))
     actions = np.concatenate([batch.actions.numpy() for batch, _ in found])
     at = (scene.targets[:, 0], scene.targets[:, 1])
     np.testing.assert_array_equal(actions, scene.actions[at])
