@@ -115,8 +115,8 @@ def load_learned(plug: LearnedPlug, argument: str, *, dt_s: float | None = None)
         about["chaining"] = chaining or "beam"
     elif chaining is not None:
         raise AspEnvError(
-            f"{plug.name} in {folder} forecasts {shape.horizon * shape.dt_s:g} s at once and chains "
-            f"nothing: name it without @{chaining}, as {plug.name}:{folder}"
+            f"{plug.name} in {folder} forecasts {shape.horizon * shape.dt_s:g} s at once, there is "
+            f"nothing to chain: name it without @{chaining}, as {plug.name}:{folder}"
         )
     _load_weights(network, folder / WEIGHTS)
     return Learned(

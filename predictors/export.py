@@ -1,0 +1,40 @@
+"""The command `asp-env export`."""
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated
+
+import tyro
+from rich.console import Console
+
+from asp_env.errors import AspEnvError, MissingExtraError
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Export:
+    """Write a trained predictor as an ONNX file, which runs without this package."""
+
+    predictor: Annotated[tyro.conf.Positional[str], tyro.conf.arg(metavar="PREDICTOR:RUN")]
+    """A trained one with its folder, such as ssp-asp:runs/1 or ssp-asp:runs/1@top1."""
+    out: Path
+    """File to write; must not exist."""
+
+    def run(self) -> None:
+        """Exports, checks the file against the network it was made of, and writes it.
+
+        Raises:
+            AspEnvError: the predictor cannot be loaded or is not trained, or the file exists.
+        """
+        if self.out.exists():
+            raise AspEnvError(f"{self.out} exists: give another --out, or delete it")
+        if not self.out.parent.is_dir():
+            raise AspEnvError(f"{self.out.parent} is no folder: make it, or give another --out")
+        try:
+            from predictors.onnx_file import write_onnx
+        except ModuleNotFoundError as error:
+            raise MissingExtraError(str(error.name), "export", "export to ONNX") from error
+
+        difference = write_onnx(self.predictor, self.out)
+        Console().print(
+            f"wrote {self.out}: as the network to {difference:.0e} on random inputs", soft_wrap=True
+        )
