@@ -3,13 +3,14 @@
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated, Any, Literal
 
 import numpy as np
 import tyro
 from jaxtyping import Bool
 from rich.console import Console
 
+from asp_env.data.causal import causal_histories
 from asp_env.data.clock import DEFAULT_DT_S, ticks
 from asp_env.data.predictor import Predictor
 from asp_env.data.snippets import (
@@ -51,6 +52,9 @@ class Evaluate:
     """Seconds per tick."""
     part: PartChoice = "auto"
     """Which part of DATA; auto takes what no named predictor has seen."""
+    history: Literal["recorded", "causal"] = "recorded"
+    """What predictors are shown: histories as recorded, which were smoothed with what came after,
+    or filtered again by a filter that knows no later frame. The truth is as recorded."""
     best_by: ModeRule = "fde"
     """How the best of 3 is chosen: lowest final error, lowest mean error, or the paper's rule."""
 
@@ -90,7 +94,10 @@ def evaluate(config: Evaluate) -> OpenLoop:
     index = index_snippets(recordings, dt_s=config.dt, horizon_s=config.horizon)
     index = keep_within(index, allowed)
     named = dict(zip(config.predictors, predictors, strict=True))
-    judgement = judge(named, index, scenes=recordings, recorded=recordings, best_by=config.best_by)
+    scenes: Sequence[Any] = recordings
+    if config.history == "causal":
+        scenes = causal_histories(recordings)
+    judgement = judge(named, index, scenes=scenes, recorded=recordings, best_by=config.best_by)
     moving = judgement.subsets["moving"]
     return OpenLoop(
         rows=rows_of(judgement, named, data=config.data, horizon_s=config.horizon),
@@ -102,6 +109,7 @@ def evaluate(config: Evaluate) -> OpenLoop:
             "horizon_s": config.horizon,
             "dt_s": config.dt,
             "part": part,
+            "history": config.history,
             "recordings": len(np.unique(index.recording)),
             "snippets": len(index),
             "moving snippets": int(moving.sum()),
@@ -110,7 +118,7 @@ def evaluate(config: Evaluate) -> OpenLoop:
             "intervals": "95 %, bootstrap over recordings",
         },
         judgement=judgement,
-        examples=_examples(recordings, recordings, index, moving, named),
+        examples=_examples(scenes, recordings, index, moving, named),
     )
 
 
