@@ -69,7 +69,7 @@ class Table:
     ablation_view: str = "chauffeurnet"
     """What they look at."""
     jobs: int = 2
-    """Cells at a time, of one thread each; 0 prints what is there."""
+    """Cells at a time, of one thread each; 0 prints what is there, even meanwhile."""
     per_recording: int | None = None
     """Test snippets of each recording at most, at random."""
     epochs: int | None = None
@@ -88,7 +88,7 @@ class Table:
         cells = self._plan()
         sites = {site.name: site for site in open_sites(self.data, self.validation, self.test)}
         console = Console()
-        with _claimed(self.out, self._fixed(list(sites.values()))):
+        with _claimed(self.out, self._fixed(list(sites.values())), alone=self.jobs > 0):
             jobs = {cell: self._job(cell, sites[cell.site]) for cell in cells}
             campaign = Campaign(jobs, self.out, console)
             campaign.run(self.jobs)
@@ -233,8 +233,8 @@ class Table:
 
 
 @contextmanager
-def _claimed(out: Path, fixed: dict[str, Any]) -> Iterator[None]:
-    """The folder, for this table and this command alone.
+def _claimed(out: Path, fixed: dict[str, Any], *, alone: bool) -> Iterator[None]:
+    """The folder, for this table and, if `alone`, for this command.
 
     Raises:
         AspEnvError: it holds something else, or another command is at it.
@@ -245,10 +245,11 @@ def _claimed(out: Path, fixed: dict[str, Any]) -> Iterator[None]:
     out.mkdir(parents=True, exist_ok=True)
     with (out / LOCK).open("w") as lock:
         try:
-            fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            if alone:
+                fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
         except OSError as error:
             raise AspEnvError(
-                f"{out}: another asp-env table is at it; wait for it, or choose another --out"
+                f"{out}: another asp-env table is at it; --jobs 0 prints what is there"
             ) from error
         same = json.loads(json.dumps(fixed))
         if not path.exists():

@@ -1,6 +1,7 @@
 """`asp-env table`: a whole small one, its numbers by hand, and what it refuses."""
 
 import csv
+import fcntl
 import io
 import json
 import math
@@ -230,6 +231,16 @@ def test_again_does_nothing(data: str, table: Path) -> None:
     before = content(table)
     assert main(["table", data, "--out", str(table), *OPTIONS]) == 0
     assert content(table) == before
+
+
+def test_one_command_at_a_time(data: str, table: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """While one is at a folder another is refused, but may print what is there."""
+    with (table / ".lock").open("w") as lock:
+        fcntl.flock(lock, fcntl.LOCK_EX)
+        assert main(["table", data, "--out", str(table), *OPTIONS]) == 2
+        assert "another asp-env table is at it" in capsys.readouterr().err
+        assert main(["table", data, "--out", str(table), *OPTIONS, "--jobs", "0"]) == 0
+    assert "DKM" in capsys.readouterr().out
 
 
 def test_what_is_missing_is_done_again(data: str, table: Path) -> None:
