@@ -7,7 +7,7 @@ too, and γ runs on the encoded features and on the predicted ones; a forecast k
 ones alone, on which validation selects. Longer horizons chain segments: `predictors.chaining`.
 
 Read into the paper: the scene to come is drawn in the target's pose at its end; features pass a
-LayerNorm before γ; a linear layer stands behind ψ, since features are unbounded; the losses of both
+LayerNorm before ψ and γ; a linear layer stands behind ψ, since features are unbounded; the losses of both
 branches are averaged, and so are those of the segments; a later segment is predicted from what
 inference has there, the predicted features and the matched mode's actions. Options that the
 `paper` recipe leaves off: `normalise`, `stop_gradient`, `ema`, `skip`, `hidden`, `scheduled`.
@@ -155,8 +155,7 @@ class SSPASPNetwork(AbstractNetwork):
             past = self.scaled_actions(batch.actions)
             chains = self._segment(Place(z, past, start_states(batch), batch.length_m))
             for _ in self.later_ticks[1:]:
-                assignment = self.config.assignment
-                chains = starts(chains, chaining, label=label, assignment=assignment)
+                chains = starts(chains, chaining, label=label, assignment=self.config.assignment)
                 chains = grow(chains, self._go_on(chains, batch))
                 if chaining == "beam":
                     chains = prune(chains, self.config.modes)
@@ -182,8 +181,7 @@ class SSPASPNetwork(AbstractNetwork):
         raw, logits = self.head(torch.cat(inputs, dim=-1))
         actions = self.actions_from(raw)
         start = at.start[:, None].expand(-1, actions.shape[1], -1)
-        integrator = self._options.integrator
-        states = drive_from(start, actions, at.length_m, self.shape.dt_s, integrator)
+        states = drive_from(start, actions, at.length_m, self.shape.dt_s, self._options.integrator)
         return actions, states, logits
 
     def training_loss(self, batch: Batch, labels: Labels, moment: Moment) -> dict[str, Tensor]:
