@@ -7,9 +7,9 @@ too, and γ runs on the encoded features and on the predicted ones; a forecast k
 ones alone, on which validation selects. Longer horizons chain segments: `predictors.chaining`.
 
 Read into the paper: the scene to come is drawn in the target's pose at its end; features pass a
-LayerNorm before ψ and γ; a linear layer stands behind ψ, since features are unbounded; the losses of both
-branches are averaged, and so are those of the segments; a later segment is predicted from what
-inference has there, the predicted features and the matched mode's actions. Options that the
+LayerNorm before ψ and γ; a linear layer stands behind ψ, since features are unbounded; the losses
+of both branches are averaged, and so are those of the segments; a later segment is predicted from
+what inference has there, the predicted features and the matched mode's actions. Options that the
 `paper` recipe leaves off: `normalise`, `stop_gradient`, `ema`, `skip`, `hidden`, `scheduled`.
 
 Dimensions: n targets, m modes, t ticks of a segment, z features.
