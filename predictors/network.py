@@ -70,7 +70,7 @@ class NetworkConfig:
     features: int = 512
     """z, the width of what the encoder gives."""
     modes: int = 3
-    assignment: Assignment = "angle"
+    assignment: Assignment = "angle-random"
     classification: Classification = "cross-entropy"
     annealed: bool = False
     """Whether all modes learn from every label at first, by nearness (softmin), and the best one

@@ -95,7 +95,6 @@ class TrainingConfig:
 
 def _paper(predictor: str, network: NetworkConfig, view: str, horizon_s: float) -> TrainingConfig:
     """The schedule of the paper at full size: Adam at 1e-4, batches of 32, 10 epochs."""
-    network = dataclasses.replace(network, assignment="angle-random")
     if view.startswith("vectors"):
         network = dataclasses.replace(network, encoder="vector")
     return TrainingConfig(
