@@ -65,7 +65,7 @@ def _thinned(points: Float[np.ndarray, "n 2"]) -> Float[np.ndarray, "m 2"]:
 class MapCache(Generic[Drawn]):
     """What was made of the maps that were drawn last, of each once."""
 
-    def __init__(self, make: Callable[[RoadMap], Drawn], size: int = 64) -> None:
+    def __init__(self, make: Callable[[RoadMap], Drawn], size: int = 512) -> None:
         """Keeps what `make` gives for up to `size` maps."""
         self._make = make
         self._size = size

@@ -82,7 +82,7 @@ class VectorView:
     own_past: bool = True
     """Whether the target's own states before now are shown."""
     _pieces: MapCache[LanePieces] = field(
-        default_factory=lambda: MapCache(lane_pieces, size=256),
+        default_factory=lambda: MapCache(lane_pieces),
         init=False,
         repr=False,
         compare=False,

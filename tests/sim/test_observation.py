@@ -8,11 +8,11 @@ import pytest
 
 from asp_env.errors import AspEnvError
 from asp_env.sim.observation import KNOWN, STATE_FIELDS, Observer
-from asp_env.views import make_view
+from asp_env.views import make_picture_view
 from tests.builders import make_recording
 from tests.sim.worlds import HISTORY, drive, on_road, scenario, simulate
 
-VIEW = make_view("chauffeurnet", height_px=90, width_px=60)
+VIEW = make_picture_view("chauffeurnet", pixels=(90, 60))
 
 
 def _state(simulation) -> dict[str, float]:
