@@ -1,4 +1,4 @@
-"""A trained predictor's folder: `config.json` and `weights.safetensors`. Nothing is unpickled."""
+"""A trained predictor's folder: configuration, weights and model card. Nothing is unpickled."""
 
 import dataclasses
 import hashlib
@@ -18,10 +18,12 @@ from asp_env.errors import AspEnvError, CheckpointError, unknown_name
 from asp_env.views import BinaryView, SceneView, view_from_config
 from predictors.chaining import CHAININGS, Chaining
 from predictors.learned import Learned
+from predictors.model_card import model_card
 from predictors.network import AbstractNetwork, LearnedPlug, NetworkShape
 
 CONFIG = "config.json"
 WEIGHTS = "weights.safetensors"
+CARD = "README.md"
 FORMAT = 1
 
 HASH_DIGITS = 16
@@ -39,7 +41,7 @@ def save_learned(
     temperature: float,
     provenance: dict[str, Any],
 ) -> None:
-    """Writes a predictor that `load_learned` loads; the configuration last, so never half.
+    """Writes a predictor that `load_learned` loads, and its card; the configuration last.
 
     Args:
         folder: an existing folder.
@@ -65,6 +67,9 @@ def save_learned(
         "provenance": provenance,
     }
     save_weights(weights, folder / WEIGHTS)
+    config = json.loads(json.dumps(config))  # as whoever reads it will find it
+    card = model_card(config, plug, weights=weights_hash(folder))
+    _write(card.encode(), folder / CARD)
     write_json(config, folder / CONFIG)
 
 

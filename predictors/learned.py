@@ -1,5 +1,6 @@
 """A trained network behind the predictor socket."""
 
+import math
 from collections.abc import Mapping
 from types import MappingProxyType
 from typing import NamedTuple, final
@@ -16,15 +17,18 @@ from asp_env.data.scene import Scene
 from asp_env.data.snippets import Future
 from asp_env.dynamics import wrap_angle
 from asp_env.errors import AspEnvError
-from asp_env.views import SceneView
+from asp_env.views import PictureView, SceneView
 from predictors.batch import Batch, Labels, make_batch, make_labels
 from predictors.chaining import Chaining
 from predictors.network import AbstractNetwork, Modes
 from predictors.physical import seen_for
 from predictors.ssp_asp import SSPASPNetwork
 
-CHUNK = 256
-"""Targets that are drawn and forecast at once, which bounds the memory that is used."""
+TARGETS_AT_ONCE = 256
+"""More are drawn and forecast in turn: on CPUs it is no slower, and the memory is bounded."""
+
+PIXELS_AT_ONCE = 1 << 26
+"""In all channels; of pictures at full size that is 64, with ResNet18 some 1.2 GiB."""
 
 
 class _Said(NamedTuple):
@@ -72,6 +76,9 @@ class Learned:
         self.network = network.eval()
         self._about = MappingProxyType(dict(about))
         self._temperature = temperature
+        self._at_once = TARGETS_AT_ONCE
+        if isinstance(view, PictureView):
+            self._at_once = min(TARGETS_AT_ONCE, max(1, PIXELS_AT_ONCE // math.prod(view.shape)))
 
     @property
     def about(self) -> Mapping[str, str]:
@@ -94,8 +101,8 @@ class Learned:
         with torch.inference_mode():
             parts = [
                 self._predict(scene.with_targets(scene.targets[known[rows]]), label, rows)
-                for first in range(0, max(len(known), 1), CHUNK)
-                for rows in [slice(first, first + CHUNK)]
+                for first in range(0, max(len(known), 1), self._at_once)
+                for rows in [slice(first, first + self._at_once)]
             ]
         log_probs = _scattered([part.log_probs for part in parts], valid)
         log_probs[~valid] = -np.log(log_probs.shape[1])

@@ -1,4 +1,4 @@
-"""`asp-env bench`: rates of the hot paths beside this machine's memory bandwidth, in one run."""
+"""`asp-env bench`: rates of the hot paths beside memory bandwidth, and latencies, in one run."""
 
 import os
 from collections.abc import Callable
@@ -15,6 +15,7 @@ from asp_env.data.scenario import Scenario, find_scenarios
 from asp_env.data.snippets import gather_scene, index_snippets
 from asp_env.data.source import Recordings, open_data
 from asp_env.errors import AspEnvError
+from asp_env.evaluation.latency import Latency, latency_table, measure_latencies
 from asp_env.evaluation.unseen import nothing_left
 from asp_env.sim.drivers import DRIVERS, make_driver
 from asp_env.sim.simulation import Simulation
@@ -30,7 +31,7 @@ STATE_BYTES = 4 * np.dtype(np.float32).itemsize
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Bench:
-    """Measure speeds on this machine: rasters and simulated steps, beside memory bandwidth."""
+    """Measure speeds: rasters and simulated steps beside memory bandwidth, and predictors."""
 
     data: Annotated[tyro.conf.Positional[str], tyro.conf.arg(metavar="DATA")] = (
         "sample:intersection"
@@ -38,12 +39,17 @@ class Bench:
     """DATA to draw and to simulate."""
     episodes: int = 256
     """Episodes that are stepped together."""
+    predictors: Annotated[tuple[str, ...], tyro.conf.arg(metavar="NAME[:RUN] …")] = ()
+    """Predictors whose calls are timed for 1, 16 and 64 agents, beside constant velocity."""
 
     def run(self) -> None:
-        """Measures and prints a table."""
+        """Measures and prints a table, and one of latencies where predictors are named."""
         if self.episodes < 1:
             raise AspEnvError(f"--episodes {self.episodes}: expected at least 1")
         recordings = open_data(self.data)
+        latencies: list[Latency] = []
+        if self.predictors:
+            latencies = measure_latencies(recordings, self.predictors, dt_s=DT_S)
         table = Table(title=f"medians of {REPEATS}, {os.cpu_count()} cores seen, one used")
         for heading in ("what", "rate", "bytes written", "share of copy bandwidth"):
             table.add_column(heading, justify="left" if heading == "what" else "right")
@@ -68,7 +74,10 @@ class Bench:
                 f"{per_s * size / copy:.3f}",
             )
             table.add_row(f"{name}, reset", f"{resets_per_s:,.0f} episodes/s")
-        Console(width=max(Console().width, 110)).print(table)
+        console = Console(width=max(Console().width, 110))
+        console.print(table)
+        if latencies:
+            console.print(latency_table(latencies))
 
 
 def median_s(work: Callable[[], object], prepare: Callable[[], object] = lambda: None) -> float:
