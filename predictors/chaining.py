@@ -18,6 +18,10 @@ Chaining = Literal["beam", "top1", "full", "oracle"]
 CHAININGS: tuple[Chaining, ...] = ("beam", "top1", "full", "oracle")
 
 
+MIN_MASS = 1e-4
+"""Of a chain that stands for nothing that another does not stand for already."""
+
+
 class Chains(NamedTuple):
     """What has been forecast so far, and where it goes on from."""
 
@@ -69,6 +73,30 @@ def prune(chains: Chains, keep: int) -> Chains:
     """The most probable chains, most probable first, with probabilities that sum to one again."""
     log_probs, rows = chains.log_probs.topk(min(keep, chains.log_probs.shape[1]), dim=1)
     return pick(chains, rows)._replace(log_probs=log_probs.log_softmax(dim=1))
+
+
+def merge(chains: Chains, keep: int, radius_m: float) -> Chains:
+    """A few chains that end apart: each stands for all that end near it, with their probabilities.
+
+    The chain with the most probability around its end comes first, then that of those it does not
+    stand for, and so on; where fewer ends lie apart than are kept, the others follow.
+    """
+    ends = chains.states[:, :, -1, :2]
+    near = torch.linalg.vector_norm(ends[:, :, None] - ends[:, None], dim=-1) <= radius_m
+    probabilities = chains.log_probs.exp()
+    left, rank = probabilities, torch.zeros_like(probabilities)
+    rows, masses = [], []
+    for _ in range(min(keep, left.shape[1])):
+        around = (near * left[:, None]).sum(dim=2)
+        # First those that nobody stands for, then those not taken yet, last those taken.
+        row = (torch.where(rank > 0, probabilities, around) - 2 * rank).argmax(dim=1, keepdim=True)
+        masses.append(around.gather(1, row))
+        rows.append(row)
+        told = near.gather(1, row[:, :, None].expand(-1, 1, near.shape[2]))[:, 0]
+        left = torch.where(told, 0.0, left)
+        rank = torch.maximum(rank, told.to(rank)).scatter(1, row, 2.0)
+    log_probs = (torch.cat(masses, dim=1) + MIN_MASS).log().log_softmax(dim=1)
+    return pick(chains, torch.cat(rows, dim=1))._replace(log_probs=log_probs)
 
 
 def pick(chains: Chains, rows: Int[Tensor, "n k"]) -> Chains:

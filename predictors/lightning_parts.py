@@ -18,6 +18,7 @@ from predictors.batch import Batch, Labels
 from predictors.checkpoint import save_weights
 from predictors.diagnosis import Diagnosis
 from predictors.hardware import gathered, share_buffers
+from predictors.modes import ANNEAL_UNTIL
 from predictors.network import AbstractNetwork, Features, Moment
 from predictors.recipes import TrainingConfig
 from predictors.samples import Batches, epoch_rows
@@ -129,6 +130,18 @@ class Fit(pl.LightningModule):
         if not isinstance(scheduler, ReduceLROnPlateau):
             scheduler.step()
 
+    @property
+    def is_learning_modes(self) -> bool:
+        """Whether this epoch's modes are what training is after, so that it may be selected.
+
+        Not before pre-training is over, nor while annealing still lets modes share their labels.
+        """
+        if self.config.network.annealed:
+            ended = (self.current_epoch + 1) / self.config.all_epochs
+            if ended <= ANNEAL_UNTIL and ended < 1:
+                return False
+        return self.current_epoch >= self.config.pretraining_epochs
+
     def step_plateau(self, loss: float) -> None:
         """Tells the schedule `plateau` an epoch's validation loss; other schedules do not care."""
         scheduler = self.lr_schedulers()
@@ -237,7 +250,7 @@ class KeepBest(pl.Callback):
         """Writes the weights first, so that the state never speaks of some that are not there."""
         value = float(trainer.callback_metrics[SELECTED_BY])
         fit = pl_module if isinstance(pl_module, Fit) else None
-        learned = fit is None or trainer.current_epoch >= fit.config.pretraining_epochs
+        learned = fit is None or fit.is_learning_modes
         if learned and value < self.best_value:
             self.best_value, self.best_epoch = value, trainer.current_epoch
             network: nn.Module = pl_module.get_submodule("network")

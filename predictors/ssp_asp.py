@@ -17,7 +17,6 @@ Dimensions: n targets, m modes, t ticks of a segment, z features.
 
 import copy
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
 from typing import ClassVar, NamedTuple, final
 
 import torch
@@ -26,10 +25,9 @@ from torch import Tensor, nn
 from torch.nn import functional
 
 from asp_env.data.predictor import Predictor
-from asp_env.dynamics.bicycle import Integrator
 from asp_env.errors import AspEnvError
 from predictors.batch import Batch, Labels
-from predictors.chaining import Chaining, Chains, grow, prune, starts
+from predictors.chaining import Chaining, Chains, grow, merge, prune, starts
 from predictors.encoders import make_encoder
 from predictors.heads import ConnectedHead, RecurrentReader
 from predictors.modes import HUBER_M, best_mode, into_frame, mode_terms
@@ -38,59 +36,14 @@ from predictors.network import (
     Features,
     Modes,
     Moment,
-    NetworkConfig,
     NetworkShape,
     drive_from,
     start_states,
 )
+from predictors.ssp_config import SSPASPConfig
 
 RECONSTRUCTOR = (256, 128, 64)
 """Widths of ξ."""
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class SSPASPConfig(NetworkConfig):
-    """What decides the network and its loss; the defaults are the paper's."""
-
-    gru_width: int = 512
-    gru_layers: int = 2
-    skip: bool = False
-    """Whether the features, the present speed and the past actions also reach γ's output."""
-    hidden: int = 0
-    """Width of a hidden layer before γ's output; 0 for none, as in the paper."""
-    integrator: Integrator = "euler"
-    normalise: bool = False
-    """Whether features are normalised where they are made, before all that reads them."""
-    stop_gradient: bool = False
-    """Whether the encoded features of the segment to come are a fixed target for ψ."""
-    ema: float = 0.0
-    """How slowly a second encoder follows φ to make that target instead, such as 0.99; 0: none."""
-    encoded_branch: bool = True
-    """Whether γ also learns on encoded features of the segment to come."""
-    scheduled: bool = False
-    """Whether, in training, ever more later segments follow the most probable mode of the one
-    before in place of the one matched to the label."""
-    action_weight: float = 1.0
-    """w1, of the reconstruction of actions."""
-    feature_weight: float = 1.0
-    """w2, of the mismatch of features."""
-    regression_weight: float = 1.0
-    """w3."""
-    classification_weight: float = 1.0
-    """w4."""
-
-    def __post_init__(self) -> None:
-        """Checks the sizes.
-
-        Raises:
-            AspEnvError: one is not positive, or `ema` is not in [0, 1).
-        """
-        self.check_positive("features", "modes", "gru_width", "gru_layers")
-        if self.hidden < 0 or not 0 <= self.ema < 1:
-            raise AspEnvError(
-                f"network: hidden is {self.hidden} and ema {self.ema}, expected 0 or more and "
-                "within [0, 1)"
-            )
 
 
 class Place(NamedTuple):
@@ -154,12 +107,18 @@ class SSPASPNetwork(AbstractNetwork):
         with torch.autocast(z.device.type, enabled=False):
             past = self.scaled_actions(batch.actions)
             chains = self._segment(Place(z, past, start_states(batch), batch.length_m))
+            chains = self._kept(chains, chaining)
             for _ in self.later_ticks[1:]:
                 chains = starts(chains, chaining, label=label, assignment=self.config.assignment)
-                chains = grow(chains, self._go_on(chains, batch))
-                if chaining == "beam":
-                    chains = prune(chains, self.config.modes)
+                chains = self._kept(grow(chains, self._go_on(chains, batch)), chaining)
         return Modes(chains.states, chains.log_probs, chains.actions)
+
+    def _kept(self, chains: Chains, chaining: Chaining) -> Chains:
+        if self._options.kept and chaining != "full":
+            ahead_s = chains.states.shape[2] * self.shape.dt_s
+            return merge(chains, self._options.kept, self._options.spread_mps * ahead_s)
+        more = chains.log_probs.shape[1] > self.config.modes
+        return prune(chains, self.config.modes) if more and chaining == "beam" else chains
 
     def encode(self, batch: Batch) -> Float[Tensor, "n z"]:
         """φ."""

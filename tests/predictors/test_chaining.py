@@ -2,10 +2,13 @@
 
 import math
 
+import numpy as np
 import pytest
 import torch
+from hypothesis import given
+from hypothesis import strategies as st
 
-from predictors.chaining import Chains, grow, pick, prune, starts
+from predictors.chaining import Chains, grow, merge, pick, prune, starts
 
 FIRST = (0.3, 0.7)
 """Probabilities of the modes of the first segment."""
@@ -118,3 +121,47 @@ def test_targets_are_chained_apart(first: Chains) -> None:
     both = both._replace(log_probs=torch.tensor([FIRST, FIRST[::-1]]).log())
     assert starts(both, "top1").z[:, 0, 0].tolist() == [1, 0]
     assert prune(both, 1).z[:, 0, 0].tolist() == [1, 0]
+
+
+def ending_at(places: list[float], probabilities: list[float]) -> Chains:
+    """Chains of one target that end at (x, 0)."""
+    states = torch.zeros(1, len(places), 2, 4)
+    states[0, :, -1, 0] = torch.tensor(places)
+    features = torch.arange(float(len(places)))[None, :, None]
+    return Chains(
+        states, torch.zeros(1, len(places), 2, 2), torch.tensor([probabilities]).log(), features
+    )
+
+
+def test_merged_chains_stand_for_those_near_by() -> None:
+    """Ends at 0, 1, 2 (0.2, 0.25, 0.15), 10 (0.3), 20 m (0.1), radius 1 m: 1, 10, 20 are kept.
+
+    The end at 1 m stands for 0.6, though the one at 10 m is the most probable single chain.
+    """
+    chains = ending_at([0.0, 1.0, 2.0, 10.0, 20.0], [0.2, 0.25, 0.15, 0.3, 0.1])
+    kept = merge(chains, 3, 1.0)
+    assert kept.states[0, :, -1, 0].tolist() == [1.0, 10.0, 20.0]
+    assert kept.z[0, :, 0].tolist() == [1.0, 3.0, 4.0]
+    np.testing.assert_allclose(kept.log_probs.exp()[0], [0.6, 0.3, 0.1], atol=2e-4)
+
+
+def test_merging_keeps_as_many_as_asked() -> None:
+    """Where all end together the others follow by probability, with next to none left to them."""
+    kept = merge(ending_at([0.0, 0.1, 0.2, 0.3], [0.1, 0.2, 0.4, 0.3]), 3, 1.0)
+    assert sorted(kept.states[0, 1:, -1, 0].tolist()) == pytest.approx([0.2, 0.3])
+    probabilities = kept.log_probs.exp()[0]
+    assert float(probabilities[0]) > 0.999
+    assert float(probabilities.sum()) == pytest.approx(1, abs=1e-6)
+
+
+@given(st.integers(0, 10_000), st.integers(1, 6), st.integers(1, 4))
+def test_merged_chains_are_among_the_chains(seed: int, count: int, keep: int) -> None:
+    """Each is one of them, none twice, the first not the worse for its neighbours; sums to one."""
+    rng = np.random.default_rng(seed)
+    probabilities = rng.dirichlet(np.ones(count))
+    chains = ending_at(rng.uniform(0, 5, count).tolist(), probabilities.tolist())
+    kept = merge(chains, keep, 1.0)
+    rows = kept.z[0, :, 0].long().tolist()
+    assert len(rows) == len(set(rows)) == min(keep, count)
+    assert float(kept.log_probs.exp().sum()) == pytest.approx(1, abs=1e-5)
+    assert float(kept.log_probs[0, 0]) >= np.log(probabilities.max()) - 1e-2

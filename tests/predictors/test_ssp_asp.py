@@ -22,7 +22,8 @@ END = Moment(share=1.0)
 
 
 def ssp(*, horizon: int = 30, seed: int = 0, **changes: Any) -> SSPASPNetwork:
-    """A tiny network for vectors whose modes differ."""
+    """A tiny network for vectors whose modes differ, trained without chance."""
+    changes = {"assignment": "angle", **changes}
     config = tiny_network("ssp-asp", "vectors", gru_width=16, **changes)
     network = make_network("ssp-asp", config, tiny_shape("vectors", horizon), seed=seed)
     assert isinstance(network, SSPASPNetwork)
