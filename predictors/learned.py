@@ -27,8 +27,8 @@ from predictors.ssp_asp import SSPASPNetwork
 TARGETS_AT_ONCE = 256
 """More are drawn and forecast in turn: on CPUs it is no slower, and the memory is bounded."""
 
-PIXELS_AT_ONCE = 1 << 26
-"""In all channels; of pictures at full size that is 64, with ResNet18 some 1.2 GiB."""
+PIXELS_AT_ONCE = 64 * 360 * 240
+"""Of pictures: 64 at full size, for which ResNet18 takes some 1.2 GiB."""
 
 
 class _Said(NamedTuple):
@@ -78,7 +78,8 @@ class Learned:
         self._temperature = temperature
         self._at_once = TARGETS_AT_ONCE
         if isinstance(view, PictureView):
-            self._at_once = min(TARGETS_AT_ONCE, max(1, PIXELS_AT_ONCE // math.prod(view.shape)))
+            pixels = math.prod(view.shape[1:])
+            self._at_once = min(TARGETS_AT_ONCE, max(1, PIXELS_AT_ONCE // pixels))
 
     @property
     def about(self) -> Mapping[str, str]:

@@ -9,7 +9,7 @@ import json
 import logging
 import os
 import warnings
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from importlib.metadata import version
 from pathlib import Path
@@ -20,6 +20,7 @@ import numpy as np
 import onnx
 import onnxruntime
 import torch
+from jaxtyping import config
 from onnxscript import opset18
 from torch import Tensor, nn
 
@@ -123,6 +124,17 @@ def inputs_of(batch: Batch) -> list[Tensor]:
     return [*seen, batch.actions, batch.motion, batch.length_m]
 
 
+def batch_of(inputs: Sequence[Tensor]) -> Batch:
+    """What the file takes, as a batch."""
+    *seen, actions, motion, length_m = inputs
+    return Batch(
+        seen=seen[0] if len(seen) == 1 else VectorTensors(*seen),
+        actions=actions,
+        motion=motion,
+        length_m=length_m,
+    )
+
+
 @final
 class _Forecaster(nn.Module):
     """Tensors in, tensors out."""
@@ -133,15 +145,7 @@ class _Forecaster(nn.Module):
         self._predictor = predictor
 
     def forward(self, *inputs: Tensor) -> tuple[Tensor, ...]:
-        *seen, actions, motion, length_m = inputs
-        modes = self._predictor.modes(
-            Batch(
-                seen=seen[0] if len(seen) == 1 else VectorTensors(*seen),
-                actions=actions,
-                motion=motion,
-                length_m=length_m,
-            )
-        )
+        modes = self._predictor.modes(batch_of(inputs))
         said = (modes.states, modes.logits)
         return said if modes.actions is None else (*said, modes.actions)
 
@@ -149,7 +153,7 @@ class _Forecaster(nn.Module):
 def _to_onnx(predictor: Learned, metadata: dict[str, str]) -> bytes:
     names = input_names(predictor)
     inputs = _random_inputs(predictor, 2)
-    with _silence(), torch.no_grad():
+    with _undisturbed(), torch.no_grad():
         axis = torch.export.Dim(TARGETS)
         program = torch.export.export(
             _Forecaster(predictor),
@@ -262,14 +266,18 @@ _TRANSLATIONS: Mapping[Any, Callable[..., Any]] = MappingProxyType(
 
 
 @contextmanager
-def _silence() -> Iterator[None]:
-    """The exporter warns of packages that nothing here needs, and of its own deprecations."""
-    log = logging.getLogger("torch.onnx")
-    level = log.level
-    log.setLevel(logging.ERROR)
+def _undisturbed() -> Iterator[None]:
+    """No checks of shapes at run time, which would fix the open axis, and no advice.
+
+    The exporter warns of packages that nothing here needs, and of its own deprecations.
+    """
+    checked, logged = config.jaxtyping_disable, logging.root.manager.disable
+    config.update("jaxtyping_disable", True)
+    logging.disable(logging.WARNING)
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")
             yield
     finally:
-        log.setLevel(level)
+        logging.disable(logged)
+        config.update("jaxtyping_disable", checked)
