@@ -114,9 +114,10 @@ class SSPASPNetwork(AbstractNetwork):
         return Modes(chains.states, chains.log_probs, chains.actions)
 
     def _kept(self, chains: Chains, chaining: Chaining) -> Chains:
-        if self._options.kept and chaining != "full":
+        kept = self._options.kept
+        if 0 < kept < chains.log_probs.shape[1] and chaining != "full":
             ahead_s = chains.states.shape[2] * self.shape.dt_s
-            return merge(chains, self._options.kept, self._options.spread_mps * ahead_s)
+            return merge(chains, kept, self._options.spread_mps * ahead_s)
         more = chains.log_probs.shape[1] > self.config.modes
         return prune(chains, self.config.modes) if more and chaining == "beam" else chains
 

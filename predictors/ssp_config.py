@@ -32,7 +32,7 @@ class SSPASPConfig(NetworkConfig):
     kept: int = 0
     """Of all modes, how many a forecast keeps: those that end apart, each with the probability of
     those that end near it. 0 keeps every mode, or in a beam the most probable chains."""
-    spread_mps: float = 0.5
+    spread_mps: float = 0.4
     """How near that is, for each second ahead."""
     action_weight: float = 1.0
     """w1, of the reconstruction of actions."""
