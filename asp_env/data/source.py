@@ -41,7 +41,7 @@ class Recordings(Sequence[Any]):  # not of Recording: checking its items at run 
         self.source = source
         self.names = tuple(each.name for each in files)
         self._files = tuple(files)
-        self._opened = Opened(recordings={}, maps={}) if opened is None else opened
+        self._opened = Opened() if opened is None else opened
 
     def __len__(self) -> int:
         """How many there are."""
@@ -76,7 +76,7 @@ class Recordings(Sequence[Any]):  # not of Recording: checking its items at run 
         Raises:
             DataError: a file is missing.
         """
-        return tuple(content_hash(files) for files in self._files)
+        return tuple(content_hash(files, self._opened) for files in self._files)
 
     def data_hash(self) -> str:
         """A hash of the content of all recordings, whatever their folder is called.

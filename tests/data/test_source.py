@@ -3,12 +3,13 @@
 import os
 import struct
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 
 from asp_env import registry
-from asp_env.data.readers import opening
+from asp_env.data.readers import levelx, opening
 from asp_env.data.recording import Recording
 from asp_env.data.source import Recordings, load, open_data
 from asp_env.errors import AspEnvError, DataError
@@ -239,6 +240,25 @@ def test_hash_is_kept(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
 
     monkeypatch.setattr(opening.cache, "digest", refuse)
     assert open_data(folder).data_hash() == expected
+
+
+def test_folders_are_searched_once(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Opening and hashing three recordings looks through each folder as often as one does."""
+    searched: list[Path] = []
+    walk = os.walk
+
+    def counted(root: Path, *, followlinks: bool) -> Any:
+        searched.append(root)
+        return walk(root, followlinks=followlinks)
+
+    monkeypatch.setattr(levelx.os, "walk", counted)
+    recordings = open_data(folder)
+    assert recordings[0].road_map is recordings[1].road_map
+    once = len(searched)
+    assert len(list(recordings)) == len(recordings.hashes()) == 3
+    recordings.data_hash()
+    assert recordings.subset([1]).hashes() == recordings.hashes()[1:2]
+    assert len(searched) == once
 
 
 def test_registered_source(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:

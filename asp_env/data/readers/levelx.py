@@ -141,19 +141,28 @@ def read_recording_meta(path: Path) -> RecordingMeta:
     )
 
 
-def find_map(files: RecordingFiles, meta: RecordingMeta) -> Path:
+def find_map(
+    files: RecordingFiles, meta: RecordingMeta, maps_below: dict[Path, list[Path]]
+) -> Path:
     """The lanelet2 map of a recording: the nearest, going up from it, that fits its location.
 
     A map fits if its own name ends in the location's id (`location1.osm`), or its folder's name
     begins with it (`01_bendplatz`). Of several, inD's construction map serves the recordings made
     then and no others. Without a name that fits, the map within 1 km of the recording serves.
 
+    Args:
+        files: the recording's files.
+        meta: its metadata.
+        maps_below: the maps in and below folders, as far as these were searched; is added to.
+
     Raises:
         DataError: there is none.
     """
     for folder in _upwards(files):
-        maps = [place / name for place, names in _walk(folder) for name in names]
-        maps = sorted(path for path in maps if path.suffix == ".osm")
+        if folder not in maps_below:
+            paths = (place / name for place, names in _walk(folder) for name in names)
+            maps_below[folder] = sorted(path for path in paths if path.suffix == ".osm")
+        maps = maps_below[folder]
         fitting = [path for path in maps if _names_location(path, meta.location)]
         under_construction = meta.location == 1 and meta.number in CONSTRUCTION_RECORDINGS
         preferred = [path for path in fitting if _is_construction(path) == under_construction]

@@ -4,7 +4,7 @@ import hashlib
 import struct
 import warnings
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -33,10 +33,15 @@ _MAP_PARTS = ("lines", "drivable", "lanes")
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Opened:
-    """What is open already, so that recordings of one place share one map."""
+    """What is known already, so that one place has one map and no folder is searched twice."""
 
-    recordings: dict[str, Recording]
-    maps: dict[tuple[Path, Origin], RoadMap]
+    recordings: dict[str, Recording] = field(default_factory=dict)
+    maps: dict[tuple[Path, Origin], RoadMap] = field(default_factory=dict)
+    places: dict[str, tuple[RecordingMeta, Path]] = field(default_factory=dict)
+    """Of each recording: its metadata, and where its map lies."""
+    hashes: dict[str, str] = field(default_factory=dict)
+    maps_below: dict[Path, list[Path]] = field(default_factory=dict)
+    """By folder; without it, finding the maps of N recordings would look at N² files."""
 
 
 def open_recording(files: RecordingFiles, opened: Opened) -> Recording:
@@ -46,30 +51,39 @@ def open_recording(files: RecordingFiles, opened: Opened) -> Recording:
         DataError: its files are damaged.
     """
     if files.name not in opened.recordings:
-        files.check_complete()
-        meta = read_recording_meta(files.recording_meta)
-        place = (find_map(files, meta), meta.origin)
+        meta, map_path = _place(files, opened)
+        place = (map_path, meta.origin)
         recording = _recording(files, meta, opened.maps.get(place) or _road_map(*place))
         opened.maps[place] = recording.road_map
         opened.recordings[files.name] = recording
     return opened.recordings[files.name]
 
 
-def content_hash(files: RecordingFiles) -> str:
+def content_hash(files: RecordingFiles, opened: Opened) -> str:
     """A hash of the content of a recording's tables and map; the picture does not count.
 
     Raises:
         DataError: a file is missing.
     """
-    files.check_complete()
-    map_path = find_map(files, read_recording_meta(files.recording_meta))
-    sources = (*files.tables, map_path)
+    if files.name not in opened.hashes:
+        _, map_path = _place(files, opened)
+        sources = (*files.tables, map_path)
 
-    def make() -> Entry:
-        digests = "".join(cache.digest(path) for path in sources)
-        return {"hash": hashlib.sha256(digests.encode()).hexdigest()}, {}
+        def make() -> Entry:
+            digests = "".join(cache.digest(path) for path in sources)
+            return {"hash": hashlib.sha256(digests.encode()).hexdigest()}, {}
 
-    return str(_cached(files.tracks, sources, make, "hash")[0]["hash"])
+        facts, _ = _cached(files.tracks, sources, make, "hash")
+        opened.hashes[files.name] = str(facts["hash"])
+    return opened.hashes[files.name]
+
+
+def _place(files: RecordingFiles, opened: Opened) -> tuple[RecordingMeta, Path]:
+    if files.name not in opened.places:
+        files.check_complete()
+        meta = read_recording_meta(files.recording_meta)
+        opened.places[files.name] = (meta, find_map(files, meta, opened.maps_below))
+    return opened.places[files.name]
 
 
 def _recording(files: RecordingFiles, meta: RecordingMeta, road_map: RoadMap) -> Recording:
