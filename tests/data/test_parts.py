@@ -2,6 +2,7 @@
 
 import dataclasses
 from collections.abc import Iterator
+from typing import Any
 
 import hypothesis.strategies as st
 import numpy as np
@@ -15,7 +16,8 @@ from asp_env.data.source import Recordings
 from asp_env.errors import AspEnvError
 from tests.builders import make_recording
 
-RECORDING = make_recording(duration_s=5.0)
+RECORDING = make_recording(duration_s=8.0)
+"""With snippets of 3 s, by which recordings are dealt."""
 
 
 class MadeUp(Recordings):
@@ -29,6 +31,10 @@ class MadeUp(Recordings):
     def __len__(self) -> int:
         """How many there are."""
         return len(self.made)
+
+    def __getitem__(self, index: Any) -> Any:
+        """One of them."""
+        return self.made[index]
 
     def __iter__(self) -> Iterator[Recording]:
         """One after the other."""
