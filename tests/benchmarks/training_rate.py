@@ -13,6 +13,7 @@ import torch
 from rich.console import Console
 from rich.table import Table
 
+from asp_env import registry
 from asp_env.data.snippets import index_snippets
 from asp_env.data.source import open_data
 from asp_env.views import make_view
@@ -21,7 +22,6 @@ from predictors.checkpoint import shape_for
 from predictors.network import AbstractNetwork, LearnedPlug, Moment
 from predictors.recipes import recipe
 from predictors.samples import Batches
-from predictors.ssp_asp import SSPASP
 
 DATA = "sample:intersection"
 BATCH = 32
@@ -63,7 +63,7 @@ def make_trial(view_name: str, encoder: str, pixels: tuple[int, int] | None) -> 
     config = recipe("ssp-asp", "cpu", view=view_name, horizon_s=3.0)
     view = make_view(view_name, pixels=pixels)
     shape = shape_for(view, history=15, horizon=15, dt_s=0.2, action_range=(4.0, 0.5))
-    plug: LearnedPlug = SSPASP
+    plug: LearnedPlug = registry.find("predictors", "ssp-asp")
     network = plug.network(dataclasses.replace(config.network, encoder=encoder), shape)
     recordings = open_data(DATA)
     index = index_snippets(recordings, dt_s=0.2, horizon_s=3.0)
