@@ -40,6 +40,12 @@ def change_network(run: Path, **fields: Any) -> None:
     change(run, network={**config["network"], **fields})
 
 
+def change_training(run: Path, **fields: Any) -> None:
+    """Other values for what it says of its training."""
+    provenance = json.loads((run / "config.json").read_text())["provenance"]
+    change(run, provenance={**provenance, "config": {**provenance["config"], **fields}})
+
+
 def drop(run: Path, field: str) -> None:
     """A configuration without one of its fields."""
     path = run / "config.json"
@@ -96,6 +102,35 @@ FAULTS: dict[str, tuple[Callable[[Path], Any], str]] = {
     "field of another type": (lambda run: change_network(run, features="x"), "does not describe"),
     "other shapes": (lambda run: change_network(run, gru_width=9), "does not fit"),
     "weights for another horizon": (lambda run: change(run, horizon=30), "does not fit"),
+    "horizon of nothing": (lambda run: change(run, horizon=0), "horizon is 0, expected a positive"),
+    "time step that is no number": (
+        lambda run: change(run, dt_s=float("nan")),
+        "dt_s is nan, expected a positive",
+    ),
+    "endless horizon": (lambda run: change(run, horizon=float("inf")), "horizon is inf"),
+    "temperature that is no number": (
+        lambda run: change(run, temperature=float("nan")),
+        "temperature is nan, expected a positive",
+    ),
+    "temperature of zero": (lambda run: change(run, temperature=0), "temperature is 0"),
+    "negative temperature": (lambda run: change(run, temperature=-1.5), r"temperature is -1\.5"),
+    "normaliser that is no number": (
+        lambda run: change(run, normaliser={"action_range": [float("nan"), 0.5]}),
+        "action_range is nan",
+    ),
+    "view that is a word": (lambda run: change(run, view="moon"), "does not describe"),
+    "provenance that is a list": (lambda run: change(run, provenance=[]), "does not describe"),
+    "other view of the same size": (
+        lambda run: (
+            change_training(run, view="chauffeurnet"),
+            change(run, view=make_view("chauffeurnet-no-trail", pixels=(36, 24)).config()),
+        ),
+        "view is chauffeurnet-no-trail, but it was trained with chauffeurnet",
+    ),
+    "other horizon than trained": (
+        lambda run: change_training(run, horizon_s=6.0),
+        r"horizon_s is 3\.0, but it was trained with 6\.0",
+    ),
     "weights of another network": (
         lambda run: save_file({"w": torch.zeros(2)}, run / "weights.safetensors"),
         "does not fit",
@@ -118,6 +153,41 @@ def test_missing_argument_says_how_to_name_a_run() -> None:
     """`ffw-asp` alone is not enough."""
     with pytest.raises(CheckpointError, match="ffw-asp:RUN_DIR"):
         load_predictor("ffw-asp", horizon=15, dt_s=0.2)
+
+
+def test_six_seconds_with_a_wrong_horizon_are_refused(tmp_path: Path) -> None:
+    """Weights of ssp-asp fit any number of segments; what it was trained for is remembered."""
+    run = save_random(tmp_path / "run", "ssp-asp", horizon=30)
+    change(run, horizon=31)
+    with pytest.raises(CheckpointError, match=r"chains segments of 3 s, the horizon of 6\.2 s"):
+        load_predictor(f"ssp-asp:{run}", horizon=15, dt_s=0.2)
+    change(run, horizon=45)
+    change_training(run, horizon_s=6.0)
+    with pytest.raises(CheckpointError, match=r"horizon_s is 9\.0, but it was trained with 6\.0"):
+        load_predictor(f"ssp-asp:{run}", horizon=15, dt_s=0.2)
+
+
+def test_chaining_is_named_behind_the_last_at(tmp_path: Path) -> None:
+    """By beam without one; a folder with an @ in its name is one; unknown ones are listed."""
+    run = save_random(tmp_path / "runs@home" / "a", "ssp-asp", horizon=30)
+    for name, chaining in ((f"{run}", "beam"), (f"{run}@top1", "top1"), (f"{run}@full", "full")):
+        about = load_predictor(f"ssp-asp:{name}", horizon=15, dt_s=0.2).about
+        assert about["chaining"] == chaining
+    assert load_predictor(f"ssp-asp:{run}@oracle", horizon=15, dt_s=0.2).privileged
+    with pytest.raises(AspEnvError, match=r"unknown chaining 'top' \(did you mean 'top1'"):
+        load_predictor(f"ssp-asp:{run}@top", horizon=15, dt_s=0.2)
+    with pytest.raises(CheckpointError, match="runs@work/a holds no trained predictor"):
+        load_predictor(f"ssp-asp:{tmp_path}/runs@work/a", horizon=15, dt_s=0.2)
+    whole = save_random(tmp_path / "b@top1", "ssp-asp", horizon=30)
+    assert load_predictor(f"ssp-asp:{whole}", horizon=15, dt_s=0.2).about["chaining"] == "beam"
+
+
+@pytest.mark.parametrize("predictor", ["ffw-asp", "ssp-asp"])
+def test_what_chains_nothing_takes_no_chaining(predictor: str, tmp_path: Path) -> None:
+    """3 s are forecast at once, by ssp-asp too: the line says how to name the run."""
+    run = save_random(tmp_path / "run", predictor)
+    with pytest.raises(AspEnvError, match=f"nothing to chain: .* as {predictor}:{run}$"):
+        load_predictor(f"{predictor}:{run}@top1", horizon=15, dt_s=0.2)
 
 
 def test_other_time_step_is_refused(run: Path) -> None:
