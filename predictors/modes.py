@@ -1,18 +1,25 @@
 """Which of several modes is trained on a label, and what it costs."""
 
-import math
+from collections.abc import Mapping
+from types import MappingProxyType
 from typing import Literal
 
 import torch
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Float, Int
 from torch import Tensor
 from torch.nn import functional
+
+from asp_env.metrics import mode_choice
+from asp_env.metrics.mode_choice import ModeRule, ends_alike
 
 Assignment = Literal["angle", "distance", "angle-random"]
 Classification = Literal["cross-entropy", "softmax"]
 
-MAX_ANGLE_RAD = math.radians(5.0)
-STANDING_M = 2.0
+RULES: Mapping[Assignment, ModeRule] = MappingProxyType(
+    {"angle": "paper", "angle-random": "paper", "distance": "ade"}
+)
+"""What each assignment is called where forecasts are judged."""
+
 HUBER_M = 1.0
 
 ANNEAL_FROM_M = 8.0
@@ -33,11 +40,7 @@ def best_mode(
     within 2 m has no direction: distance alone. `angle-random` is `angle` but in losses, where it
     takes `chance_mode` if there is none.
     """
-    distance = _distances_m(positions, label)
-    if assignment != "distance":
-        aside = _aside(positions, label)
-        distance = distance.masked_fill(aside & ~aside.all(dim=1, keepdim=True), math.inf)
-    return distance.argmin(dim=1)
+    return mode_choice.best_mode(positions, label, RULES[assignment])
 
 
 def chance_mode(
@@ -48,27 +51,11 @@ def chance_mode(
     Without that, a mode that wins all labels at first may keep them: others never learn. Chance is
     read off the last bits of the distances, so that equal weights and labels draw alike.
     """
-    aside = _aside(positions, label)
-    bits = _distances_m(positions, label).float().contiguous().view(torch.int32).long()
+    distance = torch.linalg.vector_norm(positions - label[:, None], dim=-1).mean(dim=-1)
+    bits = distance.float().contiguous().view(torch.int32).long()
     drawn = (bits * 2_654_435_761 >> 8 & 0xFFFF).argmax(dim=1)
-    return torch.where(aside.all(dim=1), drawn, best_mode(positions, label, "angle"))
-
-
-def _distances_m(
-    positions: Float[Tensor, "n m t 2"], label: Float[Tensor, "n t 2"]
-) -> Float[Tensor, "n m"]:
-    return torch.linalg.vector_norm(positions - label[:, None], dim=-1).mean(dim=-1)
-
-
-def _aside(
-    positions: Float[Tensor, "n m t 2"], label: Float[Tensor, "n t 2"]
-) -> Bool[Tensor, "n m"]:
-    """Whether a mode ends in another direction than the label does, if that has one."""
-    end, label_end = positions[:, :, -1], label[:, None, -1]
-    cross = end[..., 0] * label_end[..., 1] - end[..., 1] * label_end[..., 0]
-    dot = (end * label_end).sum(dim=-1)
-    has_direction = torch.linalg.vector_norm(label_end, dim=-1) >= STANDING_M
-    return (torch.atan2(cross, dot).abs() > MAX_ANGLE_RAD) & has_direction
+    decided = ends_alike(positions, label).any(dim=1)
+    return torch.where(decided, best_mode(positions, label, "angle"), drawn)
 
 
 def mode_terms(

@@ -48,10 +48,19 @@ def best_mode(
     distance_m = away_m[..., -1] if rule == "fde" else away_m.mean(axis=-1)
     allowed = xp.ones_like(distance_m, dtype=bool) if among is None else among
     if rule == "paper":
-        end, true_end = positions[:, :, -1], truth[:, None, -1]
-        cross = end[..., 0] * true_end[..., 1] - end[..., 1] * true_end[..., 0]
-        dot = (end * true_end).sum(axis=-1)
-        near = allowed & (xp.abs(xp.arctan2(cross, dot)) <= MAX_ANGLE_RAD)
-        has_direction = xp.linalg.vector_norm(true_end, axis=-1) >= STANDING_M
-        allowed = xp.where(has_direction & near.any(axis=1)[:, None], near, allowed)
+        near = allowed & ends_alike(positions, truth)
+        allowed = xp.where(near.any(axis=1)[:, None], near, allowed)
     return xp.where(allowed, distance_m, math.inf).argmin(axis=1)
+
+
+def ends_alike(positions: Float[Any, "n m t 2"], truth: Float[Any, "n t 2"]) -> Bool[Any, "n m"]:
+    """(n, m) whether a mode ends within 5° of where the truth ends, seen from (0, 0).
+
+    All modes do where the truth ends within 2 m, and so has no direction.
+    """
+    xp = namespace(positions)
+    end, true_end = positions[:, :, -1], truth[:, None, -1]
+    cross = end[..., 0] * true_end[..., 1] - end[..., 1] * true_end[..., 0]
+    dot = (end * true_end).sum(axis=-1)
+    stands = xp.linalg.vector_norm(true_end, axis=-1) < STANDING_M
+    return (xp.abs(xp.arctan2(cross, dot)) <= MAX_ANGLE_RAD) | stands
