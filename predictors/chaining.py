@@ -78,8 +78,8 @@ def prune(chains: Chains, keep: int) -> Chains:
 def merge(chains: Chains, keep: int, radius_m: float) -> Chains:
     """A few chains that end apart: each stands for all that end near it, with their probabilities.
 
-    The chain with the most probability around its end comes first, then that of those it does not
-    stand for, and so on; where fewer ends lie apart than are kept, the others follow.
+    The most probable chain comes first, then the most probable of those that no other stands for;
+    where fewer ends lie apart than are kept, the most probable others follow.
     """
     ends = chains.states[:, :, -1, :2]
     near = torch.linalg.vector_norm(ends[:, :, None] - ends[:, None], dim=-1) <= radius_m
@@ -87,12 +87,11 @@ def merge(chains: Chains, keep: int, radius_m: float) -> Chains:
     left, rank = probabilities, torch.zeros_like(probabilities)
     rows, masses = [], []
     for _ in range(min(keep, left.shape[1])):
-        around = (near * left[:, None]).sum(dim=2)
         # First those that nobody stands for, then those not taken yet, last those taken.
-        row = (torch.where(rank > 0, probabilities, around) - 2 * rank).argmax(dim=1, keepdim=True)
-        masses.append(around.gather(1, row))
-        rows.append(row)
+        row = (probabilities - 2 * rank).argmax(dim=1, keepdim=True)
         told = near.gather(1, row[:, :, None].expand(-1, 1, near.shape[2]))[:, 0]
+        masses.append(torch.where(told, left, 0.0).sum(dim=1, keepdim=True))
+        rows.append(row)
         left = torch.where(told, 0.0, left)
         rank = torch.maximum(rank, told.to(rank)).scatter(1, row, 2.0)
     log_probs = (torch.cat(masses, dim=1) + MIN_MASS).log().log_softmax(dim=1)

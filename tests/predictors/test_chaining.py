@@ -136,13 +136,13 @@ def ending_at(places: list[float], probabilities: list[float]) -> Chains:
 def test_merged_chains_stand_for_those_near_by() -> None:
     """Ends at 0, 1, 2 (0.2, 0.25, 0.15), 10 (0.3), 20 m (0.1), radius 1 m: 1, 10, 20 are kept.
 
-    The end at 1 m stands for 0.6, though the one at 10 m is the most probable single chain.
+    The end at 10 m is the most probable single chain; that at 1 m stands for 0.6 and so for most.
     """
     chains = ending_at([0.0, 1.0, 2.0, 10.0, 20.0], [0.2, 0.25, 0.15, 0.3, 0.1])
     kept = merge(chains, 3, 1.0)
-    assert kept.states[0, :, -1, 0].tolist() == [1.0, 10.0, 20.0]
-    assert kept.z[0, :, 0].tolist() == [1.0, 3.0, 4.0]
-    np.testing.assert_allclose(kept.log_probs.exp()[0], [0.6, 0.3, 0.1], atol=2e-4)
+    assert kept.states[0, :, -1, 0].tolist() == [10.0, 1.0, 20.0]
+    assert kept.z[0, :, 0].tolist() == [3.0, 1.0, 4.0]
+    np.testing.assert_allclose(kept.log_probs.exp()[0], [0.3, 0.6, 0.1], atol=2e-4)
 
 
 def test_merging_keeps_as_many_as_asked() -> None:
