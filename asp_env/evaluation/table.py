@@ -2,9 +2,10 @@
 
 import fcntl
 import json
+import os
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
-from dataclasses import asdict, dataclass
+from dataclasses import MISSING, asdict, dataclass, fields, is_dataclass
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -150,22 +151,23 @@ class Table:
                 ablation_view=self.ablation_view,
             )
             for cell in cells:
-                self._recipe(cell)
+                self._recipes(cell)
         except ModuleNotFoundError as error:
             raise MissingExtraError(str(error.name), "train", "training") from error
         return cells
 
-    def _recipe(self, cell: Cell) -> dict[str, Any] | None:
-        """What the configuration of a cell's run must be, but for its data; None without one.
+    def _recipes(self, cell: Cell) -> dict[str, Any]:
+        """What the configuration of a cell's run must be, but for its data; nothing without one.
 
         Raises:
             AspEnvError: there is no such recipe.
         """
         if cell.seed is None:
-            return None
+            return {}
         train = registry.find("commands", "train")
         config = train(**self._options(cell), data="", out=Path()).config_for(cell.horizon_s)
-        return json.loads(json.dumps(asdict(config)))
+        found = {"recipe": asdict(config), "defaults": _defaults(config)}
+        return json.loads(json.dumps(found))
 
     def _options(self, cell: Cell) -> dict[str, Any]:
         """The options of `train` that are not about data and folders."""
@@ -189,10 +191,10 @@ class Table:
             where = {"data": site.data, "validation": site.validation}
             train = {**self._options(cell), **where, "out": str(run), "start": start}
         if cell.horizon_s not in self.horizons:
-            return Job(train=train, judging=None, recipe=self._recipe(cell))
+            return Job(train=train, judging=None, **self._recipes(cell))
         return Job(
             train=train,
-            recipe=self._recipe(cell),
+            **self._recipes(cell),
             judging=Judging(
                 predictor=cell.predictor,
                 run="" if train is None else str(run),
@@ -232,6 +234,13 @@ class Table:
         }
 
 
+def _defaults(config: Any) -> dict[str, Any]:
+    """Of a dataclass, those of its fields that have one, and of dataclasses in it."""
+    found = {each.name: each.default for each in fields(config) if each.default is not MISSING}
+    inner = {each.name: getattr(config, each.name) for each in fields(config)}
+    return found | {name: _defaults(value) for name, value in inner.items() if is_dataclass(value)}
+
+
 @contextmanager
 def _claimed(out: Path, fixed: dict[str, Any], *, alone: bool) -> Iterator[None]:
     """The folder, for this table and, if `alone`, for this command.
@@ -240,7 +249,9 @@ def _claimed(out: Path, fixed: dict[str, Any], *, alone: bool) -> Iterator[None]
         AspEnvError: it holds something else, or another command is at it.
     """
     path = out / PLAN
-    if not path.exists() and out.exists() and (not out.is_dir() or any(out.iterdir())):
+    begun = {LOCK, f".{PLAN}.part"}  # all that a command which ends at once leaves behind
+    foreign = out.exists() and (not out.is_dir() or {each.name for each in out.iterdir()} - begun)
+    if foreign and not path.exists():
         raise AspEnvError(f"{out}: holds something that is no table; choose another --out")
     out.mkdir(parents=True, exist_ok=True)
     with (out / LOCK).open("w") as lock:
@@ -253,10 +264,19 @@ def _claimed(out: Path, fixed: dict[str, Any], *, alone: bool) -> Iterator[None]
             ) from error
         same = json.loads(json.dumps(fixed))
         if not path.exists():
-            path.write_text(json.dumps(fixed, indent=1) + "\n")
-        elif (found := json.loads(path.read_text())) != same:
+            aside = path.with_name(f".{PLAN}.part")
+            aside.write_text(json.dumps(fixed, indent=1) + "\n")
+            os.replace(aside, path)
+        elif (found := _read_plan(path)) != same:
             other = ", ".join(name for name in same if found.get(name) != same[name])
             raise AspEnvError(
                 f"{out}: holds a table of other {other}; choose another --out or remove it"
             )
         yield
+
+
+def _read_plan(path: Path) -> dict[str, Any]:
+    try:
+        return dict(json.loads(path.read_text()))
+    except (TypeError, ValueError) as error:
+        raise AspEnvError(f"{path}: cannot be read ({error}); choose another --out") from error

@@ -313,3 +313,19 @@ def test_other_tables_folders_are_refused(
     assert main(["table", data, "--out", str(tmp_path), *OPTIONS]) == 2
     assert "holds something that is no table" in capsys.readouterr().err
     assert [path.name for path in tmp_path.iterdir()] == ["letter.txt"]
+
+
+def test_folders_of_commands_that_were_killed(
+    data: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """One that was killed before it said what it is may begin again; half a plan is told."""
+    begun = tmp_path / "begun"
+    begun.mkdir()
+    (begun / ".lock").touch()
+    assert main(["table", data, "--out", str(begun), *OPTIONS, "--jobs", "0"]) == 0
+    (begun / "plan.json").write_text('{"sites":')
+    capsys.readouterr()
+    assert main(["table", data, "--out", str(begun), *OPTIONS, "--jobs", "0"]) == 2
+    said = capsys.readouterr().err
+    assert "plan.json: cannot be read" in said
+    assert said.count("\n") == 1

@@ -1,5 +1,7 @@
 """Which cells a table has, what comes before what, and what a cell's process does."""
 
+import dataclasses
+import hashlib
 import json
 import os
 import signal
@@ -239,16 +241,62 @@ def test_killed_cell_is_gone_on_with(
     assert json.loads((tmp_path / "cost.json").read_text())["cells"][cell.name]["processes"] == 2
 
 
-def test_run_of_another_recipe_is_told(data: str, tmp_path: Path) -> None:
-    """A finished run whose configuration differs is named with the fields that do."""
-    run = tmp_path / "run"
+def finished_run(run: Path, **provenance: Any) -> None:
+    """A folder as far as `check` looks into it."""
     run.mkdir()
+    (run / "config.json").write_text(json.dumps({"provenance": provenance}))
+
+
+def test_run_of_another_recipe_is_told(data: str, tmp_path: Path) -> None:
+    """A finished run whose configuration differs is named with the fields that do.
+
+    One that is older than a field has its default.
+    """
+    run = tmp_path / "run"
     config = {"epochs": 8, "network": {"hidden": 4, "modes": 3}, "validation": "elsewhere"}
-    (run / "config.json").write_text(json.dumps({"provenance": {"config": config}}))
-    recipe = {"epochs": 8, "network": {"hidden": 5, "modes": 3}, "validation": None, "new": 1}
-    job = Job(train={"out": str(run), "data": data}, judging=None, recipe=recipe)
-    with pytest.raises(AspEnvError, match="trained with other hidden than the recipe"):
-        job.check()
-    same = Job(train={"out": str(run), "data": data}, judging=None, recipe=recipe | config)
-    same.check()
-    assert same.done
+    finished_run(run, config=config)
+    recipe = {"epochs": 8, "network": {"hidden": 4, "modes": 3, "kept": 0}, "validation": None}
+    job = Job(
+        train={"out": str(run), "data": data},
+        judging=None,
+        recipe=recipe,
+        defaults={"epochs": 10, "network": {"hidden": 9, "kept": 0}},
+    )
+    job.check()
+    assert job.done
+    for field, value in (("hidden", 5), ("kept", 3)):
+        changed = recipe | {"network": recipe["network"] | {field: value}}
+        other = dataclasses.replace(job, recipe=changed)
+        with pytest.raises(AspEnvError, match=f"trained with other {field} than the recipe"):
+            other.check()
+
+
+def test_run_from_other_weights_is_told(data: str, tmp_path: Path) -> None:
+    """A run that started from weights which were trained again since is no result any more.
+
+    Nor is one whose start was trained by another recipe, finished as it may be.
+    """
+    first = Cell(site="a", predictor="dkm", horizon_s=3.0, view="vectors", seed=0)
+    second = Cell(site="a", predictor="dkm", horizon_s=6.0, view="vectors", seed=0, start=first)
+    begin, run = tmp_path / "3s", tmp_path / "6s"
+    finished_run(begin, config={"epochs": 8})
+    (begin / "weights.safetensors").write_bytes(b"weights")
+    finished_run(run, config={"epochs": 4}, start=hashlib.sha256(b"weights").hexdigest())
+
+    def failed(epochs: int) -> dict[Cell, str]:
+        start = {"out": str(begin), "data": data}
+        goes_on = {"out": str(run), "data": data, "start": str(begin)}
+        jobs = {
+            first: Job(train=start, judging=None, recipe={"epochs": epochs}),
+            second: Job(train=goes_on, judging=None, recipe={"epochs": 4}),
+        }
+        campaign = Campaign(jobs, tmp_path, Console(quiet=True))
+        campaign.run(0)
+        return dict(campaign.failed)
+
+    assert failed(8) == {}
+    told = failed(9)
+    assert "other epochs" in told[first]
+    assert "starts from, failed" in told[second]
+    (begin / "weights.safetensors").write_bytes(b"others")
+    assert "started from other weights" in failed(8)[second]

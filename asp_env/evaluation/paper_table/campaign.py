@@ -91,10 +91,11 @@ class Campaign:
         """Runs what is not finished, so many processes at a time; with 0 nothing."""
         waiting = []
         for cell, job in self._jobs.items():
-            if self._fits(cell, job) and job.done:
-                self._done.add(cell)
-            elif cell not in self._failed:
-                waiting.append(cell)
+            if self._fits(cell, job):
+                if job.done and (cell.start is None or self._jobs[cell.start].trained):
+                    self._done.add(cell)
+                else:
+                    waiting.append(cell)
         if not processes:
             return
         columns = (
@@ -117,20 +118,25 @@ class Campaign:
                 self._stop()
 
     def _fits(self, cell: Cell, job: Job) -> bool:
+        """Whether what there is of a cell is what was asked for, and what it started from too."""
         try:
+            self._check_start(cell)
             job.check()
         except AspEnvError as error:
             self._failed[cell] = str(error)
             self._tell(cell, len(self._jobs))
         return cell not in self._failed
 
+    def _check_start(self, cell: Cell) -> None:
+        if cell.start is not None and cell.start in self._failed:
+            raise AspEnvError(f"{cell.start.name}, which it starts from, failed")
+
     def _start(self, waiting: Sequence[Cell], processes: int) -> list[Cell]:
         """Starts the first cells that can be; those that still wait."""
         left = []
         for cell in waiting:
             if cell.start is not None and cell.start in self._failed:
-                self._failed[cell] = f"{cell.start.name}, which it starts from, failed"
-                self._tell(cell, len(waiting))
+                self._fits(cell, self._jobs[cell])
             elif len(self._running) < processes and (
                 cell.start is None or cell.start in self._done
             ):

@@ -49,7 +49,8 @@ def main_table(
         "[95 % interval over recordings] and ± deviation over seeds of FDE"
     )
     table.caption = (
-        f"paper: Janjoš et al. 2021 on {' and '.join(DATA)}, which mode is not said;\n{CAVEAT}\n"
+        f"paper: Janjoš et al. 2021 on {' and '.join(DATA)}, which mode is not said;\n{CAVEAT};\n"
+        f"its SSP-ASP chains 6 s by label matching, as {ORACLE} {MARK} here does:\n"
         f"{MARK} is handed the recorded future"
     )
     _heads(table, sites, columns)
@@ -78,7 +79,7 @@ def difference_table(
         f"{choice.subset} targets, {choice.selection}: what is between MAE m / MSE m² / FDE m\n"
         "paired over snippets and seeds; [95 % interval over recordings] of FDE"
     )
-    table.caption = SURE
+    table.caption = f"{SURE}; {ORACLE} {MARK} is handed the recorded future"
     _heads(table, sites, columns)
     for view, members in _by_view(_lines(findings, columns, lambda k: not k.variant)).items():
         _section(table, view)

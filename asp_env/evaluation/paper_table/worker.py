@@ -16,6 +16,7 @@ from pathlib import Path
 from typing import Any, Literal
 
 from asp_env import registry
+from asp_env.data import cache
 from asp_env.data.causal import causal_histories
 from asp_env.data.clock import DEFAULT_DT_S, ticks
 from asp_env.data.predictor import load_predictor
@@ -25,6 +26,8 @@ from asp_env.evaluation.paper_table.errors import judge_snippets, snippets_to_ju
 
 FINISHED = "config.json"
 """A run that has it is finished."""
+
+WEIGHTS = "weights.safetensors"
 
 FAILED, ABANDONED = 2, 3
 
@@ -76,22 +79,33 @@ class Job:
     judging: Judging | None
     """None for a run that others start from, and nobody asked for."""
     recipe: dict[str, Any] | None = None
-    """What the run's configuration must be, as far as both name its fields."""
+    """What the run's configuration must be."""
+    defaults: dict[str, Any] | None = None
+    """Of the recipe's fields, for a run that is older than some of them."""
 
     def check(self) -> None:
         """Looks whether a finished run is the one that was asked for.
 
         Raises:
-            AspEnvError: it was trained by another recipe.
+            AspEnvError: it was trained by another recipe, or from other weights.
         """
         if self.train is None or self.recipe is None or not self.trained:
             return
         out = Path(self.train["out"])
-        found = json.loads((out / FINISHED).read_text())["provenance"]["config"]
+        provenance = json.loads((out / FINISHED).read_text())["provenance"]
+        found = _completed(provenance["config"], self.defaults or {})
         if other := _unlike(found, self.recipe):
             raise AspEnvError(
                 f"{out} was trained with other {', '.join(other)} than the recipe has now: "
                 "delete it to train it again, or choose another --out"
+            )
+        start = self.train.get("start")
+        if start is None or not (Path(start) / FINISHED).exists():
+            return
+        if provenance.get("start") != cache.digest(Path(start) / WEIGHTS):
+            raise AspEnvError(
+                f"{out} started from other weights than {start} has now: delete it to train it "
+                "again, or choose another --out"
             )
 
     @property
@@ -115,7 +129,7 @@ class Job:
         judging = fields["judging"]
         if judging is not None:
             judging = Judging(**judging | {"chainings": tuple(judging["chainings"])})
-        return cls(train=fields["train"], judging=judging, recipe=fields["recipe"])
+        return cls(**fields | {"judging": judging})
 
     def run(self) -> None:
         """Does what is not done yet.
@@ -133,6 +147,15 @@ class Job:
             registry.find("commands", "train")(**self.train | paths).run()
         if self.judging is not None and not self.judging.done:
             judge(self.judging)
+
+
+def _completed(found: dict[str, Any], defaults: dict[str, Any]) -> dict[str, Any]:
+    """A configuration with the defaults of what it does not know."""
+    whole = defaults | found
+    for name, value in defaults.items():
+        if isinstance(value, dict) and isinstance(whole[name], dict):
+            whole[name] = _completed(whole[name], value)
+    return whole
 
 
 def _unlike(found: dict[str, Any], expected: dict[str, Any]) -> list[str]:
