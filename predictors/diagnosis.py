@@ -8,60 +8,71 @@ from torch import Tensor
 
 from predictors.network import Features
 
+STILL = 1e-12
+"""Below this share of their mean square, a variance of float32 features is rounding."""
+
 
 @final
 class Diagnosis:
-    """Gathers features over a validation set."""
+    """Gathers features over a validation set, as sums: it takes no more room for more of them."""
 
     def __init__(self) -> None:
         """Empty."""
-        self._encoded: list[Tensor] = []
-        self._predicted: list[Tensor] = []
+        self._count = 0
+        self._total = torch.zeros(())
+        self._products = torch.zeros(())
+        self._missed = torch.zeros(())
 
     def add(self, features: Features | None) -> None:
-        """Keeps a batch's features, if the network has any to show."""
+        """Takes in a batch's features, if the network has any to show."""
         if features is not None:
-            self._encoded.append(features.encoded.float().cpu())
-            self._predicted.append(features.predicted.float().cpu())
+            encoded, predicted = (each.detach().cpu().double() for each in features)
+            self._count += len(encoded)
+            self._total = self._total + encoded.sum(dim=0)
+            self._products = self._products + encoded.T @ encoded
+            self._missed = self._missed + ((encoded - predicted) ** 2).sum()
 
     def join(self, other: "Diagnosis") -> None:
-        """Keeps what another one kept, of batches that another process saw."""
-        self._encoded += other._encoded
-        self._predicted += other._predicted
+        """Takes in what another one did, of batches that another process saw."""
+        self._count += other._count
+        self._total = self._total + other._total
+        self._products = self._products + other._products
+        self._missed = self._missed + other._missed
 
     def finish(self) -> dict[str, float]:
-        """The numbers by name, of all that was added; nothing where nothing was."""
-        if not self._encoded:
+        """The numbers by name, of all that was added; nothing where nothing was.
+
+        - Standard deviation: of each coordinate, mean over them.
+        - Effective rank: see `effective_rank`, of the centred features' singular values.
+        - R²: 1 less the squared errors' share of the variance, over all coordinates together. 1 is
+          a perfect prediction, 0 no better than the mean; 0 where nothing varies.
+        """
+        if not self._count:
             return {}
-        encoded, predicted = torch.cat(self._encoded), torch.cat(self._predicted)
-        self._encoded.clear()
-        self._predicted.clear()
+        mean = self._total / self._count
+        scatter = self._products - self._count * torch.outer(mean, mean)
+        spread, missed = float(scatter.trace()), float(self._missed)
+        if spread <= STILL * float(self._products.trace()):
+            scatter, spread = torch.zeros_like(scatter), 0.0
+        values = torch.linalg.eigvalsh(scatter).clamp(min=0).sqrt()
+        deviation = (scatter.diagonal().clamp(min=0) / self._count).sqrt().mean()
+        self._count = 0
+        self._total = self._products = self._missed = torch.zeros(())
         return {
-            "feature standard deviation": float(encoded.std(dim=0, correction=0).mean()),
-            "feature effective rank": effective_rank(encoded),
-            "feature R2": r_squared(predicted, encoded),
+            "feature standard deviation": float(deviation),
+            "feature effective rank": effective_rank(values),
+            "feature R2": 1 - missed / spread if spread > 0 else 0.0,
         }
 
 
-def effective_rank(features: Float[Tensor, "n z"]) -> float:
-    """The exponential of the entropy of centred features' singular values (Roy & Vetterli 2007).
+def effective_rank(values: Float[Tensor, " z"]) -> float:
+    """The exponential of the entropy of singular values (Roy & Vetterli 2007).
 
-    1 where all features follow one line, z where they fill all directions alike; 0 where nothing
-    varies.
+    1 where all but one are 0, their number where all are alike; 0 where all are 0.
     """
-    values = torch.linalg.svdvals(features - features.mean(dim=0))
     total = values.sum()
     if total <= 0:
         return 0.0
     share = values / total
     share = share[share > 0]
     return float(torch.exp(-(share * share.log()).sum()))
-
-
-def r_squared(predicted: Float[Tensor, "n z"], actual: Float[Tensor, "n z"]) -> float:
-    """1 less the squared errors' share of the variance, over all coordinates together.
-
-    1 is a perfect prediction, 0 no better than the mean; 0 where nothing varies.
-    """
-    spread = ((actual - actual.mean(dim=0)) ** 2).sum()
-    return float(1 - ((actual - predicted) ** 2).sum() / spread) if spread > 0 else 0.0
