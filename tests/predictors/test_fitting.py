@@ -42,10 +42,9 @@ def test_other_seed_gives_other_weights(data: str, finished: Path, tmp_path: Pat
 def test_run_folder_holds_no_pickles(finished: Path) -> None:
     """Configuration, weights and logs, and nothing else."""
     files = {str(path.relative_to(finished)) for path in finished.rglob("*") if path.is_file()}
-    assert {"config.json", "weights.safetensors"} <= files
     assert "logs/from-epoch-00/metrics.csv" in files
     logs = {name for name in files if name.startswith("logs/")}
-    assert len(files - logs) == 2
+    assert files - logs == {"config.json", "weights.safetensors", "README.md"}
     assert all("events" in n or n.endswith(("metrics.csv", "hparams.yaml")) for n in logs)
 
 
