@@ -3,6 +3,7 @@
 import numpy as np
 import torch
 from jaxtyping import Float, Int
+from lightning.fabric.utilities import move_data_to_device
 
 from predictors.modes import best_mode
 from predictors.network import AbstractNetwork
@@ -14,15 +15,21 @@ _GOLDEN = (np.sqrt(5.0) - 1) / 2
 
 
 def temperature_on(network: AbstractNetwork, batches: Batches) -> float:
-    """The temperature of a network's logits on validation data; leaves the network evaluating."""
-    network.eval().cpu()
+    """The temperature of a network's logits on validation data; leaves it evaluating, on the CPU.
+
+    Worked out on a GPU where there is one: at full size a CPU would take longer than the training.
+    """
+    device = torch.device("cuda" if torch.cuda.is_available() else "cpu")
+    network.eval().to(device)
     logits, best = [], []
     with torch.inference_mode():
-        for batch, labels in batches:
+        for each in batches:
+            batch, labels = move_data_to_device(each, device)
             modes = network(batch)
-            logits.append(modes.logits.numpy())
+            logits.append(modes.logits.cpu().numpy())
             nearest = best_mode(modes.states[..., :2], labels.states[..., :2], "distance")
-            best.append(nearest.numpy())
+            best.append(nearest.cpu().numpy())
+    network.cpu()
     return fit_temperature(np.concatenate(logits), np.concatenate(best))
 
 
