@@ -16,6 +16,7 @@ from asp_env.data.split import Part, split_blocks, split_by_recording
 Split = Literal["recording", "blocks"]
 
 SPLIT_HORIZON_S = 3.0
+"""Recordings are dealt by their number of snippets with this horizon, whatever is learned."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -182,7 +182,7 @@ def gather_scene(recordings: Sequence[Recording], index: SnippetIndex) -> Scene:
 
 def gather_future(recordings: Sequence[Recording], index: SnippetIndex) -> Future:
     """What the targets of `gather_scene` went on to do."""
-    states, valid = _gather_targets(recordings, index, 1 + np.arange(index.horizon))
+    states, valid = gather_ticks(recordings, index, 1 + np.arange(index.horizon))
     return Future(states=states, valid=valid)
 
 
@@ -190,7 +190,7 @@ def gather_present(
     recordings: Sequence[Recording], index: SnippetIndex
 ) -> tuple[Float[np.ndarray, "n 4"], Float[np.ndarray, " n"]]:
     """The targets' states and lengths now: what `gather_scene` says of them, without the scene."""
-    states, _ = _gather_targets(recordings, index, np.zeros(1, dtype=np.int64))
+    states, _ = gather_ticks(recordings, index, np.zeros(1, dtype=np.int64))
     lengths = np.zeros(len(index), dtype=np.float32)
     for number in np.unique(index.recording):
         mine = index.recording == number
@@ -198,10 +198,16 @@ def gather_present(
     return states[:, 0], lengths
 
 
-def _gather_targets(
+def gather_ticks(
     recordings: Sequence[Recording], index: SnippetIndex, offsets: Int[np.ndarray, " steps"]
 ) -> tuple[Float[np.ndarray, "n steps 4"], Bool[np.ndarray, "n steps"]]:
-    """The targets' states some ticks from now, and whether they were there; zeros where not."""
+    """The targets' states some ticks from now, and whether they were there; zeros where not.
+
+    Args:
+        recordings: what the snippets are of.
+        index: the snippets.
+        offsets: in ticks, negative ones before now.
+    """
     states = np.zeros((len(index), len(offsets), 4), dtype=np.float32)
     valid = np.zeros((len(index), len(offsets)), dtype=bool)
     for number in np.unique(index.recording):

@@ -10,7 +10,7 @@ from jaxtyping import Bool, Float, Int
 from asp_env.data.clock import frames_per_tick
 from asp_env.data.recording import Recording
 from asp_env.data.road_map import RoadMap
-from asp_env.data.snippets import Future, SnippetIndex, gather_window
+from asp_env.data.snippets import Future, SnippetIndex, gather_ticks, gather_window
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -53,9 +53,8 @@ def gather_recorded(recordings: Sequence[Any], index: SnippetIndex) -> Recorded:
     keys = np.stack([index.recording, index.tick], axis=-1)
     found, inverse = np.unique(keys, axis=0, return_inverse=True)
     situation = inverse.reshape(-1)
-    length = index.history + 1 + index.horizon
-    states = np.zeros((len(index), length, 4), dtype=np.float32)
-    valid = np.zeros((len(index), length), dtype=bool)
+    offsets = np.arange(-index.history, index.horizon + 1)
+    states, valid = gather_ticks(recordings, index, offsets)
     sizes = np.zeros((len(index), 2), dtype=np.float32)
     classes = np.zeros(len(index), dtype=np.int64)
     slot = np.full(len(index), -1)
@@ -66,7 +65,6 @@ def gather_recorded(recordings: Sequence[Any], index: SnippetIndex) -> Recorded:
         recording = recordings[int(number)]
         mine = np.flatnonzero(index.recording == number)
         track = index.track[mine]
-        states[mine], valid[mine] = _windows(recording, track, index.tick[mine], index)
         sizes[mine], classes[mine] = recording.sizes[track], recording.classes[track]
         map_index[mine] = _place(maps, recording.road_map)
         for tick in found[found[:, 0] == number, 1]:
@@ -96,21 +94,6 @@ def gather_recorded(recordings: Sequence[Any], index: SnippetIndex) -> Recorded:
         others_valid=others_valid,
         others_sizes=others_sizes,
     )
-
-
-def _windows(
-    recording: Recording,
-    track: Int[np.ndarray, " n"],
-    tick: Int[np.ndarray, " n"],
-    index: SnippetIndex,
-) -> tuple[Float[np.ndarray, "n ticks 4"], Bool[np.ndarray, "n ticks"]]:
-    """Past, present and future of one recording's targets; zeros where absent."""
-    stride = frames_per_tick(recording.frame_rate_hz, index.dt_s)
-    frames = (tick[:, None] + np.arange(-index.history, index.horizon + 1)) * stride
-    first = recording.first_frames[track].astype(np.int64)[:, None]
-    valid = (frames >= first) & (frames <= recording.last_frames[track][:, None])
-    rows = np.where(valid, recording.starts[track][:, None] + frames - first, 0)
-    return np.where(valid[..., None], recording.states[rows], 0), valid
 
 
 def _after(

@@ -6,16 +6,19 @@ from typing import Literal
 import numpy as np
 from jaxtyping import Bool
 
-from asp_env.data.parts import num_ticks, snippet_parts, ticks_of_part, unseen_ticks
+from asp_env.data.parts import (
+    SPLIT_HORIZON_S,
+    num_ticks,
+    snippet_parts,
+    ticks_of_part,
+    unseen_ticks,
+)
 from asp_env.data.predictor import Predictor
 from asp_env.data.snippets import SnippetIndex, index_snippets
 from asp_env.data.source import Recordings
 from asp_env.errors import AspEnvError
 
 PartChoice = Literal["auto", "train", "validation", "test", "all"]
-
-SPLIT_HORIZON_S = 3.0
-"""Recordings are dealt by their number of snippets with this horizon, whatever is judged."""
 
 
 def ticks_to_judge(
