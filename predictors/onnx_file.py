@@ -184,7 +184,8 @@ def _described(model: onnx.ModelProto, metadata: dict[str, str]) -> onnx.ModelPr
         value.ClearField("metadata_props")
         value.doc_string = MEANINGS.get(value.name, "")
         for dim in value.type.tensor_type.shape.dim:
-            dim.dim_param = dim.dim_param.replace(axis, TARGETS)
+            if dim.dim_param:  # setting it takes a number away
+                dim.dim_param = dim.dim_param.replace(axis, TARGETS)
     for node in (*graph.node, graph):
         node.ClearField("metadata_props")
     return model
