@@ -16,10 +16,11 @@ import torch
 from safetensors.torch import load_file
 
 from asp_env import registry
+from asp_env.data.source import open_data
 from asp_env.errors import AspEnvError
 from asp_env.views import make_view
 from predictors.calibration import temperature_on
-from predictors.checkpoint import CONFIG, save_learned, shape_for, write_json
+from predictors.checkpoint import CONFIG, read_config, save_learned, shape_for, write_json
 from predictors.hardware import LOGS, Hardware, make_trainer, quiet
 from predictors.lightning_parts import Fit, KeepBest, TellEpochs
 from predictors.network import LearnedPlug
@@ -97,6 +98,9 @@ def train(
         torch.manual_seed(config.seed)
         network = plug.network(config.network, shape)
     new = [] if begin is None else begin.apply(network)
+    trained_on = chosen.trained_on
+    if begin is not None and begin.trained_on is not None:
+        trained_on = trained_on.after(begin.trained_on)
     later = network.later_ticks
     batches = [
         share.batches(view, size=size, later_ticks=later, config=config)
@@ -136,7 +140,7 @@ def train(
         temperature=temperature,
         provenance={
             **run,
-            "trained_on": dataclasses.asdict(chosen.trained_on),
+            "trained_on": dataclasses.asdict(trained_on),
             "snippets": {
                 "training": len(training.snippets),
                 "validation": len(chosen.validation.snippets),
@@ -178,10 +182,26 @@ def train_stages(
     """
     config = config_for(horizon_s)
     if start is None and horizon_s > SEGMENT_S:
-        start = out / BEFORE
-        if not (start / CONFIG).exists():
-            train(config_for(SEGMENT_S), data, start, hardware=hardware)
+        start, before = out / BEFORE, config_for(SEGMENT_S)
+        if (start / CONFIG).exists():
+            _check_before(start, before, data)
+        else:
+            train(before, data, start, hardware=hardware)
     return train(config, data, out, start=start, hardware=hardware)
+
+
+def _check_before(start: Path, config: TrainingConfig, data: str) -> None:
+    """A finished run for 3 s may be of other data: of the test recordings, in the worst case."""
+    found = read_config(start).get("provenance", {})
+    expected = {
+        "config": json.loads(json.dumps(dataclasses.asdict(config))),
+        "data_hash": open_data(data).data_hash(),
+    }
+    if other := [name for name, value in expected.items() if found.get(name) != value]:
+        raise AspEnvError(
+            f"{start} holds a finished run of another {' and '.join(other)}: delete it to train it "
+            "again, or name it by --start to go on from it"
+        )
 
 
 def _resumes(out: Path, run: dict[str, Any]) -> bool:

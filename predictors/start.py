@@ -7,6 +7,7 @@ from pathlib import Path
 
 from torch import Tensor
 
+from asp_env.data.parts import TrainedOn
 from asp_env.errors import CheckpointError
 from asp_env.views import SceneView
 from predictors.checkpoint import WEIGHTS, read_config, read_weights
@@ -24,6 +25,8 @@ class Start:
     """The normaliser that the weights belong to; None for a ResNet18."""
     weights: dict[str, Tensor] | None
     """None for a ResNet18."""
+    trained_on: TrainedOn | None
+    """What the weights have seen; None for a ResNet18, which has seen other things."""
 
     @classmethod
     def read(cls, path: Path, plug: LearnedPlug, *, view: SceneView, dt_s: float) -> "Start":
@@ -34,7 +37,9 @@ class Start:
         """
         if path.is_file():
             digest = hashlib.sha256(path.read_bytes()).hexdigest()
-            return cls(path=path, weights_hash=digest, action_range=None, weights=None)
+            return cls(
+                path=path, weights_hash=digest, action_range=None, weights=None, trained_on=None
+            )
         config = read_config(path)
         if config["predictor"] != plug.name:
             raise CheckpointError(
@@ -54,10 +59,19 @@ class Start:
         try:
             acceleration, steering = config["normaliser"]["action_range"]
             scale = (float(acceleration), float(steering))
+            trained_on = TrainedOn(**config["provenance"]["trained_on"])
         except (KeyError, TypeError, ValueError) as error:
-            raise CheckpointError(f"{path} does not say its normaliser: train again") from error
+            raise CheckpointError(
+                f"{path} does not say its normaliser and what it learned from: train again"
+            ) from error
         digest = hashlib.sha256((path / WEIGHTS).read_bytes()).hexdigest()
-        return cls(path=path, weights_hash=digest, action_range=scale, weights=weights)
+        return cls(
+            path=path,
+            weights_hash=digest,
+            action_range=scale,
+            weights=weights,
+            trained_on=trained_on,
+        )
 
     def apply(self, network: AbstractNetwork) -> list[str]:
         """Loads the weights that fit the network; the names of those that it keeps at random.

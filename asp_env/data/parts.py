@@ -29,6 +29,21 @@ class TrainedOn:
     parts: Mapping[str, str]
     """By the content hash of each recording: its part, or `blocks` where its blocks were dealt."""
 
+    def after(self, earlier: "TrainedOn") -> "TrainedOn":
+        """What a predictor has seen that goes on from one which had learned from `earlier`.
+
+        Blocks stay blocks where both had them; a recording that either learned from otherwise, or
+        was selected on, is not free any more.
+        """
+        parts = dict(self.parts)
+        for content, part in earlier.parts.items():
+            mine = parts.get(content, "none")
+            if part not in ("train", "validation", "blocks") or part == mine:
+                continue
+            free = mine in ("test", "none")
+            parts[content] = part if free else "train"
+        return TrainedOn(source=self.source, split=self.split, parts=parts)
+
 
 def snippet_parts(
     recordings: Recordings, index: SnippetIndex, split: Split

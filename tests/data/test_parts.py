@@ -154,3 +154,23 @@ def test_blocks_of_ticks() -> None:
     assert len(at) == 30
     assert at[0] % 30 == 0
     assert at[-1] - at[0] == 29
+
+
+@pytest.mark.parametrize(
+    ("own", "earlier", "known"),
+    [
+        ("train", "train", "train"),
+        ("test", "train", "train"),
+        ("none", "validation", "validation"),
+        ("test", "blocks", "blocks"),
+        ("blocks", "blocks", "blocks"),
+        ("blocks", "train", "train"),
+        ("train", "blocks", "train"),
+        ("test", "test", "test"),
+        ("train", "test", "train"),
+    ],
+)
+def test_what_a_start_saw_is_seen(own: str, earlier: str, known: str) -> None:
+    """A recording is as free as the less free of two runs left it; others' are kept besides."""
+    both = trained(h0=own, h1="test").after(trained(h0=earlier, h2="train", h3="test"))
+    assert both.parts == {"h0": known, "h1": "test", "h2": "train"}

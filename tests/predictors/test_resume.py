@@ -11,6 +11,7 @@ import torch
 from lightning.pytorch.core.optimizer import LightningOptimizer
 from safetensors.torch import load_file
 
+from asp_env.errors import AspEnvError
 from predictors import lightning_parts
 from predictors.fitting import train, train_stages
 from predictors.lightning_parts import Fit, TellEpochs
@@ -129,3 +130,39 @@ def test_6_s_go_on_from_3_s(data: str, tmp_path: Path) -> None:
     assert first["normaliser"] == second["normaliser"]
     assert second["provenance"]["start"]
     assert second["provenance"]["not_started"] == []
+    assert first["provenance"]["trained_on"] == second["provenance"]["trained_on"]
+
+
+def test_3_s_of_another_run_are_refused(data: str, tmp_path: Path) -> None:
+    """A run for 3 s that is there already must be of the same recipe and data."""
+
+    def config_for(horizon_s: float, **changes: Any) -> TrainingConfig:
+        config = tiny_config("dkm", "vectors", epochs=1)
+        return dataclasses.replace(config, horizon_s=horizon_s, snippets_per_epoch=8, **changes)
+
+    out = tmp_path / "run"
+    train(config_for(3.0), data, out / "3s")
+    with pytest.raises(AspEnvError, match="3s holds a finished run of another config: delete it"):
+        train_stages(lambda horizon_s: config_for(horizon_s, seed=1), 6.0, data, out)
+    path = out / "3s" / "config.json"
+    kept = path.read_text()
+    changed = json.loads(kept)
+    changed["provenance"]["data_hash"] = "another"
+    path.write_text(json.dumps(changed))
+    with pytest.raises(AspEnvError, match="3s holds a finished run of another data_hash"):
+        train_stages(config_for, 6.0, data, out)
+    path.write_text(kept)
+    assert train_stages(config_for, 6.0, data, out) == out
+
+
+def test_what_the_start_learned_from_is_remembered(data: str, tmp_path: Path) -> None:
+    """A run that goes on from one that saw a recording more has seen that too."""
+    config = tiny_config("dkm", "vectors", epochs=1, snippets_per_epoch=8)
+    start = train(config, data, tmp_path / "start")
+    path = start / "config.json"
+    content = json.loads(path.read_text())
+    content["provenance"]["trained_on"]["parts"]["elsewhere"] = "train"
+    path.write_text(json.dumps(content))
+    run = train(config, data, tmp_path / "run", start=start)
+    parts = json.loads((run / "config.json").read_text())["provenance"]["trained_on"]["parts"]
+    assert parts == content["provenance"]["trained_on"]["parts"]

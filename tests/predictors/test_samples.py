@@ -8,10 +8,12 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from asp_env.data.classes import AgentClass
-from asp_env.data.snippets import gather_future, gather_scene, index_snippets
+from asp_env.data.snippets import gather_future, gather_present, gather_scene, index_snippets
+from asp_env.dynamics import inverse
 from asp_env.errors import AspEnvError
 from asp_env.views import make_picture_view
 from asp_env.views.packing import pack_bits
+from predictors import samples
 from predictors.samples import (
     Batches,
     action_range,
@@ -108,6 +110,27 @@ def test_action_range_is_that_of_the_futures() -> None:
     acceleration, steering = action_range(recordings, index)
     assert acceleration == pytest.approx(2.0, abs=0.01)
     assert steering == pytest.approx(0.2, abs=0.01)
+
+
+@pytest.mark.parametrize("count", [1, 2, 3, 70, 131])
+def test_action_range_is_the_percentile_of_all(count: int, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Read in chunks of 7 or at once by NumPy: the same to the last bit."""
+    weaving = Drive(
+        kind=AgentClass.CAR,
+        start=(0.0, 0.0, 0.0, 12.0),
+        phases=((9.0, 1.3, 0.1), (14.0, -1.1, -0.3), (80.0, 0.3, 0.2)),
+    )
+    recordings = [make_recording(drives=(weaving, EAST), duration_s=60.0)]
+    index = index_snippets(recordings, dt_s=0.2, horizon_s=3.0)
+    index = index.select(np.arange(count))
+    now, lengths = gather_present(recordings, index)
+    future = gather_future(recordings, index).states
+    before = np.concatenate([now[:, None], future[:, :-1]], axis=1)
+    every = np.abs(inverse(before, future, lengths[:, None], 0.2)).reshape(-1, 2)
+    expected = np.percentile(every.astype(np.float64), 99.9, axis=0)
+    monkeypatch.setattr(samples, "CHUNK", 7)
+    low = np.array(samples.MIN_ACTION_RANGE)
+    assert action_range(recordings, index) == tuple(np.maximum(expected, low).tolist())
 
 
 def test_action_range_stays_within_limits() -> None:
