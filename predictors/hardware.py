@@ -85,6 +85,12 @@ def make_trainer(
     """
     count = hardware.devices_per_node
     processes = count * hardware.nodes
+    launched = int(os.environ.get("WORLD_SIZE", processes))
+    if "LOCAL_RANK" in os.environ and launched != processes:
+        raise AspEnvError(
+            f"training: a launcher started {launched} processes for {count} devices of "
+            f"{hardware.nodes} nodes: give --devices and --nodes as it has them"
+        )
     strategy: DDPStrategy | Literal["auto"] = "auto"
     if processes > 1 or hardware.strategy == "ddp":
         # In pre-training no gradient reaches what predicts actions.

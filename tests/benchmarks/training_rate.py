@@ -25,7 +25,7 @@ from predictors.samples import Batches
 
 DATA = "sample:intersection"
 BATCH = 32
-ROUNDS = 5
+ROUNDS = 3
 TRIALS = (
     ("vectors", "vector", None),
     ("chauffeurnet", "small", (90, 60)),
@@ -59,7 +59,7 @@ class Trial(NamedTuple):
 
 
 def make_trial(view_name: str, encoder: str, pixels: tuple[int, int] | None) -> Trial:
-    """A network of the small recipe with another encoder, and three batches."""
+    """A network of the small recipe with another encoder, and one batch."""
     config = recipe("ssp-asp", "cpu", view=view_name, horizon_s=3.0)
     view = make_view(view_name, pixels=pixels)
     shape = shape_for(view, history=15, horizon=15, dt_s=0.2, action_range=(4.0, 0.5))
@@ -67,7 +67,7 @@ def make_trial(view_name: str, encoder: str, pixels: tuple[int, int] | None) -> 
     network = plug.network(dataclasses.replace(config.network, encoder=encoder), shape)
     recordings = open_data(DATA)
     index = index_snippets(recordings, dt_s=0.2, horizon_s=3.0)
-    rows = np.random.default_rng(0).permutation(len(index))[: 3 * BATCH]
+    rows = np.random.default_rng(0).permutation(len(index))[:BATCH]
     batches = Batches(
         recordings,
         index.select(rows),

@@ -231,6 +231,16 @@ def test_hardware_that_cannot_be_is_one_line(
     assert not (tmp_path / "run").exists()
 
 
+def test_launcher_of_other_processes_is_one_line(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Otherwise each of the three would take itself for the only one."""
+    monkeypatch.setenv("LOCAL_RANK", "0")
+    monkeypatch.setenv("WORLD_SIZE", "3")
+    with pytest.raises(AspEnvError, match="started 3 processes for 1 devices of 1 nodes"):
+        make_trainer(tiny_config(), Hardware(), out=tmp_path / "run", started="now", callbacks=[])
+
+
 def test_compiled_encoder_leaves_names_and_weights_alone(data: str, tmp_path: Path) -> None:
     """Traced by the compiler and run as traced: a run that died ends with the weights of another.
 
