@@ -182,12 +182,14 @@ def ffw_asp_ours(view: str, horizon_s: float) -> TrainingConfig:
 
 def ssp_asp_paper(view: str, horizon_s: float) -> TrainingConfig:
     """The paper's self-supervised network, with three epochs of forward-model pre-training."""
+    _check_segments(horizon_s)
     config = _paper("ssp-asp", SSPASPConfig(), view, horizon_s)
     return _pretrained(config, horizon_s, 3, of=config.epochs + 3)
 
 
 def ssp_asp_cpu(view: str, horizon_s: float) -> TrainingConfig:
     """The same structure, small, under Heun; pre-training takes two of the eight epochs."""
+    _check_segments(horizon_s)
     network = SSPASPConfig(gru_width=128, integrator="heun")
     config = _small("ssp-asp", "cpu", network, view, horizon_s)
     return _pretrained(config, horizon_s, 2, of=config.epochs)
@@ -199,6 +201,7 @@ def ssp_asp_ours(view: str, horizon_s: float) -> TrainingConfig:
     Annealed modes hold apart what the best mode alone lets collapse; a run that goes on from one
     that had them keeps them as they are. Chains that end together are told as one.
     """
+    _check_segments(horizon_s)
     network = SSPASPConfig(
         gru_width=128,
         gru_layers=1,
@@ -213,6 +216,15 @@ def ssp_asp_ours(view: str, horizon_s: float) -> TrainingConfig:
         scheduled=True,
     )
     return _small("ssp-asp", "ours", network, view, horizon_s)
+
+
+def _check_segments(horizon_s: float) -> None:
+    """Refuses, before anything is trained, what cannot be chained."""
+    if horizon_s < SEGMENT_S or abs(horizon_s / SEGMENT_S - round(horizon_s / SEGMENT_S)) > 1e-6:
+        raise AspEnvError(
+            f"ssp-asp chains segments of {SEGMENT_S:g} s, the horizon of {horizon_s:g} s is no "
+            "whole number of them: give 3, 6 or 9"
+        )
 
 
 def _pretrained(

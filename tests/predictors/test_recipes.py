@@ -110,3 +110,11 @@ def test_impossible_shares_are_refused() -> None:
         tiny_config(pretraining_epochs=-1)
     assert isinstance(tiny_config(), TrainingConfig)
     assert dataclasses.replace(tiny_config(), pretraining_epochs=2).all_epochs == 6
+
+
+@pytest.mark.parametrize("preset", RECIPES["ssp-asp"])
+@pytest.mark.parametrize("horizon_s", [1.5, 4.0])
+def test_what_cannot_be_chained_is_refused_at_once(preset: str, horizon_s: float) -> None:
+    """1.5 and 4 s are no whole number of segments of 3 s: one line before anything is trained."""
+    with pytest.raises(AspEnvError, match=f"horizon of {horizon_s:g} s is no whole number"):
+        recipe("ssp-asp", preset, view="vectors", horizon_s=horizon_s)
