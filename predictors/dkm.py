@@ -6,17 +6,23 @@ into the paper: one hidden layer, then a linear one.
 """
 
 from dataclasses import dataclass
-from typing import ClassVar, final
+from typing import final
 
 import torch
 from torch import nn
 
-from asp_env.data.predictor import Predictor
 from asp_env.dynamics.bicycle import Integrator
 from predictors.batch import Batch
 from predictors.encoders import make_encoder
 from predictors.heads import ConnectedHead
-from predictors.network import AbstractNetwork, Modes, NetworkConfig, NetworkShape, drive
+from predictors.network import (
+    AbstractNetwork,
+    LearnedPlug,
+    Modes,
+    NetworkConfig,
+    NetworkShape,
+    drive,
+)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -60,23 +66,5 @@ class DKMNetwork(AbstractNetwork):
         return Modes(states, logits, actions)
 
 
-@final
-class DKM:
-    """What the registry holds under `dkm`."""
-
-    name: ClassVar[str] = "dkm"
-    config: ClassVar[type[DKMConfig]] = DKMConfig
-    network: ClassVar[type[DKMNetwork]] = DKMNetwork
-
-    @classmethod
-    def from_name(cls, argument: str, *, horizon: int, dt_s: float) -> Predictor:
-        """The predictor of a finished run's folder; it keeps the horizon it was trained for.
-
-        Raises:
-            CheckpointError: the folder holds no finished run of this predictor.
-            AspEnvError: it was trained for another time step.
-        """
-        del horizon
-        from predictors.checkpoint import load_learned
-
-        return load_learned(cls, argument, dt_s=dt_s)
+DKM = LearnedPlug(name="dkm", config=DKMConfig, network=DKMNetwork)
+"""What the registry holds under `dkm`."""

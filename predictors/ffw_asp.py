@@ -15,18 +15,24 @@ Dimensions: n targets, m modes, t ticks ahead, z features.
 """
 
 from dataclasses import dataclass
-from typing import ClassVar, Literal, final
+from typing import Literal, final
 
 import torch
 from torch import nn
 
-from asp_env.data.predictor import Predictor
 from asp_env.dynamics.bicycle import Integrator
 from asp_env.errors import AspEnvError
 from predictors.batch import Batch
 from predictors.encoders import make_encoder
 from predictors.heads import ConnectedHead, RecurrentReader
-from predictors.network import AbstractNetwork, Modes, NetworkConfig, NetworkShape, drive
+from predictors.network import (
+    AbstractNetwork,
+    LearnedPlug,
+    Modes,
+    NetworkConfig,
+    NetworkShape,
+    drive,
+)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -91,23 +97,5 @@ class FFWASPNetwork(AbstractNetwork):
         return Modes(states, logits, actions)
 
 
-@final
-class FFWASP:
-    """What the registry holds under `ffw-asp`."""
-
-    name: ClassVar[str] = "ffw-asp"
-    config: ClassVar[type[FFWASPConfig]] = FFWASPConfig
-    network: ClassVar[type[FFWASPNetwork]] = FFWASPNetwork
-
-    @classmethod
-    def from_name(cls, argument: str, *, horizon: int, dt_s: float) -> Predictor:
-        """The predictor of a finished run's folder; it keeps the horizon it was trained for.
-
-        Raises:
-            CheckpointError: the folder holds no finished run of this predictor.
-            AspEnvError: it was trained for another time step.
-        """
-        del horizon
-        from predictors.checkpoint import load_learned
-
-        return load_learned(cls, argument, dt_s=dt_s)
+FFWASP = LearnedPlug(name="ffw-asp", config=FFWASPConfig, network=FFWASPNetwork)
+"""What the registry holds under `ffw-asp`."""

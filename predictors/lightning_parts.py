@@ -183,7 +183,7 @@ class Fit(pl.LightningModule):
         batch, labels = sample
         modes = self.network(batch)
         own = self._validation.own(batch_idx)
-        terms: dict[str, Tensor] = self.network.loss(batch, modes, labels, Moment())
+        terms: dict[str, Tensor] = self.network.loss(modes, labels, Moment())
         features = self.network.features(batch, labels)
         self._diagnosis.add(features and Features(*(each[:own] for each in features)))
         truth = labels.states[..., :2].cpu().numpy()

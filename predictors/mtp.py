@@ -5,17 +5,16 @@ model: nothing keeps a forecast drivable. Headings and speeds are read off the p
 """
 
 from dataclasses import dataclass
-from typing import ClassVar, final
+from typing import final
 
 import torch
 from jaxtyping import Float
 from torch import Tensor, nn
 
-from asp_env.data.predictor import Predictor
 from predictors.batch import Batch
 from predictors.encoders import make_encoder
 from predictors.heads import ConnectedHead
-from predictors.network import AbstractNetwork, Modes, NetworkConfig, NetworkShape
+from predictors.network import AbstractNetwork, LearnedPlug, Modes, NetworkConfig, NetworkShape
 
 POSITION_SCALE_M = 10.0
 """What the outputs are multiplied by: positions lie some ten metres away."""
@@ -81,23 +80,5 @@ def states_along(positions: Float[Tensor, "n m t 2"], dt_s: float) -> Float[Tens
     return torch.cat([positions, motion], dim=-1)
 
 
-@final
-class MTP:
-    """What the registry holds under `mtp`."""
-
-    name: ClassVar[str] = "mtp"
-    config: ClassVar[type[MTPConfig]] = MTPConfig
-    network: ClassVar[type[MTPNetwork]] = MTPNetwork
-
-    @classmethod
-    def from_name(cls, argument: str, *, horizon: int, dt_s: float) -> Predictor:
-        """The predictor of a finished run's folder; it keeps the horizon it was trained for.
-
-        Raises:
-            CheckpointError: the folder holds no finished run of this predictor.
-            AspEnvError: it was trained for another time step.
-        """
-        del horizon
-        from predictors.checkpoint import load_learned
-
-        return load_learned(cls, argument, dt_s=dt_s)
+MTP = LearnedPlug(name="mtp", config=MTPConfig, network=MTPNetwork)
+"""What the registry holds under `mtp`."""

@@ -2,12 +2,13 @@
 
 from abc import ABC, abstractmethod
 from dataclasses import dataclass
-from typing import Any, NamedTuple, Protocol, runtime_checkable
+from typing import NamedTuple
 
 import torch
 from jaxtyping import Float
 from torch import Tensor, nn
 
+from asp_env.data.predictor import Predictor
 from asp_env.dynamics import clip_actions, rollout
 from asp_env.dynamics.bicycle import Integrator
 from asp_env.errors import AspEnvError
@@ -115,9 +116,8 @@ class AbstractNetwork(nn.Module, ABC):
     def forward(self, batch: Batch) -> Modes:
         """The modes of every target."""
 
-    def loss(self, batch: Batch, modes: Modes, labels: Labels, moment: Moment) -> dict[str, Tensor]:
+    def loss(self, modes: Modes, labels: Labels, moment: Moment) -> dict[str, Tensor]:
         """The terms of the loss by name, `loss` their weighted sum."""
-        del batch
         terms = mode_terms(
             modes.states[..., :2],
             modes.logits,
@@ -130,7 +130,7 @@ class AbstractNetwork(nn.Module, ABC):
 
     def training_loss(self, batch: Batch, labels: Labels, moment: Moment) -> dict[str, Tensor]:
         """The terms of the loss that is trained on, `loss` their weighted sum."""
-        return self.loss(batch, self(batch), labels, moment)
+        return self.loss(self(batch), labels, moment)
 
     def features(self, batch: Batch, labels: Labels) -> Features | None:
         """Encoded and predicted features of the scene to come; None where none are predicted."""
@@ -178,21 +178,28 @@ def drive_from(
     return rollout(start, actions, lengths, dt_s, integrator=integrator)
 
 
-@runtime_checkable
-class LearnedPlug(Protocol):
+@dataclass(frozen=True, slots=True, kw_only=True)
+class LearnedPlug:
     """What the registry holds under a learned predictor's name, for training and loading."""
 
-    @property
-    def name(self) -> str:
-        """By which it is registered."""
-        ...
+    name: str
+    """By which it is registered."""
+    config: type[NetworkConfig]
+    """A frozen dataclass of what JSON can hold."""
+    network: type[AbstractNetwork]
+    """Made of (config, shape); its module tells what the predictor is."""
 
-    @property
-    def config(self) -> type[Any]:
-        """A frozen dataclass of what JSON can hold."""
-        ...
+    def from_name(self, argument: str, *, horizon: int, dt_s: float) -> Predictor:
+        """The predictor of a finished run's folder; it keeps the horizon it was trained for.
 
-    @property
-    def network(self) -> type[AbstractNetwork]:
-        """Made of (config, shape)."""
-        ...
+        Behind an @ stands how segments are chained, for a run that chains any: `RUN@beam` (as
+        without it), `RUN@top1`, `RUN@full`, or `RUN@oracle`, which knows the recorded future.
+
+        Raises:
+            CheckpointError: the folder holds no finished run of this predictor.
+            AspEnvError: it was trained for another time step, or the chaining does not apply.
+        """
+        del horizon
+        from predictors.checkpoint import load_learned
+
+        return load_learned(self, argument, dt_s=dt_s)

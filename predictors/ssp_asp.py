@@ -10,21 +10,21 @@ Read into the paper: the scene to come is drawn in the target's pose at its end;
 LayerNorm before ψ and γ; a linear layer stands behind ψ, since features are unbounded; the losses
 of both branches are averaged, and so are those of the segments; a later segment is predicted from
 what inference has there, the predicted features and the matched mode's actions. Options that the
-`paper` recipe leaves off: `normalise`, `stop_gradient`, `ema`, `skip`, `hidden`, `scheduled`.
+`paper` recipe leaves off: `normalise`, `stop_gradient`, `ema`, `skip`, `hidden`, `scheduled`,
+`annealed`, `kept`; or takes away, for an ablation: `encoded_branch`.
 
 Dimensions: n targets, m modes, t ticks of a segment, z features.
 """
 
 import copy
 from collections.abc import Iterator, Sequence
-from typing import ClassVar, NamedTuple, final
+from typing import NamedTuple, final
 
 import torch
 from jaxtyping import Float
 from torch import Tensor, nn
 from torch.nn import functional
 
-from asp_env.data.predictor import Predictor
 from asp_env.errors import AspEnvError
 from predictors.batch import Batch, Labels
 from predictors.chaining import Chaining, Chains, grow, merge, prune, starts
@@ -34,6 +34,7 @@ from predictors.modes import HUBER_M, best_mode, into_frame, mode_terms
 from predictors.network import (
     AbstractNetwork,
     Features,
+    LearnedPlug,
     Modes,
     Moment,
     NetworkShape,
@@ -284,27 +285,5 @@ class SSPASPNetwork(AbstractNetwork):
         return functional.layer_norm(z, z.shape[1:]) if self._options.normalise else z
 
 
-@final
-class SSPASP:
-    """What the registry holds under `ssp-asp`."""
-
-    name: ClassVar[str] = "ssp-asp"
-    config: ClassVar[type[SSPASPConfig]] = SSPASPConfig
-    network: ClassVar[type[SSPASPNetwork]] = SSPASPNetwork
-
-    @classmethod
-    def from_name(cls, argument: str, *, horizon: int, dt_s: float) -> Predictor:
-        """The predictor of a finished run's folder; it keeps the horizon it was trained for.
-
-        Behind an @ stands how segments are chained: `RUN@beam` (as without it), `RUN@top1`,
-        `RUN@full`, or `RUN@oracle`, which knows the recorded future.
-
-        Raises:
-            CheckpointError: the folder holds no finished run of this predictor.
-            AspEnvError: it was trained for another time step, the chaining is unknown, or there is
-                one segment alone.
-        """
-        del horizon
-        from predictors.checkpoint import load_learned
-
-        return load_learned(cls, argument, dt_s=dt_s)
+SSPASP = LearnedPlug(name="ssp-asp", config=SSPASPConfig, network=SSPASPNetwork)
+"""What the registry holds under `ssp-asp`."""

@@ -31,28 +31,6 @@ def mean(values: Shaped[np.ndarray, " n"], groups: Shaped[np.ndarray, " n"]) -> 
     return ratio(values, np.ones(len(values)), groups)
 
 
-def difference(
-    values: Shaped[np.ndarray, "*seeds n"],
-    other: Shaped[np.ndarray, "*other_seeds n"],
-    groups: Shaped[np.ndarray, " n"],
-) -> Estimate:
-    """Mean of values less other values of the same samples: paired, so that what is common cancels.
-
-    Below zero as a whole, the interval says that `values` are lower on average; it speaks of other
-    recordings, not of other seeds, which are averaged sample by sample before anything else.
-
-    Args:
-        values: one per sample, or one per seed and sample.
-        other: as `values`, of any number of seeds.
-        groups: which recording each sample is from.
-    """
-    return mean(_over_seeds(values) - _over_seeds(other), groups)
-
-
-def _over_seeds(values: Shaped[np.ndarray, "*seeds n"]) -> Float[np.ndarray, " n"]:
-    return values.reshape(-1, values.shape[-1]).mean(axis=0, dtype=np.float64)
-
-
 def ratio(
     numerators: Shaped[np.ndarray, " n"],
     denominators: Shaped[np.ndarray, " n"],

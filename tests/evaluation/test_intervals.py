@@ -5,7 +5,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from asp_env.evaluation.intervals import Estimate, difference, mean, of_sums, ratio
+from asp_env.evaluation.intervals import Estimate, mean, of_sums, ratio
 
 
 def test_two_recordings_by_hand():
@@ -29,32 +29,6 @@ def test_a_ratio_is_of_sums():
     """(1 + 3) / (2 + 2) is 1, not the mean of 1/2 and 3/2 weighed in another way."""
     estimate = ratio(np.array([1.0, 3.0]), np.array([2.0, 2.0]), np.array([0, 1]))
     assert (estimate.value, estimate.low, estimate.high) == (1.0, 0.5, 1.5)
-
-
-def test_a_paired_difference_by_hand():
-    """0.5 lower in every recording is -0.5 without any doubt, however the recordings differ.
-
-    Beside it, means of two recordings that lie -1 and +3 apart: 1 [-1, 3].
-    """
-    groups = np.array([0, 1, 2, 2])
-    reference = np.array([1.0, 10.0, 100.0, 3.0])
-    estimate = difference(reference - 0.5, reference, groups)
-    assert (estimate.value, estimate.low, estimate.high) == pytest.approx((-0.5, -0.5, -0.5))
-    assert estimate.n == 4
-    apart = difference(np.array([1.0, 5.0]), np.array([2.0, 2.0]), np.array([0, 1]))
-    assert (apart.value, apart.low, apart.high) == (1.0, -1.0, 3.0)
-
-
-def test_seeds_are_averaged_before_they_are_compared():
-    """Three seeds of one, two of the other: the same as their means, sample by sample."""
-    rng = np.random.default_rng(0)
-    values, other = rng.normal(size=(3, 20)), rng.normal(size=(2, 20))
-    groups = np.arange(20) % 4
-    expected = mean(values.mean(axis=0) - other.mean(axis=0), groups)
-    found = difference(values, other, groups)
-    assert (found.value, found.low, found.high, found.n) == pytest.approx(
-        (expected.value, expected.low, expected.high, expected.n)
-    )
 
 
 def test_any_function_of_sums():

@@ -93,7 +93,7 @@ def train_on_bimodal(modes: int, seed: int, **changes: Any) -> tuple[Modes, dict
         falling.step()
     with torch.no_grad():
         found = network(batch)
-        terms = network.loss(batch, found, labels, Moment())
+        terms = network.loss(found, labels, Moment())
     return found, {name: float(value) for name, value in terms.items()}
 
 
