@@ -49,10 +49,26 @@ class Simulation:
         self, ego_actions: Float[np.ndarray, "b 2"], ego_driven: Bool[np.ndarray, " b"]
     ) -> None:
         """One tick. Egos that are not driven replay their log."""
-        control = self.driver.control(self.world)
-        actions, driven = control.actions.copy(), control.driven.copy()
+        actions = np.zeros((*self.world.episodes.ids.shape, 2), dtype=np.float32)
+        driven = np.zeros(actions.shape[:2], dtype=bool)
         actions[:, EGO], driven[:, EGO] = ego_actions, ego_driven
-        self.world.step(actions, driven, control.leaving)
+        self.step_agents(actions, driven)
+
+    def step_agents(
+        self, actions: Float[np.ndarray, "b a 2"], driven: Bool[np.ndarray, "b a"]
+    ) -> None:
+        """One tick in which the caller drives any agents; the traffic's driver moves the others.
+
+        The ego is never the traffic's: one that is not driven replays its log.
+        """
+        control = self.driver.control(self.world)
+        traffics = control.driven & ~driven
+        traffics[:, EGO] = False
+        self.world.step(
+            np.where(driven[..., None], actions, control.actions),
+            driven | traffics,
+            control.leaving & ~driven,
+        )
 
     def snapshot(self) -> tuple[Snapshot, Driver]:
         """The whole state, the driver's memory included, to be handed to `restore`."""
