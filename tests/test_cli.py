@@ -61,7 +61,7 @@ def test_an_unknown_command_is_refused(capsys):
         (["x"], "--out PATH"),
         ([], "Missing from asp-env drive"),
         (["x", "--out", "o", "--horizon", "long"], "could not convert string to float: 'long'"),
-        (["x", "--out", "o", "--scenarios", "1.5"], "--scenarios"),
+        (["x", "--out", "o", "--most", "1.5"], "--most"),
         (["x", "--out", "o", "--part", "some"], "'some'"),
     ],
     ids=["unknown", "too many", "missing option", "nothing", "no number", "no integer", "no part"],
@@ -105,7 +105,7 @@ def test_an_unwritable_output_is_refused(capsys, tmp_path, command):
         (["--dt", "nan"], "expected a positive number"),
         (["--horizon", "inf"], "expected a positive number"),
         (["--horizon", "-1"], "expected a positive number"),
-        (["--scenarios", "0"], "expected at least 1"),
+        (["--most", "0"], "expected at least 1"),
     ],
     ids=lambda value: "-".join(value) if isinstance(value, list) else None,
 )

@@ -1,7 +1,11 @@
 """Frames, boxes and paths: the only definitions, for arrays with any leading axes."""
 
+import math
+from typing import no_type_check
+
 import numpy as np
 from jaxtyping import Float, Shaped
+from numba import njit
 
 from asp_env.dynamics import wrap_angle
 
@@ -66,10 +70,7 @@ def route_along(states: Float[np.ndarray, "n 4"], *, beyond_m: float) -> Float[n
 
     Points are taken only where the vehicle got on, so that standing and jitter leave no trace.
     """
-    kept = [states[0, :2]]
-    for point in states[1:, :2]:
-        if np.hypot(*(point - kept[-1])) >= 0.5:
-            kept.append(point)
+    kept = list(states[_got_on(np.array(states[:, :2])), :2])
     end = kept[-1]
     if len(kept) > 1:
         direction = (kept[-1] - kept[-2]) / np.hypot(*(kept[-1] - kept[-2]))
@@ -77,3 +78,55 @@ def route_along(states: Float[np.ndarray, "n 4"], *, beyond_m: float) -> Float[n
         direction = np.array([np.cos(states[-1, 2]), np.sin(states[-1, 2])])
     kept.append(end + (beyond_m * direction).astype(states.dtype))
     return resample(np.stack(kept), 1.0)
+
+
+@njit(cache=True)
+@no_type_check
+def _got_on(points):
+    """(n,) the first point, and each that lies 0.5 m or more from the last one before it."""
+    keep = np.zeros(len(points), dtype=np.bool_)
+    keep[0] = True
+    last = 0
+    for i in range(1, len(points)):
+        if math.hypot(points[i, 0] - points[last, 0], points[i, 1] - points[last, 1]) >= 0.5:
+            keep[i] = True
+            last = i
+    return keep
+
+
+@njit(cache=True)
+@no_type_check
+def project(route, count, x, y, near_m, reach_m):
+    """(arc length, lateral offset, heading) of the nearest point of a route.
+
+    Args:
+        route: (p, 2) points, the first `count` of them valid.
+        count: number of valid points, at least 2.
+        x: of the point, metres.
+        y: of the point, metres.
+        near_m: arc length around which to look; negative to look everywhere.
+        reach_m: how far around it, so that a route that crosses itself is not confused.
+    """
+    first, last = 0, count - 1
+    if near_m >= 0.0:
+        first = min(max(0, int(near_m - reach_m)), count - 2)
+        last = min(count - 1, max(first + 1, int(near_m + reach_m) + 1))
+    best, arc, offset, heading = np.inf, 0.0, 0.0, 0.0
+    for i in range(first, last):
+        ax, ay = route[i, 0], route[i, 1]
+        sx, sy = route[i + 1, 0] - ax, route[i + 1, 1] - ay
+        length = math.hypot(sx, sy)
+        if length < 1e-6:
+            continue
+        along = ((x - ax) * sx + (y - ay) * sy) / length
+        low = -np.inf if i == 0 else 0.0  # both ends go on straight
+        high = np.inf if i == count - 2 else length
+        along = min(max(along, low), high)
+        dx, dy = x - ax - along * sx / length, y - ay - along * sy / length
+        distance = math.hypot(dx, dy)
+        if distance < best:
+            best = distance
+            arc = i + along / length
+            offset = math.copysign(distance, sx * dy - sy * dx)
+            heading = math.atan2(sy, sx)
+    return arc, offset, heading

@@ -10,7 +10,7 @@ from jaxtyping import Bool, Float
 from asp_env.data.classes import PREDICTED, AgentClass
 from asp_env.data.clock import frames_per_tick
 from asp_env.data.geometry import route_along
-from asp_env.data.scenario import STANDING_MPS
+from asp_env.data.scenario_rules import STANDING_MPS
 from asp_env.dynamics import inverse
 from asp_env.errors import unknown_name
 from asp_env.sim.idm import IDM, follow_paths, speed_limits
