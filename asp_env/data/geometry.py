@@ -70,14 +70,14 @@ def route_along(states: Float[np.ndarray, "n 4"], *, beyond_m: float) -> Float[n
 
     Points are taken only where the vehicle got on, so that standing and jitter leave no trace.
     """
-    kept = list(states[_got_on(np.array(states[:, :2])), :2])
+    kept = states[_got_on(np.array(states[:, :2])), :2]
     end = kept[-1]
     if len(kept) > 1:
         direction = (kept[-1] - kept[-2]) / np.hypot(*(kept[-1] - kept[-2]))
     else:
         direction = np.array([np.cos(states[-1, 2]), np.sin(states[-1, 2])])
-    kept.append(end + (beyond_m * direction).astype(states.dtype))
-    return resample(np.stack(kept), 1.0)
+    beyond = end + (beyond_m * direction).astype(states.dtype)
+    return resample(np.concatenate([kept, beyond[None]]), 1.0)
 
 
 @njit(cache=True)
@@ -111,22 +111,22 @@ def project(route, count, x, y, near_m, reach_m):
     if near_m >= 0.0:
         first = min(max(0, int(near_m - reach_m)), count - 2)
         last = min(count - 1, max(first + 1, int(near_m + reach_m) + 1))
-    best, arc, offset, heading = np.inf, 0.0, 0.0, 0.0
+    best, arc, side, at = np.inf, 0.0, 0.0, -1
     for i in range(first, last):
         ax, ay = route[i, 0], route[i, 1]
         sx, sy = route[i + 1, 0] - ax, route[i + 1, 1] - ay
-        length = math.hypot(sx, sy)
-        if length < 1e-6:
+        squared = sx * sx + sy * sy
+        if squared < 1e-12:
             continue
-        along = ((x - ax) * sx + (y - ay) * sy) / length
+        share = ((x - ax) * sx + (y - ay) * sy) / squared
         low = -np.inf if i == 0 else 0.0  # both ends go on straight
-        high = np.inf if i == count - 2 else length
-        along = min(max(along, low), high)
-        dx, dy = x - ax - along * sx / length, y - ay - along * sy / length
-        distance = math.hypot(dx, dy)
+        high = np.inf if i == count - 2 else 1.0
+        share = min(max(share, low), high)
+        dx, dy = x - ax - share * sx, y - ay - share * sy
+        distance = dx * dx + dy * dy
         if distance < best:
-            best = distance
-            arc = i + along / length
-            offset = math.copysign(distance, sx * dy - sy * dx)
-            heading = math.atan2(sy, sx)
-    return arc, offset, heading
+            best, arc, side, at = distance, i + share, sx * dy - sy * dx, i
+    if at < 0:
+        return 0.0, 0.0, 0.0
+    heading = math.atan2(route[at + 1, 1] - route[at, 1], route[at + 1, 0] - route[at, 0])
+    return arc, math.copysign(math.sqrt(best), side), heading

@@ -20,7 +20,8 @@ DRIVEN_MPS = 2.0
 LEADER_S = 3.0
 LEADER_M = 5.0
 ALONG_RAD = math.pi / 4
-SIDEWAYS_RAD = (math.radians(30), math.radians(150))
+FROM_SIDE_RAD = math.radians(20)
+ACROSS_RAD = math.radians(30)
 YIELDS_WITHIN_M = 20.0
 YIELDS_BEFORE_S = 3.0
 YIELDS_AFTER_S = 5.0
@@ -42,6 +43,8 @@ _NEAR_WAY_M = 8.0
 """Whoever is further from the way than this is no more than off it."""
 _LOOK_AHEAD_M = 60
 _LOOK_BACK_M = 10
+_COARSE_M = 4
+"""Who is near the way is told from every fourth of its points, and where by all."""
 _ROUNDING = 1e-6
 
 (
@@ -125,12 +128,15 @@ def _wrap(angle):
 def _alone(ego, dt_s, tags, values):
     """Turns, standing, stopping, and measures."""
     count, turned, distance, fastest = len(ego), 0.0, 0.0, 0.0
-    driven, stood = False, 0
+    driven, stood, heading = False, 0, math.nan
     for t in range(count):
         if t > 0:
-            turned += _wrap(ego[t, 2] - ego[t - 1, 2])
             distance += math.hypot(ego[t, 0] - ego[t - 1, 0], ego[t, 1] - ego[t - 1, 1])
         speed = abs(ego[t, 3])
+        if speed >= STANDING_MPS:
+            if not math.isnan(heading):
+                turned += _wrap(ego[t, 2] - heading)
+            heading = ego[t, 2]
         fastest = max(fastest, speed)
         driven |= speed >= DRIVEN_MPS
         stood = stood + 1 if speed < STANDING_MPS else 0
@@ -153,7 +159,8 @@ def _on_rings(ego, ring, tags):
         x, y, heading = ego[t, 0], ego[t, 1], ego[t, 2]
         on = False
         for j in range(len(ring)):
-            if math.hypot(ring[j, 0] - x, ring[j, 1] - y) <= RING_HALF_WIDTH_M:
+            dx, dy = ring[j, 0] - x, ring[j, 1] - y
+            if dx * dx + dy * dy <= RING_HALF_WIDTH_M * RING_HALF_WIDTH_M:
                 on |= abs(_wrap(ring[j, 2] - heading)) <= ALONG_RAD
         if t > 0:
             enters |= on and not was_on
@@ -185,12 +192,12 @@ def _place(rows, first, frame, stride, ego, arcs, way, placed):
         placed[t, 1] = np.inf
         nearest, best = 0, np.inf
         low = max(0, int(arcs[t]) - _LOOK_BACK_M)
-        for j in range(low, min(len(way), int(arcs[t]) + _LOOK_AHEAD_M)):
+        for j in range(low, min(len(way), int(arcs[t]) + _LOOK_AHEAD_M), _COARSE_M):
             dx, dy = way[j, 0] - x, way[j, 1] - y
             if dx * dx + dy * dy < best:
                 nearest, best = j, dx * dx + dy * dy
         if best <= _NEAR_WAY_M * _NEAR_WAY_M:
-            arc, offset, heading = project(way, len(way), x, y, nearest, 2.0)
+            arc, offset, heading = project(way, len(way), x, y, nearest, 2.0 * _COARSE_M)
             placed[t, 0], placed[t, 1] = arc, offset
             placed[t, 2], placed[t, 3] = _wrap(rows[at, 2] - heading), rows[at, 3]
     return seen, close
@@ -205,9 +212,10 @@ def _leaders(ego, arcs, size, sizes, roles, placed, tags):
     for t in range(len(ego)):
         gap = np.inf
         for k in range(len(placed)):
-            arc, offset, angle = placed[k, t, 0], placed[k, t, 1], placed[k, t, 2]
-            on_way = abs(offset) < 0.5 * (size[1] + sizes[k, 1])
-            if on_way and roles[k] & LEADS and abs(angle) < ALONG_RAD and arc > arcs[t]:
+            arc, offset, angle, speed = placed[k, t]
+            on_way = abs(offset) < 0.5 * (size[1] + sizes[k, 1]) and arc > arcs[t]
+            along = abs(angle) < ALONG_RAD or abs(speed) < STANDING_MPS
+            if on_way and along and roles[k] & LEADS:
                 nearest[t] = min(nearest[t], arc)
                 gap = min(gap, arc - arcs[t] - 0.5 * (size[0] + sizes[k, 0]))
         if ego[t, 3] >= STANDING_MPS:
@@ -219,8 +227,9 @@ def _leaders(ego, arcs, size, sizes, roles, placed, tags):
 
 @njit(cache=True)
 @no_type_check
-def _moves_sideways(placed):
-    return SIDEWAYS_RAD[0] <= abs(placed[2]) <= SIDEWAYS_RAD[1] and abs(placed[3]) >= STANDING_MPS
+def _moves_off(placed, least):
+    """Whether it moves at an angle to the way, neither along nor against it."""
+    return least <= abs(placed[2]) <= math.pi - least and abs(placed[3]) >= STANDING_MPS
 
 
 @njit(cache=True)
@@ -230,16 +239,17 @@ def _crossings(ego, arcs, front, way_end, reach, vulnerable, placed, leader, dt_
     for t in range(1, len(ego)):
         arc, offset, before = placed[t, 0], placed[t, 1], placed[t - 1, 1]
         ahead = arc - arcs[t] - front
-        if not (_moves_sideways(placed[t]) and ahead > 0.0 and arc <= way_end):
+        if not (_moves_off(placed[t], FROM_SIDE_RAD) and ahead > 0.0 and arc <= way_end):
             continue
         # over the middle, not from one side of a bend to the other
         over = before * offset <= 0.0 and abs(before - offset) <= _NEAR_WAY_M
-        tags[_CROSSING_VRU] |= vulnerable and over and ahead <= CROSSES_WITHIN_M
+        over &= _moves_off(placed[t], ACROSS_RAD) and ahead <= CROSSES_WITHIN_M
+        tags[_CROSSING_VRU] |= vulnerable and over
         comes = abs(before) >= reach and abs(offset) < reach
-        if comes and ahead <= YIELDS_WITHIN_M and arc < leader[t]:
+        if comes and ahead <= YIELDS_WITHIN_M and arc <= leader[t]:
             cleared = t
             while cleared + 1 < len(ego) and abs(placed[cleared + 1, 1]) < reach:
-                if abs(placed[cleared + 1, 2]) < SIDEWAYS_RAD[0]:
+                if abs(placed[cleared + 1, 2]) < FROM_SIDE_RAD:
                     break
                 cleared += 1
             tags[_YIELDING] |= _yields(ego[:, 3], arcs, arc - front, t, cleared, dt_s)

@@ -3,25 +3,26 @@
 All rules look at the ticks of the drive alone, the first observation and the last tick included.
 The ego's way is where it went until its track ends, then straight on (`route_along`). Others are
 road users that are not parked. One is on the way while its centre is nearer to it than half of both
-widths together, and moves sideways if it does 0.5 m/s or more and heads 30° to 150° off the way
-there. One comes onto the way if it was not on it one tick before, is now, moves sideways, is ahead
-of the ego's front, and the way is a recorded one there.
+widths together, and a leader if it is a vehicle or bicycle on the way ahead that heads within 45°
+of it or stands. One comes onto the way from the side if it was not on it one tick before and is
+now, ahead of the ego's front, where the way is a recorded one, at 0.5 m/s or more and at an angle
+of at least 20° to it, in either sense.
 
 `left`, `right`, `straight`: the heading turns by over 30° in all to the left, to the right, or by
-    less; every scenario has one of them.
+    less; every scenario has one of them. Headings below 0.5 m/s do not count.
 `u-turn`: it turns by over 150° in all, and the scenario is no `roundabout`.
 `standing-start`: below 0.5 m/s at the first tick.
 `stopping`: stands, below 0.5 m/s, for at least 1 s in a row after having driven at 2 m/s or more.
-`following`: at over half of the ticks at which the ego drives at 0.5 m/s or more, a vehicle or
-    bicycle is on the way ahead, heads within 45° of it, and the gap to it is at most 3 s at the
-    ego's speed, or at most 5 m.
-`yielding`: somebody comes onto the way at most 20 m ahead of the ego's front, with no such leader
-    in between, and the ego's front gets to that place at most 5 s after the other has cleared it:
-    has left the way, or heads within 30° of it. From 3 s before the other came until it gets there
-    the ego is slowest no later than 1 s after the place was cleared, below 0.5 m/s or at 0.6 or
-    less of its highest speed in the 5 s before, and it gets there at least 1 m/s faster.
-`crossing-vru`: a pedestrian, bicycle or animal that moves sideways passes over the middle of the
-    way, at most 30 m ahead of the ego's front, where the way is a recorded one.
+`following`: at over half of the ticks at which the ego drives at 0.5 m/s or more there is a leader,
+    and the gap to it is at most 3 s at the ego's speed, or at most 5 m.
+`yielding`: somebody comes onto the way from the side at most 20 m ahead of the ego's front, with no
+    leader in between, and the ego's front gets to that place at most 5 s after the other has
+    cleared it: has left the way, or heads within 20° of it. From 3 s before the other came until it
+    gets there the ego is slowest no later than 1 s after the place was cleared, below 0.5 m/s or at
+    0.6 or less of its highest speed in the 5 s before, and it gets there at least 1 m/s faster.
+`crossing-vru`: a pedestrian, bicycle or animal passes over the middle of the way at most 30 m ahead
+    of the ego's front, where the way is a recorded one, at 0.5 m/s or more and at an angle of at
+    least 30° to it, in either sense.
 `roundabout`: drives at least 10 m along a ring of the map (`asp_env.data.scenario_rings`), within
     2 m of the middle of one of its lanes and heading within 45° of it.
 `roundabout-entry`, `roundabout-exit`: a `roundabout` in which it comes onto the ring; leaves it.
@@ -49,7 +50,7 @@ COLUMNS = {
     "length_s": "how long the recording goes on after the first observation",
     "distance_m": "how far the ego goes",
     "max_speed_mps": "its highest speed",
-    "turn_deg": "by how much its heading turns in all, left positive",
+    "turn_deg": "by how much its heading turns in all while it does not stand, left positive",
     "density": "how many others are within 30 m of it, on average over the ticks",
     "agents": "how many others are there at any tick",
 }
