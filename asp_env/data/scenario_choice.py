@@ -136,10 +136,11 @@ def _drivable_track(table: Recording, ego_id: int) -> int:
     """Index of the track of a vehicle that drives."""
     found = np.flatnonzero(table.track_ids == ego_id)
     if not len(found):
-        first, last = table.track_ids.min(initial=0), table.track_ids.max(initial=0)
+        ids = table.track_ids
+        span = f"{ids.min()} to {ids.max()}" if len(ids) else "none"
         raise AspEnvError(
-            f"ego {ego_id}: recording {table.name} has no such track; its {len(table)} have ids "
-            f"from {first} to {last}"
+            f"ego {ego_id}: recording {table.name} has no such track; expected one of its "
+            f"{len(table)}, which have the ids {span}"
         )
     track = int(found[0])
     kind = AgentClass(int(table.classes[track]))

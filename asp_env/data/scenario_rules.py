@@ -263,7 +263,7 @@ def _yields(speeds, arcs, place_m, came, cleared, dt_s):
     while there < len(arcs) and arcs[there] < place_m:
         there += 1
     late = (there - cleared) * dt_s
-    if there == len(arcs) or not 0.0 <= late <= YIELDS_AFTER_S + _ROUNDING:
+    if there == len(arcs) or not 0.0 < late <= YIELDS_AFTER_S + _ROUNDING:
         return False
     slowest = max(0, came - int(YIELDS_BEFORE_S / dt_s + _ROUNDING))
     slowest += np.argmin(speeds[slowest : there + 1])

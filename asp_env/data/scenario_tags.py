@@ -16,10 +16,10 @@ of at least 20° to it, in either sense.
 `following`: at over half of the ticks at which the ego drives at 0.5 m/s or more there is a leader,
     and the gap to it is at most 3 s at the ego's speed, or at most 5 m.
 `yielding`: somebody comes onto the way from the side at most 20 m ahead of the ego's front, with no
-    leader in between, and the ego's front gets to that place at most 5 s after the other has
-    cleared it: has left the way, or heads within 20° of it. From 3 s before the other came until it
-    gets there the ego is slowest no later than 1 s after the place was cleared, below 0.5 m/s or at
-    0.6 or less of its highest speed in the 5 s before, and it gets there at least 1 m/s faster.
+    leader in between, and the ego's front gets to that place within 5 s after the other was last on
+    the way at an angle of at least 20° to it. From 3 s before the other came until it gets there
+    the ego is slowest no later than 1 s after that, below 0.5 m/s or at 0.6 or less of its highest
+    speed in the 5 s before, and it gets there at least 1 m/s faster.
 `crossing-vru`: a pedestrian, bicycle or animal passes over the middle of the way at most 30 m ahead
     of the ego's front, where the way is a recorded one, at 0.5 m/s or more and at an angle of at
     least 30° to it, in either sense.

@@ -68,7 +68,8 @@ def _drive(
 
 
 def _values(result: ClosedLoop, planner: str, predictor: str = "") -> dict[str, float]:
-    mine = [r for r in result.rows if (r.planner, r.predictor) == (planner, predictor)]
+    who = (planner, predictor, "all")
+    mine = [r for r in result.rows if (r.planner, r.predictor, r.subset) == who]
     return {row.metric: row.value for row in mine}
 
 
