@@ -76,7 +76,7 @@ class VectorsPart:
         self._bounds = _field_bounds(AGENT_FIELDS), _field_bounds(LINE_FIELDS)
 
     def spaces(self) -> dict[str, spaces.Box]:
-        """Tables of agents (time by time) and lines (point by point), each with its mask of 0, 1."""
+        """Tables of agents (time by time) and lines (point by point), with masks of 0 and 1."""
         shape = self._view.shape
         agents, lines = (shape.agents, shape.ticks), (shape.lines, shape.points)
         return {
@@ -214,7 +214,7 @@ def _way_ahead(routes, counts, arcs, egos, step_m, out):
         cos, sin = math.cos(egos[t, 2]), math.sin(egos[t, 2])
         for k in range(out.shape[1]):
             arc = arcs[t] + (k + 1) * step_m
-            i = min(max(int(math.floor(arc)), 0), last)
+            i = min(max(math.floor(arc), 0), last)
             dx = route[i, 0] + (arc - i) * (route[i + 1, 0] - route[i, 0]) - egos[t, 0]
             dy = route[i, 1] + (arc - i) * (route[i + 1, 1] - route[i, 1]) - egos[t, 1]
             out[t, k, 0] = cos * dx + sin * dy

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from asp_env.errors import AspEnvError
-from asp_env.sim.observation import KNOWN, Observer
+from asp_env.sim.observation import Observer
 from asp_env.sim.observed import STATE_FIELDS
 from asp_env.sim.sight import ego_sight
 from asp_env.views import make_picture_view
