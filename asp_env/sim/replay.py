@@ -18,9 +18,9 @@ from asp_env.data.snippets import gather_window
 from asp_env.dynamics import forward
 from asp_env.errors import AspEnvError
 from asp_env.metrics.boxes import ego_contacts, touching_trailers
-from asp_env.metrics.drivable import off_road_m
 from asp_env.metrics.route import route_coordinates
-from asp_env.sim.world import EGO, Events
+from asp_env.sim.events import Events, contacts_now, outside_now_m
+from asp_env.sim.world import EGO
 
 BEYOND_M = 60.0
 """How far a route goes on straight behind the last recorded position."""
@@ -228,13 +228,11 @@ class ReplayWorld:
         self._judge_contacts()
 
     def _judge_contacts(self) -> None:
-        """Brings contacts up to now. As in nuPlan, whose fault one is shows when it begins."""
+        """Brings contacts up to now."""
         data, rows = self.episodes, np.arange(len(self))
         states = np.ascontiguousarray(data.states[rows, self.now])
         valid = np.ascontiguousarray(data.valid[rows, self.now])
-        found = ego_contacts(states, data.sizes, valid & ~data.own_trailer)
-        lasts = (found > 0) & (data.contacts > 0)
-        data.contacts = np.where(lasts, data.contacts, found)
+        data.contacts = contacts_now(states, data.sizes, valid & ~data.own_trailer, data.contacts)
 
     def scene(self) -> Scene:
         """All that may be known now; targets are all present agents but the ego."""
@@ -275,15 +273,9 @@ class ReplayWorld:
     def events(self) -> Events:
         """What holds now."""
         data = self.episodes
-        egos = self.ego_states()
-        maps, map_index = self.maps()
-        outside = np.zeros(len(self), dtype=np.float32)
-        for number, road_map in enumerate(maps):
-            here = map_index == number
-            outside[here] = off_road_m(road_map, egos[here], data.sizes[here, EGO])
         return Events(
             contacts=data.contacts.copy(),
-            off_road_m=outside,
+            off_road_m=outside_now_m(*self.maps(), self.ego_states(), data.sizes[:, EGO]),
             route_m=data.on_route[:, 0].copy(),
             route_offset_m=data.on_route[:, 1].copy(),
             route_heading_rad=data.on_route[:, 2].copy(),
