@@ -7,8 +7,8 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 
 from asp_env.data.road_map import RoadMap
-from asp_env.metrics.boxes import AT_FAULT, ego_contacts
-from asp_env.metrics.drivable import off_road_m
+from asp_env.metrics.boxes import AT_FAULT
+from asp_env.metrics.drivable import drivable_field
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -46,20 +46,6 @@ class Events:
         return np.asarray(np.isin(self.contacts, [int(kind) for kind in AT_FAULT]).any(axis=1))
 
 
-def contacts_now(
-    states: Float[np.ndarray, "b a 4"],
-    sizes: Float[np.ndarray, "b a 2"],
-    valid: Bool[np.ndarray, "b a"],
-    before: Int[np.ndarray, "b a"],
-) -> Int[np.ndarray, "b a"]:
-    """`Contact` of the ego (slot 0) with each agent, given those of the tick before.
-
-    As in nuPlan, whose fault one is shows when it begins: one that lasts keeps its class.
-    """
-    found = ego_contacts(states, sizes, valid)
-    return np.where((found > 0) & (before > 0), before, found)
-
-
 def outside_now_m(
     maps: Sequence[RoadMap],
     map_index: Int[np.ndarray, " b"],
@@ -69,6 +55,5 @@ def outside_now_m(
     """How far the outermost corner of each ego lies outside the drivable area of its map, m."""
     outside = np.zeros(len(egos), dtype=np.float32)
     for number, road_map in enumerate(maps):
-        here = map_index == number
-        outside[here] = off_road_m(road_map, egos[here], sizes[here])
+        drivable_field(road_map).corners_m(egos, sizes, map_index == number, outside)
     return outside

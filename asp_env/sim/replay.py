@@ -19,7 +19,7 @@ from asp_env.dynamics import forward
 from asp_env.errors import AspEnvError
 from asp_env.metrics.boxes import ego_contacts, touching_trailers
 from asp_env.metrics.route import route_coordinates
-from asp_env.sim.events import Events, contacts_now, outside_now_m
+from asp_env.sim.events import Events, outside_now_m
 from asp_env.sim.world import EGO
 
 BEYOND_M = 60.0
@@ -232,7 +232,7 @@ class ReplayWorld:
         data, rows = self.episodes, np.arange(len(self))
         states = np.ascontiguousarray(data.states[rows, self.now])
         valid = np.ascontiguousarray(data.valid[rows, self.now])
-        data.contacts = contacts_now(states, data.sizes, valid & ~data.own_trailer, data.contacts)
+        data.contacts = ego_contacts(states, data.sizes, valid & ~data.own_trailer, data.contacts)
 
     def scene(self) -> Scene:
         """All that may be known now; targets are all present agents but the ego."""
