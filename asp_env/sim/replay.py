@@ -12,12 +12,12 @@ from asp_env.data.scenario import Scenario
 from asp_env.data.scene import Scene, infer_actions
 from asp_env.dynamics import forward
 from asp_env.metrics.boxes import ego_contacts
-from asp_env.metrics.drivable import off_road_m
 from asp_env.metrics.route import route_coordinates
 from asp_env.sim.beginning import begin
 from asp_env.sim.episodes import Episodes, no_episodes
+from asp_env.sim.events import Events, outside_now_m
 from asp_env.sim.kernels import read_window, write_tick
-from asp_env.sim.world import EGO, Events
+from asp_env.sim.world import EGO
 
 Snapshot = tuple[Episodes, list[Scenario | None], list[np.random.Generator]]
 
@@ -128,13 +128,11 @@ class ReplayWorld:
         return moved.reshape(-1, 4).astype(np.float32, copy=False)
 
     def _judge_contacts(self) -> None:
-        """Brings contacts up to now. As in nuPlan, whose fault one is shows when it begins."""
+        """Brings contacts up to now."""
         data, rows = self.episodes, np.arange(len(self))
         states = np.ascontiguousarray(data.states[rows, self.now])
         valid = np.ascontiguousarray(data.valid[rows, self.now])
-        found = ego_contacts(states, data.sizes, valid & ~data.own_trailer)
-        lasts = (found > 0) & (data.contacts > 0)
-        data.contacts = np.where(lasts, data.contacts, found)
+        data.contacts = ego_contacts(states, data.sizes, valid & ~data.own_trailer, data.contacts)
 
     def scene(self) -> Scene:
         """All that may be known now; targets are all present agents but the ego."""
@@ -182,14 +180,9 @@ class ReplayWorld:
     def events(self) -> Events:
         """What holds now."""
         data = self.episodes
-        egos = self.ego_states()
-        outside = np.zeros(len(self), dtype=np.float32)
-        for number, road_map in enumerate(self._maps):
-            here = self._map_index == number
-            outside[here] = off_road_m(road_map, egos[here], data.sizes[here, EGO])
         return Events(
             contacts=data.contacts.copy(),
-            off_road_m=outside,
+            off_road_m=outside_now_m(*self.maps(), self.ego_states(), data.sizes[:, EGO]),
             route_m=data.on_route[:, 0].copy(),
             route_offset_m=data.on_route[:, 1].copy(),
             route_heading_rad=data.on_route[:, 2].copy(),
