@@ -180,8 +180,6 @@ class VectorView:
             )
         shape = self.shape
         out = self._memory(len(scene.targets), out)
-        for part in out:
-            part.fill(0)
         states = np.ascontiguousarray(scene.states[:, :, -shape.ticks :], dtype=np.float32)
         valid = np.ascontiguousarray(scene.valid[:, :, -shape.ticks :])
         targets = np.ascontiguousarray(scene.targets, dtype=np.int64)
@@ -205,6 +203,7 @@ class VectorView:
             out.agents,
             out.agents_valid,
         )
+        out.lines[~known], out.lines_valid[~known] = 0, False
         map_of_target = np.where(known, scene.map_index[situation], -1)
         for index, road_map in enumerate(scene.maps):
             pieces = self._pieces(road_map)
