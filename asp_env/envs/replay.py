@@ -16,10 +16,10 @@ from asp_env.data.source import open_data
 from asp_env.dynamics import MAX_ACCELERATION_MPS2, MAX_STEERING_RAD
 from asp_env.errors import AspEnvError
 from asp_env.render.frames import draw_frame
-from asp_env.sim.drivers import make_driver
 from asp_env.sim.observation import Observer
 from asp_env.sim.reward import reward_terms, weighted_sum, weights_from
 from asp_env.sim.simulation import Simulation, ending
+from asp_env.sim.traffic import TrafficSpec, make_traffic
 from asp_env.sim.world import Ending
 from asp_env.views import make_picture_view
 
@@ -60,8 +60,9 @@ width m |
     ## Arguments
     `data`: a folder in the inD/rounD layout, `sample:intersection`, `sample:roundabout` or
     `synthetic:…`. `observations`: which parts. `view` and `raster_px` (height, width): what the
-    raster shows, always 72 m by 48 m. `traffic`: `log`, `log-actions` or `idm`. `dt_s`: length of
-    a tick. `reward_weights`: weights by name, where they differ from the defaults.
+    raster shows, always 72 m by 48 m. `traffic`: a driver or a table of them, as
+    `asp_env.sim.traffic.make_traffic` takes it. `dt_s`: length of a tick. `reward_weights`: weights
+    by name, where they differ from the defaults.
 
     ## Version history
     v0: first.
@@ -76,7 +77,7 @@ width m |
         observations: Sequence[str] = ("raster", "actions", "state"),
         view: str = "chauffeurnet",
         raster_px: tuple[int, int] = (360, 240),
-        traffic: str = "log",
+        traffic: TrafficSpec = "log",
         dt_s: float = DEFAULT_DT_S,
         reward_weights: dict[str, float] | None = None,
         render_mode: str | None = None,
@@ -97,8 +98,9 @@ width m |
                 f"{data}: no vehicle covers 10 m in 4 s after 3 s of history; use other recordings"
             )
         self._observer = Observer(observations, make_picture_view(view, pixels=raster_px), history)
+        driver = make_traffic(traffic, dt_s=dt_s)
         self._simulation = Simulation(
-            self.recordings, make_driver(traffic), num_episodes=1, dt_s=dt_s, history=history
+            self.recordings, driver, num_episodes=1, dt_s=dt_s, history=history
         )
         self._weights = weights_from(reward_weights or {})
         self._running = False

@@ -17,14 +17,15 @@ from asp_env.data.source import Recordings, open_data
 from asp_env.errors import AspEnvError
 from asp_env.evaluation.latency import Latency, latency_table, measure_latencies
 from asp_env.evaluation.unseen import nothing_left
-from asp_env.sim.drivers import DRIVERS, make_driver
 from asp_env.sim.simulation import Simulation
+from asp_env.sim.traffic import make_traffic
 from asp_env.views import make_picture_view
 
 DT_S = 0.2
 HISTORY = 15
 REPEATS = 5
 SIZES_PX = ((360, 240), (90, 60))
+TRAFFICS = ("log", "log-actions", "idm", "predictor:constant-velocity")
 COPY_BYTES = 256 * 2**20
 STATE_BYTES = 4 * np.dtype(np.float32).itemsize
 
@@ -64,7 +65,7 @@ class Bench:
                 f"{per_s * size / copy:.2f}",
             )
         scenarios = _scenarios(recordings, self.data, self.episodes)
-        for traffic in DRIVERS:
+        for traffic in TRAFFICS:
             per_s, resets_per_s, size = _steps(recordings, scenarios, traffic)
             name = f"{self.episodes} episodes, {size // STATE_BYTES} slots, {traffic}"
             table.add_row(
@@ -119,7 +120,7 @@ def _steps(
 ) -> tuple[float, float, int]:
     """Episode-steps and resets per second, and the bytes of one tick's states of an episode."""
     simulation = Simulation(
-        recordings, make_driver(traffic), num_episodes=len(scenarios), dt_s=DT_S, history=HISTORY
+        recordings, make_traffic(traffic), num_episodes=len(scenarios), dt_s=DT_S, history=HISTORY
     )
     generators = [np.random.default_rng(0)] * len(scenarios)
     reset_s = median_s(lambda: simulation.reset(scenarios, generators))

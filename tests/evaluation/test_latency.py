@@ -74,7 +74,7 @@ def test_bench_prints_them_where_asked(
     """`--predictors` adds a table; a wrong name is refused before anything is measured."""
     monkeypatch.setattr(bench, "COPY_BYTES", 2**20)
     monkeypatch.setattr(bench, "SIZES_PX", ())
-    monkeypatch.setattr(bench, "DRIVERS", ())
+    monkeypatch.setattr(bench, "TRAFFICS", ())
     assert main(["bench", str(crossings), "--episodes", "2"]) == 0
     assert "predict" not in capsys.readouterr().out
     args = ["bench", str(crossings), "--episodes", "2", "--predictors"]
