@@ -25,6 +25,24 @@ FIRST_KIND = 4
 
 @njit(cache=True, nogil=True)
 @no_type_check
+def target_poses(states, valid, targets, poses):
+    """Writes x, y and heading of every target now; of one that is not there, zeros.
+
+    Args:
+        states: (situations, slots, ticks, 4) float32, the last tick is now.
+        valid: (situations, slots, ticks).
+        targets: (targets, 2) situation and slot.
+        poses: (targets, 3), written.
+    """
+    for t in range(len(targets)):
+        b, ego = targets[t]
+        there = valid[b, ego, -1]
+        for field in range(3):  # what is not valid may hold anything
+            poses[t, field] = states[b, ego, -1, field] if there else 0.0
+
+
+@njit(cache=True, nogil=True)
+@no_type_check
 def place_agents(
     states, valid, sizes, classes, groups, ids, targets, frames, own_past, agents, agents_valid
 ):
@@ -116,21 +134,29 @@ def _choose_agents(states, valid, ids, ego, origin, chosen, distances):
 
 @njit(cache=True, nogil=True)
 @no_type_check
-def place_lines(middles, points, kinds, rows, frames, lines, lines_valid):
-    """Writes the lines of those targets that are on one map.
+def place_lines(middles, points, kinds, valid, targets, here, frames, lines, lines_valid):
+    """Writes the lines of those targets that are on one map; of one that is not there, zeros.
 
     Args:
         middles: (2, pieces) of the map's pieces.
         points: (pieces, points, 4) x, y, cos, sin.
         kinds: (pieces,) indices into `KINDS`.
-        rows: (m,) which targets.
+        valid: (situations, slots, ticks), the last tick is now.
+        targets: (targets, 2) situation and slot.
+        here: (situations,) whether it is on this map.
         frames: (targets, 4) x, y, cos and sin of the targets now, float64.
-        lines: (targets, lines, points, fields); those of the rows are written.
+        lines: (targets, lines, points, fields); those of the targets here are written.
         lines_valid: (targets, lines, points), the same.
     """
     chosen = np.arange(min(lines.shape[1], len(kinds)))
     distances, scratch = np.empty(len(kinds)), np.empty(len(kinds))
-    for t in rows:
+    for t in range(len(targets)):
+        b, ego = targets[t]
+        if not here[b]:
+            continue
+        if not valid[b, ego, -1]:
+            lines[t], lines_valid[t] = 0.0, False
+            continue
         x_0, y_0, cos_0, sin_0 = frames[t, 0], frames[t, 1], frames[t, 2], frames[t, 3]
         if len(chosen) < len(kinds):
             _choose_pieces(middles, (x_0, y_0, cos_0, sin_0), chosen, distances, scratch)
