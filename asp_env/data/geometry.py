@@ -9,6 +9,9 @@ from numba import njit
 
 from asp_env.dynamics import wrap_angle
 
+MIN_STEP_M = 0.5
+"""A way takes no point nearer to its last one than this."""
+
 
 def to_frame(
     points: Shaped[np.ndarray, "*batch 2"], poses: Shaped[np.ndarray, "*poses n"]
@@ -70,28 +73,29 @@ def route_along(states: Float[np.ndarray, "n 4"], *, beyond_m: float) -> Float[n
 
     Points are taken only where the vehicle got on, so that standing and jitter leave no trace.
     """
-    kept = states[_got_on(np.array(states[:, :2])), :2]
-    end = kept[-1]
-    if len(kept) > 1:
-        direction = (kept[-1] - kept[-2]) / np.hypot(*(kept[-1] - kept[-2]))
+    kept = np.empty((len(states) + 1, 2), dtype=states.dtype)
+    count = _moved_on(np.ascontiguousarray(states[:, :2]), MIN_STEP_M, kept)
+    end = kept[count - 1]
+    if count > 1:
+        direction = (end - kept[count - 2]) / np.hypot(*(end - kept[count - 2]))
     else:
         direction = np.array([np.cos(states[-1, 2]), np.sin(states[-1, 2])])
-    beyond = end + (beyond_m * direction).astype(states.dtype)
-    return resample(np.concatenate([kept, beyond[None]]), 1.0)
+    kept[count] = end + (beyond_m * direction).astype(states.dtype)
+    return resample(kept[: count + 1], 1.0)
 
 
 @njit(cache=True)
 @no_type_check
-def _got_on(points):
-    """(n,) the first point, and each that lies 0.5 m or more from the last one before it."""
-    keep = np.zeros(len(points), dtype=np.bool_)
-    keep[0] = True
-    last = 0
+def _moved_on(points, step_m, out):
+    """Writes the first point and each that is a step away from the last one; how many there are."""
+    out[0] = points[0]
+    count = 1
     for i in range(1, len(points)):
-        if math.hypot(points[i, 0] - points[last, 0], points[i, 1] - points[last, 1]) >= 0.5:
-            keep[i] = True
-            last = i
-    return keep
+        dx, dy = points[i, 0] - out[count - 1, 0], points[i, 1] - out[count - 1, 1]
+        if math.hypot(dx, dy) >= step_m:
+            out[count] = points[i]
+            count += 1
+    return count
 
 
 @njit(cache=True)
@@ -111,22 +115,23 @@ def project(route, count, x, y, near_m, reach_m):
     if near_m >= 0.0:
         first = min(max(0, int(near_m - reach_m)), count - 2)
         last = min(count - 1, max(first + 1, int(near_m + reach_m) + 1))
-    best, arc, side, at = np.inf, 0.0, 0.0, -1
+    nearest, arc, offset_x, offset_y, nearest_x, nearest_y = np.inf, 0.0, 0.0, 0.0, 1.0, 0.0
     for i in range(first, last):
         ax, ay = route[i, 0], route[i, 1]
         sx, sy = route[i + 1, 0] - ax, route[i + 1, 1] - ay
-        squared = sx * sx + sy * sy
-        if squared < 1e-12:
+        square = sx * sx + sy * sy
+        if square < 1e-12:
             continue
-        share = ((x - ax) * sx + (y - ay) * sy) / squared
-        low = -np.inf if i == 0 else 0.0  # both ends go on straight
-        high = np.inf if i == count - 2 else 1.0
-        share = min(max(share, low), high)
+        share = ((x - ax) * sx + (y - ay) * sy) / square
+        if i > 0:  # both ends go on straight
+            share = max(share, 0.0)
+        if i < count - 2:
+            share = min(share, 1.0)
         dx, dy = x - ax - share * sx, y - ay - share * sy
         distance = dx * dx + dy * dy
-        if distance < best:
-            best, arc, side, at = distance, i + share, sx * dy - sy * dx, i
-    if at < 0:
-        return 0.0, 0.0, 0.0
-    heading = math.atan2(route[at + 1, 1] - route[at, 1], route[at + 1, 0] - route[at, 0])
-    return arc, math.copysign(math.sqrt(best), side), heading
+        if distance < nearest:
+            nearest, arc = distance, i + share
+            offset_x, offset_y, nearest_x, nearest_y = dx, dy, sx, sy
+    side = nearest_x * offset_y - nearest_y * offset_x
+    offset = math.copysign(math.hypot(offset_x, offset_y), side)
+    return arc, offset, math.atan2(nearest_y, nearest_x)
