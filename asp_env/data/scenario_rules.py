@@ -88,8 +88,10 @@ def describe_all(
         arcs = np.empty(count)
         near = 0.0
         for t in range(count):
-            near, _, _ = project(way, len(way), ego[t, 0], ego[t, 1], max(near, 0.0), 15.0)
-            arcs[t] = near
+            if t > 0:
+                near += math.hypot(ego[t, 0] - ego[t - 1, 0], ego[t, 1] - ego[t - 1, 1])
+            arcs[t], _, _ = project(way, len(way), ego[t, 0], ego[t, 1], near, 15.0)
+            near = max(arcs[t], 0.0)
         _alone(ego, dt_s, tags[i], values[i])
         _on_rings(ego, ring, tags[i])
         tags[i, _U_TURN] &= not tags[i, _ROUNDABOUT]

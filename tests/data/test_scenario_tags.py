@@ -254,3 +254,16 @@ def test_every_scenario_has_one_turn() -> None:
     turns = np.stack([found.has(tag) for tag in ("left", "right", "straight")])
     assert (turns.sum(axis=0) == 1).all()
     assert set(found.counts()) == set(TAGS)
+
+
+@pytest.mark.parametrize("dt_s", [0.1, 0.5, 1.0])
+def test_other_time_steps(dt_s: float) -> None:
+    """At 25 m/s a leader 2 s ahead is followed, and who crosses is seen, however long a tick is."""
+    drives = (
+        car(0, 0, 0, 25),
+        car(54, 0, 0, 25),
+        through(310, 0, 11.3, math.pi / 2, 2, AgentClass.BICYCLE),
+    )
+    recording = make_recording(drives=drives, duration_s=20.0, frame_rate_hz=10.0)
+    found = find_scenarios([recording], source="", dt_s=dt_s, history=round(3 / dt_s))
+    assert set(found[0].tags) == {"straight", "following", "crossing-vru"}
