@@ -1,4 +1,4 @@
-"""Lanelet2 maps (`.osm`): lenient, and every repair is told.
+"""Lanelet2 maps (`.osm`, `.osm_xy`): lenient, and every repair is told.
 
 A lanelet's direction follows from its roles, as in Lanelet2 itself: seen along it, left is on the
 left. How its ways happen to be drawn says nothing, since neighbours that share them may run the
@@ -34,6 +34,9 @@ CURB_TYPES = frozenset(
     {"curbstone", "road_border", "guard_rail", "fence", "wall", "jersey_barrier", "rail"}
 )
 
+FAR_M = 100_000.0
+"""A map whose middle is further from its recordings' origin is that of another place."""
+
 MEETS_WITHIN_M = 0.5
 """Ends of lanelets that do not share nodes meet if both their corners are this near."""
 
@@ -53,6 +56,15 @@ class Origin:
         """The code of the UTM zone."""
         zone = int((self.longitude_deg + 180.0) // 6.0) % 60 + 1
         return (32600 if self.latitude_deg >= 0 else 32700) + zone
+
+    @classmethod
+    def at(cls, *, latitude_deg: float, longitude_deg: float) -> "Origin":
+        """The frame whose origin is a point on the globe."""
+        here = cls(x_m=0.0, y_m=0.0, longitude_deg=longitude_deg, latitude_deg=latitude_deg)
+        ((x_m, y_m),) = project(np.array([latitude_deg]), np.array([longitude_deg]), here)
+        return cls(
+            x_m=float(x_m), y_m=float(y_m), longitude_deg=longitude_deg, latitude_deg=latitude_deg
+        )
 
 
 @dataclass(slots=True, kw_only=True)
@@ -105,7 +117,7 @@ def read_lanelet2(path: Path, origin: Origin) -> RoadMap:
     the outer rings of freespace and parking; holes in these are not cut out.
 
     Raises:
-        DataError: the file is no map, or a map without lanelets.
+        DataError: the file is no map, a map without lanelets, or one of another place.
     """
     osm = read_osm(path)
     if not any(relation.tags.get("type") == "lanelet" for relation in osm.relations):
@@ -115,6 +127,7 @@ def read_lanelet2(path: Path, origin: Origin) -> RoadMap:
         )
     repairs = list(osm.repairs)
     points = _points(osm, origin)
+    _check_near(path, osm, points, origin)
     lanelets = _lanelets(osm, points, repairs)
     vehicle = [lanelet for lanelet in lanelets if lanelet.subtype in VEHICLE_SUBTYPES]
     _untwist(vehicle, repairs)
@@ -138,9 +151,20 @@ def read_lanelet2(path: Path, origin: Origin) -> RoadMap:
 
 
 def _points(osm: Osm, origin: Origin) -> dict[str, np.ndarray]:
-    degrees = np.array(list(osm.nodes.values()), dtype=np.float64).reshape(-1, 2)
-    local = project(degrees[:, 0], degrees[:, 1], origin)
+    given = np.array(list(osm.nodes.values()), dtype=np.float64).reshape(-1, 2)
+    local = given if osm.local else project(given[:, 0], given[:, 1], origin)
     return dict(zip(osm.nodes, local, strict=True))
+
+
+def _check_near(path: Path, osm: Osm, points: Mapping[str, np.ndarray], origin: Origin) -> None:
+    if not points or math.hypot(*np.median(list(points.values()), axis=0)) < FAR_M:
+        return
+    middle = np.median(list(osm.nodes.values()), axis=0)
+    raise DataError(
+        f"{path}: lies about {middle[0]:.4f}, {middle[1]:.4f}, expected it at its recordings' "
+        f"origin {origin.latitude_deg:.4f}, {origin.longitude_deg:.4f} (degrees; told by "
+        "recordingMeta.csv or by meta_data.csv beside the tracks): put the right file in its place"
+    )
 
 
 def _polyline(way: Way, points: Mapping[str, np.ndarray]) -> Float[np.ndarray, "n 2"]:
