@@ -128,7 +128,8 @@ def load(path: str | Path) -> Recordings:
 def _resolve(source: str) -> Path:
     match = _SCHEME.match(source)
     if match is None or Path(source).exists():
-        return Path(source).expanduser().absolute()
+        path = Path(source).expanduser().absolute()
+        return path.resolve() if ".." in path.parts else path  # folders' names are places' names
     scheme, argument = match.groups()
     if scheme == "sample":
         return _sample(argument)

@@ -1,6 +1,6 @@
 """Writes folders in the INTERACTION layout: road users that move as they may, over two lanes."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 
 import numpy as np
@@ -16,7 +16,9 @@ LATITUDE_DEG, LONGITUDE_DEG = 49.0053, 8.4374
 """Where `meta_data.csv` has its origin."""
 
 
-def places(latitude_deg: float = 0.0, longitude_deg: float = 0.0):  # noqa: ANN201
+def places(
+    latitude_deg: float = 0.0, longitude_deg: float = 0.0
+) -> Callable[[np.ndarray], list[str]]:
     """What map nodes say of their place, about an origin in degrees."""
     zone = int((longitude_deg + 180) // 6) + 1
     utm = Transformer.from_crs(4326, 32600 + zone, always_xy=True)

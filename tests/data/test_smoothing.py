@@ -21,7 +21,7 @@ def off_deg(headings: np.ndarray, states: np.ndarray) -> np.ndarray:
 
 
 def test_motion_of_constant_acceleration_is_left_as_it_is() -> None:
-    """x = 2 t + t²: at 1 s 3 m and 4 m/s, to millimetres, though nobody said how fast it is."""
+    """After 2 t + t² m: at 1 s 3 m and 4 m/s, to millimetres, though nobody said how fast it is."""
     time = np.arange(31) * DT_S
     positions = np.stack([2 * time + time**2, np.zeros(31)], axis=-1)
     smoothed, velocities = smooth(positions, DT_S)
