@@ -11,8 +11,8 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from asp_env.data.readers.folders import maps_in, natural, upwards, walk
-from asp_env.data.readers.lanelet2 import Origin
-from asp_env.data.readers.tables import Kind, read_columns
+from asp_env.data.readers.origin import Origin
+from asp_env.data.readers.tables import Kind, find_line, read_columns
 from asp_env.errors import DataError
 
 MAP_SUFFIXES = (".osm", ".osm_xy")
@@ -133,9 +133,8 @@ def read_meta(files: InteractionFiles) -> InteractionMeta:
                     location=files.location,
                     location_id=str(chunk["locationId"][row]) if "locationId" in chunk else folder,
                     speed_limit_mps=limit_kmh / KMH_PER_MPS if limit_kmh > 0 else None,
-                    origin=Origin.at(
-                        latitude_deg=float(chunk["originLat"][row]),
-                        longitude_deg=float(chunk["originLon"][row]),
+                    origin=_origin(
+                        files.meta, float(chunk["originLat"][row]), float(chunk["originLon"][row])
                     ),
                 )
     raise DataError(
@@ -178,6 +177,16 @@ def find_map(
         f"{files.root}: no map for location {folder.name} of recording {files.name}; "
         f"expected a lanelet2 file maps/{folder.name}.osm in it or beside it"
     )
+
+
+def _origin(path: Path, latitude_deg: float, longitude_deg: float) -> Origin:
+    for name, value, most in (("originLat", latitude_deg, 90), ("originLon", longitude_deg, 180)):
+        if abs(value) > most:
+            line = find_line(path, {name: value})
+            raise DataError(
+                f"{path}, line {line}: {name} is {value:g}, expected {-most} to {most} degrees"
+            )
+    return Origin.at(latitude_deg=latitude_deg, longitude_deg=longitude_deg)
 
 
 def _same_number(one: str, other: str) -> bool:

@@ -13,7 +13,7 @@ from pathlib import Path
 import numpy as np
 
 from asp_env.data.readers.folders import maps_in, natural, upwards, walk
-from asp_env.data.readers.lanelet2 import Origin, project
+from asp_env.data.readers.origin import Origin, project
 from asp_env.data.readers.osm import read_osm
 from asp_env.data.readers.tables import read_table
 from asp_env.errors import DataError
