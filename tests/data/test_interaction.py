@@ -138,17 +138,18 @@ def test_wrong_velocities_change_nothing(tmp_path: Path) -> None:
 
 
 def test_folded_headings(tmp_path: Path) -> None:
-    """Headings folded into ±90° turn nobody around, and it is said that they are not used."""
-    cars = some_cars()
+    """Headings folded into ±90° turn nobody around, and are used as such, which is said."""
+    parked = drive((90, -25, 1.55, 0), [(9, 0, 0)], 10)
+    cars = pd.concat([some_cars(), rows(9, parked)])
     expected, _ = read(tmp_path / "a", cars)
     folded = (cars["psi_rad"] + np.pi / 2) % np.pi - np.pi / 2
     assert (np.abs(folded - cars["psi_rad"]) > 3).any()
     found, _ = read(tmp_path / "b", cars.assign(psi_rad=folded))
     assert same(found, expected)
     assert expected.repairs == ()
+    assert track(found, 9)[:, 2] == pytest.approx(1.55)
     (repair,) = found.repairs
-    assert repair.startswith("headings not used: ")
-    assert repair.endswith("% of those of fast vehicles point backwards")
+    assert "% of the headings of fast vehicles point backwards: which end is" in repair
 
 
 def test_backing_up(tmp_path: Path) -> None:

@@ -97,11 +97,14 @@ def test_standing_at_first() -> None:
 
 
 def test_who_never_moves() -> None:
-    """The mean of the measured headings, the short way round, or 0."""
+    """The mean of the measured headings, the short way round, or 0; folded ones have no front."""
     positions = np.zeros((4, 2))
     measured = np.array([3.1, -3.1, 3.1, -3.1])
     assert np.abs(follow_heading(positions, measured, REAR_M, DT_S)) == pytest.approx(math.pi)
     assert (follow_heading(positions, None, REAR_M, DT_S) == 0).all()
+    across = np.array([1.55, -1.55, 1.55, -1.55])
+    found = follow_heading(positions, across, REAR_M, DT_S, folded=True)
+    assert np.abs(found) == pytest.approx(math.pi / 2)
 
 
 def test_backing_up() -> None:

@@ -37,7 +37,7 @@ NOBODY_BACKS_MPS = 3.0
 """Whose heading points back at more than this has a wrong heading."""
 
 MOST_WRONG = 0.01
-"""If more of the fast vehicles' rows than this are so, no heading of the file is used."""
+"""If more of the fast vehicles' rows than this are so, headings are folded into ±90°."""
 
 _COLUMNS: Mapping[str, Kind] = {
     "track_id": "whole",
@@ -82,9 +82,9 @@ def read_interaction(files: InteractionFiles) -> tuple[TrackTable, float]:
     """Reads a recording's tracks and its frame rate.
 
     Tracks are cut at gaps and jumps, positions smoothed; speeds and headings follow from them.
-    A vehicle's heading in the file says which end is its front, and how it stands if it never
-    moves; where headings contradict fast motion, not even that. Vulnerable road users head where
-    they move, from the past alone; before they first move they have the file's heading, or 0.
+    A vehicle's heading in the file says which end is its front, unless headings contradict fast
+    motion, and how it stands if it never moves. Vulnerable road users head where they move, from
+    the past alone; before they first move they have the file's heading, or 0.
 
     Returns:
         The tracks, and the frames per second.
@@ -103,10 +103,10 @@ def read_interaction(files: InteractionFiles) -> tuple[TrackTable, float]:
         )
     kinds, sizes = _per_track(rows, pieces, repairs)
     vulnerable = np.isin(kinds, [int(kind) for kind in VULNERABLE])
-    trusted = _trusted(rows, pieces, vulnerable, repairs)
+    folded = _folded(rows, pieces, vulnerable, repairs)
     measured = np.concatenate(
         [
-            _measured(rows, piece, float(size[0]), clock.step_s, trusted, bool(foot))
+            _measured(rows, piece, float(size[0]), clock.step_s, folded, bool(foot))
             for piece, size, foot in zip(pieces, sizes, vulnerable, strict=True)
         ]
     )
@@ -260,13 +260,13 @@ def _per_track(
     return kinds, np.where(known, sizes, FOOTPRINTS_M[kinds]).astype(np.float32)
 
 
-def _trusted(
+def _folded(
     rows: _Rows,
     pieces: Sequence[_Piece],
     vulnerable: Bool[np.ndarray, " pieces"],
     repairs: list[str],
 ) -> bool:
-    """Whether the file's headings tell a vehicle's front."""
+    """Whether the file's headings do not tell a vehicle's front from its rear."""
     fast = wrong = 0
     for piece, foot in zip(pieces, vulnerable, strict=True):
         heading = rows.heading[piece.rows]
@@ -277,14 +277,17 @@ def _trusted(
         fast += int(moves.sum())
         wrong += int((moves & (along < 0)).sum())
     if wrong <= MOST_WRONG * fast:
-        return True
+        return False
     share = 100 * wrong / fast
-    repairs.append(f"headings not used: {share:.0f} % of those of fast vehicles point backwards")
-    return False
+    repairs.append(
+        f"{share:.0f} % of the headings of fast vehicles point backwards: "
+        "which end is the front is told by motion alone"
+    )
+    return True
 
 
 def _measured(
-    rows: _Rows, piece: _Piece, length_m: float, dt_s: float, trusted: bool, vulnerable: bool
+    rows: _Rows, piece: _Piece, length_m: float, dt_s: float, folded: bool, vulnerable: bool
 ) -> Float[np.ndarray, "rows 5"]:
     """x, y, heading in degrees, velocity along x and y."""
     heading = rows.heading[piece.rows]
@@ -294,6 +297,5 @@ def _measured(
         heading = np.zeros(len(piece.positions)) if heading is None else heading
     else:
         rear_m = AXLE_SHARE_OF_LENGTH * length_m
-        given = heading if trusted else None
-        heading = follow_heading(piece.positions, given, rear_m, dt_s)
+        heading = follow_heading(piece.positions, heading, rear_m, dt_s, folded=folded)
     return np.column_stack([piece.positions, np.degrees(heading), piece.velocities])

@@ -90,17 +90,20 @@ def follow_heading(
     measured_rad: Float[np.ndarray, " rows"] | None,
     rear_m: float,
     dt_s: float,
+    *,
+    folded: bool = False,
 ) -> Float[np.ndarray, " rows"]:
     """A vehicle's headings, radians.
 
-    Which of its ends is the front, the measured headings tell where there are any; without them
-    it drives forward most of its way. One that never sets off has the mean of them, or else 0.
+    Which of its ends is the front, the measured headings tell; without them, or if they are
+    folded, it drives forward most of its way. One that never sets off has the mean of them, or 0.
 
     Args:
         positions: smoothed ones of the box's centre, metres.
-        measured_rad: what the file says, or None if that is not to be relied on.
+        measured_rad: what the file says, or None if it says nothing.
         rear_m: distance from the box's centre to the rear axle.
         dt_s: seconds between frames.
+        folded: whether the measured headings may be of either end.
     """
     steps = np.diff(positions, axis=0)
     way = np.hypot(*steps.T)
@@ -108,14 +111,15 @@ def follow_heading(
     if not away.any():
         if measured_rad is None:
             return np.zeros(len(positions))
-        mean = math.atan2(np.sin(measured_rad).mean(), np.cos(measured_rad).mean())
-        return np.full(len(positions), mean)
+        times = 2 if folded else 1
+        sine, cosine = np.sin(times * measured_rad).mean(), np.cos(times * measured_rad).mean()
+        return np.full(len(positions), math.atan2(sine, cosine) / times)
     course = np.arctan2(steps[:, 1], steps[:, 0])
     off = positions[int(away.argmax())] - positions[0]
     headings = np.empty(len(positions))
     _pull(math.atan2(off[1], off[0]), course, way, rear_m, STANDS_MPS * dt_s, headings)
     moves = way > STANDS_MPS * dt_s
-    along = course if measured_rad is None else measured_rad[1:]
+    along = course if measured_rad is None or folded else measured_rad[1:]
     forward = (way * np.cos(along - headings[1:]))[moves].sum()
     return headings if forward >= 0 else headings + math.pi
 
