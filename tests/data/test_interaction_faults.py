@@ -3,9 +3,15 @@
 from collections.abc import Callable
 from pathlib import Path
 
+import numpy as np
 import pytest
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
 
 from asp_env.cli import main
+from asp_env.data.readers.interaction import InteractionFiles, find_recordings, read_meta
+from asp_env.data.readers.interaction_tracks import read_interaction
+from asp_env.data.readers.tracks import TrackTable
 from asp_env.data.source import open_data
 from asp_env.errors import DataError
 from tests.data.interaction_files import (
@@ -178,6 +184,48 @@ def test_fault(folder: Path, name: str) -> None:
     assert all(part in message for part in expected), message
     if "map" not in name and "metadata" not in name and "origin" not in name:
         assert len(recordings[1]) == 3
+
+
+def outcome(files: InteractionFiles) -> tuple[TrackTable, float] | str:
+    """What is read of a recording, or what is said of it."""
+    try:
+        read_meta(files)
+        return read_interaction(files)
+    except DataError as error:
+        return str(error)
+
+
+@settings(suppress_health_check=[HealthCheck.function_scoped_fixture])
+@given(
+    name=st.sampled_from([VEHICLES, WALKERS, META]),
+    at=st.floats(0, 1, exclude_max=True),
+    gone=st.integers(0, 40),
+    put=st.one_of(
+        st.binary(max_size=6),
+        st.sampled_from([b"\n", b",", b'"', b"-", b"e9", b"1e400", b"nan", b"\xff\xfe", b"\r"]),
+    ),
+)
+def test_any_damage(tmp_path: Path, name: str, at: float, gone: int, put: bytes) -> None:
+    """Whatever bytes are lost or changed: a recording of finite numbers, or one line on it."""
+    folder = tmp_path / "fuzzed"
+    write_recording(folder, pedestrians=walk("P1", (0, 0), (0, 1), 20))
+    meta("0,0.0,0.0")(folder)
+    (path,) = folder.rglob(name)
+    content = path.read_bytes()
+    begin = int(at * len(content))
+    path.write_bytes(content[:begin] + put + content[begin + gone :])
+    (files,) = find_recordings(folder)
+    found = outcome(files)
+    if isinstance(found, str):
+        assert "\n" not in found
+        assert name in found or VEHICLES in found
+        return
+    table, rate_hz = found
+    assert np.isfinite(table.states).all()
+    assert (table.sizes > 0).all()
+    assert 1 <= rate_hz <= 250
+    assert len(np.unique(table.track_ids)) == len(table.track_ids)
+    assert (table.first_frames >= 0).all()
 
 
 def test_exit_status(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:

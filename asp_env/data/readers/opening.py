@@ -117,16 +117,17 @@ def _recording(files: RecordingFiles, meta: Meta, road_map: RoadMap) -> Recordin
 
 def _track_entry(files: RecordingFiles, meta: Meta) -> Entry:
     scale = None
-    if isinstance(files, LevelxFiles) and isinstance(meta, RecordingMeta):
-        rate_hz, table = meta.frame_rate_hz, read_tracks(files)
+    if isinstance(files, InteractionFiles):
+        table, rate_hz = read_interaction(files)
+        repairs = list(table.repairs)
+    else:
+        assert isinstance(meta, RecordingMeta)
+        table, rate_hz = read_tracks(files), meta.frame_rate_hz
         repairs = list(table.repairs)
         if files.background is not None:
             scale = _scale(files, files.background, meta, table)
             if scale is None:
                 repairs.append(f"{files.background.name} left out: its scale cannot be told")
-    else:
-        table, rate_hz = read_interaction(files)
-        repairs = list(table.repairs)
     last_frames = table.first_frames + np.diff(table.starts) - 1
     facts = {
         "frame_rate_hz": rate_hz,
@@ -146,14 +147,14 @@ def _scale(
 
 def _road_map(path: Path, origin: Origin) -> RoadMap:
     facts, arrays = _cached(path, [path], lambda: _map_entry(path, origin), origin)
-    parts = {
+    parts: dict[str, Any] = {name: arrays[name] for name in _MAP_COLUMNS}
+    parts |= {
         name: Ragged(points=arrays[f"{name}_points"], starts=arrays[f"{name}_starts"])
         for name in _MAP_PARTS
     }
     return RoadMap(
         name=path.stem,
         repairs=tuple(facts["repairs"]),
-        **{name: arrays[name] for name in _MAP_COLUMNS},
         **parts,
     )
 

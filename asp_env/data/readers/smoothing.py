@@ -80,8 +80,24 @@ def smooth(
     """
     transition, process = _singer(dt_s)
     variances = _variances(positions, max(round(NOISE_WITHIN_S / dt_s), 1))
-    smoothed = np.empty((len(positions), 4))
-    _smooth(np.ascontiguousarray(positions), variances, transition, process, smoothed)
+    rows = len(positions)
+    means, spreads, smoothed = (
+        np.zeros((rows + 1, 3, 2)),
+        np.zeros((rows + 1, 3, 3)),
+        np.empty((rows, 4)),
+    )
+    means[0, 0] = positions[0]
+    spreads[0] = np.diag([_START_SIGMA_M, _SPEED_SIGMA_MPS, ACCELERATION_SIGMA_MPS2]) ** 2
+    _smooth(
+        np.ascontiguousarray(positions),
+        variances,
+        transition,
+        process,
+        means,
+        spreads,
+        np.zeros((3, 2)),
+        smoothed,
+    )
     return smoothed[:, :2], smoothed[:, 2:]
 
 
@@ -156,55 +172,104 @@ def _variances(positions: Float[np.ndarray, "rows 2"], reach: int) -> Float[np.n
 
 @njit(cache=True, nogil=True)
 @no_type_check
+def _median(values, first, last, axis, room):
+    """Of rows first to last (exclusive) of values, along one axis; room takes them sorted."""
+    count = last - first
+    for i in range(count):
+        value, at = values[first + i, axis], i
+        while at > 0 and room[at - 1] > value:
+            room[at] = room[at - 1]
+            at -= 1
+        room[at] = value
+    return 0.5 * (room[(count - 1) // 2] + room[count // 2])
+
+
+@njit(cache=True, nogil=True)
+@no_type_check
 def _mark_jumps(steps, limit, found):
+    room = np.empty(_STEPS_AROUND)
     for i in range(len(steps)):
         apart = np.inf
-        for first, last in ((max(i - _STEPS_AROUND, 0), i), (i + 1, i + 1 + _STEPS_AROUND)):
-            around = steps[first:last]
-            if len(around) >= 2:
-                x = steps[i, 0] - np.median(around[:, 0])
-                y = steps[i, 1] - np.median(around[:, 1])
-                apart = min(apart, math.hypot(x, y))
+        for side in range(2):
+            first = i + 1 if side else max(i - _STEPS_AROUND, 0)
+            last = min(i + 1 + _STEPS_AROUND, len(steps)) if side else i
+            if last - first >= 2:
+                x = steps[i, 0] - _median(steps, first, last, 0, room)
+                y = steps[i, 1] - _median(steps, first, last, 1, room)
+                apart = min(apart, math.sqrt(x * x + y * y))
         found[i] = limit < apart < np.inf
 
 
 @njit(cache=True, nogil=True)
 @no_type_check
-def _smooth(positions, variances, transition, process, smoothed):
-    """Receives positions and velocities of both axes, whose gains are the same, in `smoothed`."""
-    rows = len(positions)
-    means, spreads = np.empty((rows, 3, 2)), np.empty((rows, 3, 3))
-    mean, spread = np.zeros((3, 2)), np.zeros((3, 3))
-    mean[0] = positions[0]
-    spread[0, 0] = _START_SIGMA_M**2
-    spread[1, 1] = _SPEED_SIGMA_MPS**2
-    spread[2, 2] = ACCELERATION_SIGMA_MPS2**2
-    for k in range(rows):
-        means[k], spreads[k] = mean, spread
-        gain = spread[:, 0] / (spread[0, 0] + variances[k])
-        mean = mean + np.outer(gain, positions[k] - mean[0])
-        spread = spread - np.outer(gain, spread[0])
-        mean = _times(transition, mean)
-        spread = _times(_times(transition, spread), transition.T) + process
-    adjoint = np.zeros((3, 2))
-    for k in range(rows - 1, -1, -1):
-        total = spreads[k, 0, 0] + variances[k]
-        adjoint[0] -= (positions[k] - means[k, 0] + _times(spreads[k, :1], adjoint)[0]) / total
-        mean = means[k] - _times(spreads[k], adjoint)
-        smoothed[k, :2], smoothed[k, 2:] = mean[0], mean[1]
-        adjoint = _times(transition.T, adjoint)
+def _filter(place, variance, mean, spread, transition, process, next_mean, next_spread):
+    """Takes in one position and writes what is expected of the next."""
+    total = spread[0, 0] + variance
+    between = np.zeros((3, 3))
+    for i in range(3):
+        for j in range(3):
+            for n in range(3):
+                kept = spread[n, j] - spread[n, 0] * spread[0, j] / total
+                between[i, j] += transition[i, n] * kept
+    for i in range(3):
+        for n in range(3):
+            for axis in range(2):
+                off = (place[axis] - mean[0, axis]) / total
+                next_mean[i, axis] += transition[i, n] * (mean[n, axis] + spread[n, 0] * off)
+        for j in range(3):
+            next_spread[i, j] = process[i, j]
+            for n in range(3):
+                next_spread[i, j] += between[i, n] * transition[j, n]
 
 
 @njit(cache=True, nogil=True)
 @no_type_check
-def _times(left, right):
-    """The matrix product, which numba has of SciPy only."""
-    product = np.zeros((left.shape[0], right.shape[1]))
-    for i in range(left.shape[0]):
-        for j in range(right.shape[1]):
-            for k in range(left.shape[1]):
-                product[i, j] += left[i, k] * right[k, j]
-    return product
+def _look_back(place, variance, mean, spread, transition, adjoint, smoothed):
+    """Smooths one row by what came after it; `adjoint` (3, 2) carries that on to the one before."""
+    for axis in range(2):
+        off = place[axis] - mean[0, axis]
+        for n in range(3):
+            off += spread[0, n] * adjoint[n, axis]
+        adjoint[0, axis] -= off / (spread[0, 0] + variance)
+        a, b, c = adjoint[0, axis], adjoint[1, axis], adjoint[2, axis]
+        for i in range(2):
+            weighed = spread[i, 0] * a + spread[i, 1] * b + spread[i, 2] * c
+            smoothed[2 * i + axis] = mean[i, axis] - weighed
+        for i in range(3):
+            adjoint[i, axis] = transition[0, i] * a + transition[1, i] * b + transition[2, i] * c
+
+
+@njit(cache=True, nogil=True)
+@no_type_check
+def _smooth(positions, variances, transition, process, means, spreads, adjoint, smoothed):
+    """Receives positions and velocities of both axes, whose gains are the same, in `smoothed`.
+
+    Args:
+        positions: (rows, 2).
+        variances: (rows,).
+        transition: (3, 3) of [position, velocity, acceleration].
+        process: (3, 3), noise that a frame adds.
+        means: (rows + 1, 3, 2), what is expected of each row: that of the first, else zeros.
+        spreads: (rows + 1, 3, 3), its covariance: that of the first, else room.
+        adjoint: zeros (3, 2).
+        smoothed: (rows, 4).
+    """
+    rows = len(positions)
+    for k in range(rows):
+        _filter(
+            positions[k],
+            variances[k],
+            means[k],
+            spreads[k],
+            transition,
+            process,
+            means[k + 1],
+            spreads[k + 1],
+        )
+    for k in range(rows - 1, -1, -1):
+        _look_back(
+            positions[k], variances[k], means[k], spreads[k], transition, adjoint, smoothed[k]
+        )
 
 
 @njit(cache=True, nogil=True)
