@@ -196,5 +196,16 @@ def follow_paths(
     actions = np.zeros((*valid.shape, 2), dtype=np.float32)
     step = np.diff(paths, axis=2, append=paths[:, :, -1:])
     norm = np.maximum(np.linalg.norm(step, axis=-1, keepdims=True), 1e-6)
-    _follow(states, sizes, valid, driven, np.concatenate([paths, step / norm], axis=-1), counts, limits, arcs, idm.as_row(), actions)
+    _follow(
+        states,
+        sizes,
+        valid,
+        driven,
+        np.concatenate([paths, step / norm], axis=-1),
+        counts,
+        limits,
+        arcs,
+        idm.as_row(),
+        actions,
+    )
     return actions

@@ -154,7 +154,19 @@ def _zones(
             )
         else:
             how = _crossing(
-                x, v, wanted[me], law, enters, leaves, s, u, wanted[o], enters_o, leaves_o, first, decides[o]
+                x,
+                v,
+                wanted[me],
+                law,
+                enters,
+                leaves,
+                s,
+                u,
+                wanted[o],
+                enters_o,
+                leaves_o,
+                first,
+                decides[o],
             )
             if how == 0:
                 gap = enters - x
