@@ -42,6 +42,8 @@ LEADS, VULNERABLE, PRESENT = 1, 2, 4
 _NEAR_WAY_M = 8.0
 """Whoever is further from the way than this is no more than off it."""
 _LOOK_AHEAD_M = 60
+_LONGEST_M = 25
+"""Centres are further apart than bumpers by this at most."""
 _LOOK_BACK_M = 10
 _COARSE_M = 4
 """Who is near the way is told from every fourth of its points, and where by all."""
@@ -194,7 +196,8 @@ def _place(rows, first, frame, stride, ego, arcs, way, placed):
         placed[t, 1] = np.inf
         nearest, best = 0, np.inf
         low = max(0, int(arcs[t]) - _LOOK_BACK_M)
-        for j in range(low, min(len(way), int(arcs[t]) + _LOOK_AHEAD_M), _COARSE_M):
+        ahead = max(_LOOK_AHEAD_M, int(LEADER_S * ego[t, 3]) + _LONGEST_M)
+        for j in range(low, min(len(way), int(arcs[t]) + ahead), _COARSE_M):
             dx, dy = way[j, 0] - x, way[j, 1] - y
             if dx * dx + dy * dy < best:
                 nearest, best = j, dx * dx + dy * dy

@@ -98,6 +98,8 @@ def test_stopping_needs_to_have_driven(speed: float, expected: bool) -> None:
         (20.0, 1.81, 10.0, False),
         (20.0, -1.79, 10.0, True),
         (-20.0, 0.0, 10.0, False),
+        (94.4, 0.0, 30.0, True),  # 89.9 m at 30 m/s
+        (94.6, 0.0, 30.0, False),
         (9.4, 0.0, 1.0, True),  # 4.9 m, although 3 s are 3 m
         (9.6, 0.0, 1.0, False),
     ],
