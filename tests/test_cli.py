@@ -99,7 +99,7 @@ def test_an_unwritable_output_is_refused(capsys, tmp_path, command):
         (["--predictors", "constant-velocty"], "unknown predictor 'constant-velocty'"),
         (["--predictors"], "none given"),
         (["--planner", "sampler"], "unknown planner 'sampler'"),
-        (["--traffic", "idn"], "unknown traffic 'idn'"),
+        (["--traffic", "idn"], "unknown driver 'idn'"),
         (["--dt", "0.13"], "0.13 s"),
         (["--dt", "0"], "expected a positive number"),
         (["--dt", "nan"], "expected a positive number"),
