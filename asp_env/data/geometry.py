@@ -1,9 +1,16 @@
 """Frames, boxes and paths: the only definitions, for arrays with any leading axes."""
 
+import math
+from typing import no_type_check
+
 import numpy as np
 from jaxtyping import Float, Shaped
+from numba import njit
 
 from asp_env.dynamics import wrap_angle
+
+MIN_STEP_M = 0.5
+"""A way takes no point nearer to its last one than this."""
 
 
 def to_frame(
@@ -66,14 +73,65 @@ def route_along(states: Float[np.ndarray, "n 4"], *, beyond_m: float) -> Float[n
 
     Points are taken only where the vehicle got on, so that standing and jitter leave no trace.
     """
-    kept = [states[0, :2]]
-    for point in states[1:, :2]:
-        if np.hypot(*(point - kept[-1])) >= 0.5:
-            kept.append(point)
-    end = kept[-1]
-    if len(kept) > 1:
-        direction = (kept[-1] - kept[-2]) / np.hypot(*(kept[-1] - kept[-2]))
+    kept = np.empty((len(states) + 1, 2), dtype=states.dtype)
+    count = _moved_on(np.ascontiguousarray(states[:, :2]), MIN_STEP_M, kept)
+    end = kept[count - 1]
+    if count > 1:
+        direction = (end - kept[count - 2]) / np.hypot(*(end - kept[count - 2]))
     else:
         direction = np.array([np.cos(states[-1, 2]), np.sin(states[-1, 2])])
-    kept.append(end + (beyond_m * direction).astype(states.dtype))
-    return resample(np.stack(kept), 1.0)
+    kept[count] = end + (beyond_m * direction).astype(states.dtype)
+    return resample(kept[: count + 1], 1.0)
+
+
+@njit(cache=True)
+@no_type_check
+def _moved_on(points, step_m, out):
+    """Writes the first point and each that is a step away from the last one; how many there are."""
+    out[0] = points[0]
+    count = 1
+    for i in range(1, len(points)):
+        dx, dy = points[i, 0] - out[count - 1, 0], points[i, 1] - out[count - 1, 1]
+        if math.hypot(dx, dy) >= step_m:
+            out[count] = points[i]
+            count += 1
+    return count
+
+
+@njit(cache=True)
+@no_type_check
+def project(route, count, x, y, near_m, reach_m):
+    """(arc length, lateral offset, heading) of the nearest point of a route.
+
+    Args:
+        route: (p, 2) points, the first `count` of them valid.
+        count: number of valid points, at least 2.
+        x: of the point, metres.
+        y: of the point, metres.
+        near_m: arc length around which to look; negative to look everywhere.
+        reach_m: how far around it, so that a route that crosses itself is not confused.
+    """
+    first, last = 0, count - 1
+    if near_m >= 0.0:
+        first = min(max(0, int(near_m - reach_m)), count - 2)
+        last = min(count - 1, max(first + 1, int(near_m + reach_m) + 1))
+    nearest, arc, offset_x, offset_y, nearest_x, nearest_y = np.inf, 0.0, 0.0, 0.0, 1.0, 0.0
+    for i in range(first, last):
+        ax, ay = route[i, 0], route[i, 1]
+        sx, sy = route[i + 1, 0] - ax, route[i + 1, 1] - ay
+        square = sx * sx + sy * sy
+        if square < 1e-12:
+            continue
+        share = ((x - ax) * sx + (y - ay) * sy) / square
+        if i > 0:  # both ends go on straight
+            share = max(share, 0.0)
+        if i < count - 2:
+            share = min(share, 1.0)
+        dx, dy = x - ax - share * sx, y - ay - share * sy
+        distance = dx * dx + dy * dy
+        if distance < nearest:
+            nearest, arc = distance, i + share
+            offset_x, offset_y, nearest_x, nearest_y = dx, dy, sx, sy
+    side = nearest_x * offset_y - nearest_y * offset_x
+    offset = math.copysign(math.hypot(offset_x, offset_y), side)
+    return arc, offset, math.atan2(nearest_y, nearest_x)

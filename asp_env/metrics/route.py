@@ -1,49 +1,12 @@
 """Where a point lies along a route whose points are 1 m apart, compiled."""
 
-import math
 from typing import no_type_check
 
 import numpy as np
 from jaxtyping import Bool, Float
 from numba import njit
 
-
-@njit(cache=True)
-@no_type_check
-def project(route, count, x, y, near_m, reach_m):
-    """(arc length, lateral offset, heading) of the nearest point of a route.
-
-    Args:
-        route: (p, 2) points, the first `count` of them valid.
-        count: number of valid points, at least 2.
-        x: of the point, metres.
-        y: of the point, metres.
-        near_m: arc length around which to look; negative to look everywhere.
-        reach_m: how far around it, so that a route that crosses itself is not confused.
-    """
-    first, last = 0, count - 1
-    if near_m >= 0.0:
-        first = min(max(0, int(near_m - reach_m)), count - 2)
-        last = min(count - 1, max(first + 1, int(near_m + reach_m) + 1))
-    best, arc, offset, heading = np.inf, 0.0, 0.0, 0.0
-    for i in range(first, last):
-        ax, ay = route[i, 0], route[i, 1]
-        sx, sy = route[i + 1, 0] - ax, route[i + 1, 1] - ay
-        length = math.hypot(sx, sy)
-        if length < 1e-6:
-            continue
-        along = ((x - ax) * sx + (y - ay) * sy) / length
-        low = -np.inf if i == 0 else 0.0  # both ends go on straight
-        high = np.inf if i == count - 2 else length
-        along = min(max(along, low), high)
-        dx, dy = x - ax - along * sx / length, y - ay - along * sy / length
-        distance = math.hypot(dx, dy)
-        if distance < best:
-            best = distance
-            arc = i + along / length
-            offset = math.copysign(distance, sx * dy - sy * dx)
-            heading = math.atan2(sy, sx)
-    return arc, offset, heading
+from asp_env.data.geometry import project
 
 
 @njit(cache=True)

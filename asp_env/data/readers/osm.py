@@ -1,11 +1,15 @@
 """OSM XML as it comes: nodes, ways and relations, with whatever had to be overlooked."""
 
+import re
 import xml.etree.ElementTree as ElementTree
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
 from asp_env.errors import DataError
+
+SPEED_UNITS = {"": 1 / 3.6, "km/h": 1 / 3.6, "kmh": 1 / 3.6, "m/s": 1.0, "mph": 0.44704}
+"""In m/s; a number without a unit is in km/h, in Lanelet2 as in OSM."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -32,7 +36,8 @@ class Osm:
     """What a file holds. Ways have at least two nodes, all of which exist."""
 
     nodes: Mapping[str, tuple[float, float]]
-    """(latitude, longitude) in degrees by id."""
+    """By id: (latitude, longitude) in degrees, or (x, y) in metres if `local`."""
+    local: bool
     ways: Mapping[str, Way]
     relations: tuple[Relation, ...]
     repairs: tuple[str, ...]
@@ -41,6 +46,8 @@ class Osm:
 def read_osm(path: Path) -> Osm:
     """Reads a map file. Of elements with the same id the first counts; deleted ones do not.
 
+    Nodes of a file whose name ends in `.osm_xy` have local metres in place of degrees.
+
     Raises:
         DataError: the file is absent or no XML.
     """
@@ -48,6 +55,7 @@ def read_osm(path: Path) -> Osm:
     raw_ways: dict[str, Way] = {}
     relations: dict[str, Relation] = {}
     doubles: list[str] = []
+    local = path.suffix == ".osm_xy"
     try:
         for _, element in ElementTree.iterparse(path):
             if element.tag not in ("node", "way", "relation"):
@@ -59,7 +67,7 @@ def read_osm(path: Path) -> Osm:
             elif number in known:
                 doubles.append(f"{element.tag} {number}")
             elif element.tag == "node":
-                _add_node(nodes, number, element)
+                _add_node(nodes, number, element, ("x", "y") if local else ("lat", "lon"))
             elif element.tag == "way":
                 raw_ways[number] = _way(number, element)
             else:
@@ -75,7 +83,13 @@ def read_osm(path: Path) -> Osm:
     if doubles:
         repairs.append(f"{len(doubles)} ids given twice, the first kept: {shorten(doubles)}")
     ways = _complete(raw_ways, nodes, repairs)
-    return Osm(nodes=nodes, ways=ways, relations=tuple(relations.values()), repairs=tuple(repairs))
+    return Osm(
+        nodes=nodes,
+        local=local,
+        ways=ways,
+        relations=tuple(relations.values()),
+        repairs=tuple(repairs),
+    )
 
 
 def shorten(names: list[str], limit: int = 5) -> str:
@@ -85,10 +99,13 @@ def shorten(names: list[str], limit: int = 5) -> str:
 
 
 def _add_node(
-    nodes: dict[str, tuple[float, float]], number: str, element: ElementTree.Element
+    nodes: dict[str, tuple[float, float]],
+    number: str,
+    element: ElementTree.Element,
+    names: tuple[str, str],
 ) -> None:
     try:
-        nodes[number] = (float(element.get("lat", "")), float(element.get("lon", "")))
+        nodes[number] = (float(element.get(names[0], "")), float(element.get(names[1], "")))
     except ValueError:
         return  # a node without a position is a missing one, and reported as such
 
@@ -109,6 +126,14 @@ def _relation(number: str, element: ElementTree.Element) -> Relation:
         if member.get("type", "way") == "way"
     )
     return Relation(id=number, members=members, tags=_tags(element))
+
+
+def speed_mps(text: str) -> float | None:
+    """A speed as a tag tells it, such as `50 km/h` or `30 mph`; None if it tells none."""
+    match = re.fullmatch(r"(\d+(?:\.\d+)?)\s*([a-z/]*)", text.strip().lower())
+    if match is None or match[2] not in SPEED_UNITS:
+        return None
+    return float(match[1]) * SPEED_UNITS[match[2]]
 
 
 def _complete(
