@@ -43,12 +43,14 @@ class Clock(pl.Callback):
         self.come: list[Any] = []
         self.done: list[Any] = []
 
-    def on_train_batch_start(self, *_: Any) -> None:
+    def on_train_batch_start(self, *args: Any, **kwargs: Any) -> None:
         """The batch has been asked to be copied."""
+        del args, kwargs
         self.come.append(_mark())
 
-    def on_train_batch_end(self, *_: Any) -> None:
+    def on_train_batch_end(self, *args: Any, **kwargs: Any) -> None:
         """All of the step's work has been asked for."""
+        del args, kwargs
         self.done.append(_mark())
 
     def found(self) -> tuple[float, float]:
