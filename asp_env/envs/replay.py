@@ -9,13 +9,15 @@ from gymnasium import spaces
 from jaxtyping import Shaped
 
 from asp_env.data.clock import DEFAULT_DT_S, ticks
+from asp_env.data.forecast import Forecast
+from asp_env.data.recording import Background
 from asp_env.data.scenario import find_scenarios
 from asp_env.data.scene import Scene
 from asp_env.data.snippets import HISTORY_S
 from asp_env.data.source import open_data
 from asp_env.dynamics import MAX_ACCELERATION_MPS2, MAX_STEERING_RAD
 from asp_env.errors import AspEnvError
-from asp_env.render.frames import draw_frame
+from asp_env.render.live import MODES, Live
 from asp_env.sim.drivers import make_driver
 from asp_env.sim.observation import Observer
 from asp_env.sim.reward import reward_terms, weighted_sum, weights_from
@@ -23,7 +25,7 @@ from asp_env.sim.simulation import Simulation, ending
 from asp_env.sim.world import Ending
 from asp_env.views import make_picture_view
 
-METADATA = {"render_modes": ["rgb_array"], "render_fps": 5}
+METADATA = {"render_modes": [*MODES], "render_fps": 5}
 FAILURES = (Ending.COLLISION, Ending.OFF_ROAD)
 
 
@@ -63,6 +65,10 @@ width m |
     raster shows, always 72 m by 48 m. `traffic`: `log`, `log-actions` or `idm`. `dt_s`: length of
     a tick. `reward_weights`: weights by name, where they differ from the defaults.
 
+    ## Rendering
+    `render_mode`: `rgb_array`, a picture from above of 80 m by 80 m, or `human`, a window that
+    keeps up with the episode (extra `render`). `show` adds a forecast and a plan.
+
     ## Version history
     v0: first.
     """
@@ -86,10 +92,10 @@ width m |
         Raises:
             AspEnvError: an argument is not understood, or the data hold no scenario.
         """
-        if render_mode is not None and render_mode not in self.metadata["render_modes"]:
-            raise AspEnvError(f"render mode {render_mode!r}: expected rgb_array or None")
-        self.render_mode = render_mode
         history = ticks(HISTORY_S, dt_s)
+        self.render_mode = render_mode
+        self.metadata = {**METADATA, "render_fps": round(1 / dt_s, 6)}
+        self._live = Live(render_mode, title=f"asp-env: {data}", dt_s=dt_s)
         self.recordings = open_data(data)
         self.scenarios = find_scenarios(self.recordings, source=data, dt_s=dt_s, history=history)
         if not len(self.scenarios):
@@ -129,6 +135,8 @@ width m |
         self._running = True
         self._events = self._simulation.world.events()
         scene = self.scene()
+        self._live.begin()
+        self._live.keep_up(scene, self._background)
         return self._observe(scene), self._info()
 
     def step(self, action: Any) -> tuple[dict[str, Any], float, bool, bool, dict[str, Any]]:
@@ -156,7 +164,9 @@ width m |
             "ending": why.name,
         }
         reward = float(weighted_sum(terms, self._weights)[0])
-        return self._observe(self.scene()), reward, terminated, truncated, info
+        scene = self.scene()
+        self._live.keep_up(scene, self._background)
+        return self._observe(scene), reward, terminated, truncated, info
 
     def scene(self) -> Scene:
         """All that may be known now, for a predictor in anybody's loop; the ego is slot 0.
@@ -168,13 +178,40 @@ width m |
             raise gymnasium.error.ResetNeeded("no episode has begun: call reset first")
         return self._simulation.world.scene()
 
+    def show(
+        self, *, forecast: Forecast | None = None, plan: Shaped[np.ndarray, "steps n"] | None = None
+    ) -> None:
+        """Hands over what to draw besides, until the next time; `reset` forgets it.
+
+        Args:
+            forecast: of `scene()`. Later pictures show what is still to come of it.
+            plan: the ego's positions at the next ticks, metres, in the first two columns.
+
+        Raises:
+            AspEnvError: it is not of this scene, or not finite.
+        """
+        self._live.tell(self.scene(), forecast, plan)
+        if self.render_mode == "human":
+            self.render()
+
     def render(self) -> Any:
-        """An RGB picture uint8 (H, W, 3) from above in mode `rgb_array`, else None."""
+        """A picture from above: RGB uint8 (H, W, 3) in mode `rgb_array`, on screen in `human`.
+
+        Raises:
+            gymnasium.error.ResetNeeded: no episode has begun.
+            AspEnvError: there is no screen.
+        """
         if self.render_mode is None:
             return None
-        scene = self.scene()
-        recording = self.recordings[int(self._simulation.world.episodes.recording[0])]
-        return draw_frame(scene, background=recording.background)
+        return self._live.render(self.scene(), self._background)
+
+    def close(self) -> None:
+        """Closes the window, if there is one."""
+        self._live.close()
+
+    @property
+    def _background(self) -> Background | None:
+        return self.recordings[int(self._simulation.world.episodes.recording[0])].background
 
     def _observe(self, scene: Scene) -> dict[str, Any]:
         observed = self._observer.observe(scene, self._events)

@@ -15,7 +15,8 @@ from asp_env.data.recording import Background
 from asp_env.data.scene import Scene
 from asp_env.errors import AspEnvError, DataError
 from asp_env.render import ground
-from asp_env.render.frames import CLASS_COLOURS, EDGE, EGO, EGO_EDGE, FORECAST, draw_frame
+from asp_env.render.canvas import SHADE
+from asp_env.render.frames import CLASS_COLOURS, EGO_COLOUR, EGO_EDGE, FORECAST, draw_frame
 from asp_env.render.ground import GROUND, PHOTO_STRENGTH, ROAD, draw_ground
 from tests.builders import make_map
 
@@ -80,7 +81,7 @@ def test_places_and_colours() -> None:
     )
     image = draw_frame(scene, **SIZE)
     assert image.shape == (400, 400, 3)
-    assert pixel(image, 0, 0) == EGO
+    assert pixel(image, 0, 0) == EGO_COLOUR
     assert pixel(image, 10, 1) == CLASS_COLOURS[AgentClass.TRUCK]
     assert pixel(image, 0, 10) == CLASS_COLOURS[AgentClass.PEDESTRIAN]
     assert pixel(image, 0, -10) == GROUND  # the road is 7 m wide
@@ -92,12 +93,12 @@ def test_a_box_has_its_length_along_its_heading_and_a_wedge_at_its_front() -> No
     """Heading +y: 4 m up, 2 m wide, dark wedge in the upper half and none in the lower."""
     scene = make_scene((AgentClass.CAR, 50.0, 40.0, np.pi / 2))
     image = draw_frame(scene, **SIZE)
-    assert pixel(image, 0, 1.2) == EDGE
-    assert pixel(image, 0, -1.2) == EGO
-    assert pixel(image, 0.8, -1.8) == EGO
+    assert pixel(image, 0, 1.2) == SHADE
+    assert pixel(image, 0, -1.2) == EGO_COLOUR
+    assert pixel(image, 0.8, -1.8) == EGO_COLOUR
     assert pixel(image, 1.3, 0) == GROUND
     assert pixel(image, 0, 2.3) == GROUND
-    assert pixel(image, 0, -1.97)[0] > (EGO[0] + EGO_EDGE[0]) / 2
+    assert pixel(image, 0, -1.97)[0] > (EGO_COLOUR[0] + EGO_EDGE[0]) / 2
 
 
 def test_equal_arguments_give_equal_bits() -> None:
@@ -187,7 +188,7 @@ def test_the_whole_map_is_shown_without_an_extent() -> None:
     scale = 500 / 200 / 1.06
     for x, y in ((95, -2), (-95, 2), (2, 95), (-2, -95)):
         assert pixel(image, x, y, scale=scale) == ROAD
-    assert pixel(image, 90, 1, scale=scale) == EGO
+    assert pixel(image, 90, 1, scale=scale) == EGO_COLOUR
 
 
 def test_a_photograph_lies_where_its_scale_says(tmp_path: Path) -> None:
