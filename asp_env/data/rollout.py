@@ -6,6 +6,7 @@ import math
 import os
 import zipfile
 import zlib
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -25,7 +26,7 @@ _DAMAGED = (
 )
 
 
-_SHAPES = (
+_AXES = (
     ("states", "ticks a 4", "f"),
     ("valid", "ticks a", "b"),
     ("log_states", "ticks a 4", "f"),
@@ -70,23 +71,6 @@ class Rollout:
     events: Bool[np.ndarray, "ticks kinds"]
     event_names: tuple[str, ...]
 
-    def __post_init__(self) -> None:
-        """Checks that the parts fit together.
-
-        Raises:
-            DataError: a shape, a type or a number does not fit the others.
-        """
-        sizes = _sizes(self)
-        if not (sizes["ticks"] and sizes["a"] and sizes["plans"] <= sizes["ticks"]):
-            raise DataError(f"{sizes['ticks']} ticks, {sizes['a']} agents, {sizes['plans']} plans")
-        ends = {"forecast_slots": sizes["a"], "forecast_ticks": sizes["ticks"]}
-        for name, end in (ends | {"classes": len(AgentClass)}).items():
-            numbers = getattr(self, name)
-            if not ((numbers >= 0) & (numbers < end)).all():
-                raise DataError(f"{name}: expected numbers from 0 to {end - 1}")
-        if not (isinstance(self.dt_s, float) and 0 < self.dt_s < math.inf):
-            raise DataError(f"time step {self.dt_s!r}: expected a positive number")
-
     def save(self, path: Path) -> None:
         """Writes one compressed `.npz`, aside first, then renamed."""
         header = {
@@ -118,6 +102,7 @@ class Rollout:
             header = json.loads(arrays.pop("header").tobytes())
             if header["format"] != FORMAT:
                 raise DataError(f"rollout format {header['format']}, expected {FORMAT}")
+            _check(arrays, header)
             scenario = header["scenario"]
             scenario["tags"] = tuple(scenario["tags"])
             return cls(
@@ -133,19 +118,26 @@ class Rollout:
             raise DataError(f"{path}: not a rollout that can be read ({why})") from error
 
 
-def _sizes(rollout: Rollout) -> dict[str, int]:
-    """How long each axis is.
+def _check(arrays: Mapping[str, np.ndarray], header: Mapping[str, Any]) -> None:
+    """Refuses parts that do not fit together.
 
     Raises:
-        DataError: two arrays differ in it, or one is of another kind.
+        DataError: an axis, a kind of number or a number does not fit the others.
     """
-    sizes: dict[str, int] = {"kinds": len(rollout.event_names)}
-    for name, axes, kinds in _SHAPES:
-        array = getattr(rollout, name)
+    sizes: dict[str, int] = {"kinds": len(header["event_names"])}
+    for name, axes, kinds in _AXES:
+        array = arrays[name]
         if array.dtype.kind not in kinds or array.ndim != len(axes.split()):
             raise DataError(f"{name}: {array.dtype} {array.shape}, expected ({axes})")
         for axis, size in zip(axes.split(), array.shape, strict=True):
             expected = int(axis) if axis.isdigit() else sizes.setdefault(axis, size)
             if size != expected:
                 raise DataError(f"{name}: {size} along {axis!r}, expected {expected}")
-    return sizes
+    if not (sizes["ticks"] and sizes["a"] and sizes["plans"] <= sizes["ticks"]):
+        raise DataError(f"{sizes['ticks']} ticks, {sizes['a']} agents, {sizes['plans']} plans")
+    ends = {"forecast_slots": sizes["a"], "forecast_ticks": sizes["ticks"]}
+    for name, end in (ends | {"classes": len(AgentClass)}).items():
+        if not ((arrays[name] >= 0) & (arrays[name] < end)).all():
+            raise DataError(f"{name}: expected numbers from 0 to {end - 1}")
+    if not 0 < header["dt_s"] < math.inf:
+        raise DataError(f"time step {header['dt_s']} s: expected a positive number")

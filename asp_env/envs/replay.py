@@ -179,7 +179,7 @@ width m |
         return self._simulation.world.scene()
 
     def show(
-        self, *, forecast: Forecast | None = None, plan: Shaped[np.ndarray, "steps n"] | None = None
+        self, *, forecast: Forecast | None = None, plan: Shaped[np.ndarray, "..."] | None = None
     ) -> None:
         """Hands over what to draw besides, until the next time; `reset` forgets it.
 

@@ -60,7 +60,7 @@ class Watch:
         rollouts = load_rollouts(self.rollout)
         console = Console()
         if self.list:
-            console.print(_table(rollouts))
+            console.print(_table(self.rollout, rollouts))
             return
         films = make_films(rollouts, self.data)
         if self.video is None:
@@ -184,7 +184,7 @@ def _title(path: Path, rollout: Rollout) -> str:
     return f"{driver.name}: {scenario}" if driver.parent.name == "rollouts" else scenario
 
 
-def _table(rollouts: Mapping[Path, Rollout]) -> Table:
+def _table(folder: Path, rollouts: Mapping[Path, Rollout]) -> Table:
     table = Table(box=None)
     for name in ("rollout", "seconds", "tags", "what went wrong"):
         table.add_column(name, overflow="fold")
@@ -195,5 +195,6 @@ def _table(rollouts: Mapping[Path, Rollout]) -> Table:
             if held
         ]
         seconds = f"{(len(rollout.states) - 1) * rollout.dt_s:.1f}"
-        table.add_row(str(path), seconds, ", ".join(rollout.scenario.tags), ", ".join(wrong))
+        name = path.relative_to(folder) if path != folder else path
+        table.add_row(str(name), seconds, ", ".join(rollout.scenario.tags), ", ".join(wrong))
     return table

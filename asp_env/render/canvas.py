@@ -90,22 +90,25 @@ class Canvas:
         x0, y0, x1, y1 = (max(round(at * self.unit), 0) for at in (left, top, right, bottom))
         self.image[y0:y1, x0:x1] = colour
 
-    def text(self, words: str, left: float, base: float, colour: Colour) -> None:
+    def text(
+        self, words: str, left: float, base: float, colour: Colour, *, rim: bool = True
+    ) -> None:
         """Words whose base line starts at a point, with a dark rim to be read over anything."""
-        scale, thickness = TEXT_SCALE * self.unit, round(self.unit)
-        rim = 2 * round(self.unit)
+        scale, thickness = TEXT_SCALE * self.unit, int(self.unit)
         (width, height), below = cv2.getTextSize(words, FONT, scale, thickness)
-        x, y = round(left * self.unit) - 2 * rim, round(base * self.unit) - height - 2 * rim
-        mask = _new_mask(height + below + 4 * rim, width + 4 * rim)
-        at = (2 * rim, height + 2 * rim)
+        edge = 4 * round(self.unit)
+        x, y = round(left * self.unit) - edge, round(base * self.unit) - height - edge
+        mask = _new_mask(height + below + 2 * edge, width + 2 * edge)
+        at = (edge, height + edge)
         cv2.putText(mask, words, at, FONT, scale, 255, thickness, cv2.LINE_AA)
-        dark = cv2.dilate(mask, np.ones((rim + 1, rim + 1), dtype=np.uint8)) // 4 * 3
-        self._blend(dark, y, x, SHADE)
+        if rim:
+            wide = np.ones((edge // 2 + 1, edge // 2 + 1), dtype=np.uint8)
+            self._blend(cv2.dilate(mask, wide) // 4 * 3, y, x, SHADE)
         self._blend(mask, y, x, colour)
 
     def text_width(self, words: str) -> float:
         """How long words get."""
-        (width, _), _ = cv2.getTextSize(words, FONT, TEXT_SCALE * self.unit, round(self.unit))
+        (width, _), _ = cv2.getTextSize(words, FONT, TEXT_SCALE * self.unit, int(self.unit))
         return width / self.unit
 
 

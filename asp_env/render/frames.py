@@ -35,6 +35,8 @@ FORECAST: Colour = (255, 146, 43)
 PLAN: Colour = (120, 190, 255)
 TRAIL: Colour = (170, 182, 200)
 GHOST: Colour = (242, 245, 249)
+ALARM_GAP_M = 1.2
+"""How much larger than the ego the frame is that shows something to be wrong."""
 MIN_BOX_PX = 6.0
 """Nobody is drawn smaller than this, so that pedestrians are seen."""
 MIN_WEDGE_PX = 8.0
@@ -63,7 +65,7 @@ def draw_frame(
         forecast: of this scene, or of an earlier tick with the same slots; width and strength of
             a mode tell its probability.
         plan: (steps, 2 or more) the ego's planned positions, metres, in their first two columns.
-        background: a photograph of the place in place of the map's drivable area.
+        background: a photograph of the place, over the map's drivable area.
 
     Raises:
         AspEnvError: a size is not positive, or there is no such situation.
@@ -99,8 +101,12 @@ def draw_moment(moment: Moment, *, size_px: tuple[int, int], extent_m: float | N
         ahead = np.concatenate([moment.states[EGO, None, -1, :2], moment.plan])
         canvas.stroke(ahead[None], 0.95, 4.0)
         canvas.blend(PLAN)
+    if moment.logged_ego is not None:
+        _frame(canvas, moment.logged_ego, moment.sizes[EGO], 0.85, 2.0, GHOST)
     _draw_boxes(canvas, moment, seen)
-    _draw_ego_marks(canvas, moment)
+    if moment.alarms and moment.valid[EGO, -1]:
+        size = moment.sizes[EGO] + ALARM_GAP_M
+        _frame(canvas, moment.states[EGO, -1], size, 1.0, 3.0, moment.alarms[0][1])
     draw_labels(canvas, moment.words, moment.alarms)
     return canvas
 
@@ -187,23 +193,15 @@ def _wedges(
     return from_frame(corners, states[:, None])
 
 
-def _draw_ego_marks(canvas: Canvas, moment: Moment) -> None:
-    """The logged ego as an outline, and a frame about the ego while something is wrong."""
-    size = moment.sizes[EGO]
-    if moment.logged_ego is not None:
-        _frame(canvas, moment.logged_ego, size, 0.85, 2.0)
-        canvas.blend(GHOST)
-    if moment.alarms and moment.valid[EGO, -1]:
-        _frame(canvas, moment.states[EGO, -1], size + 1.2, 1.0, 3.0)
-        canvas.blend(moment.alarms[0][1])
-
-
 def _frame(
     canvas: Canvas,
     state: Shaped[np.ndarray, " 4"],
     size: Shaped[np.ndarray, " 2"],
     alpha: float,
     width_px: float,
+    colour: Colour,
 ) -> None:
+    """An empty box."""
     corners = box_corners(state, size)
     canvas.stroke(np.concatenate([corners, corners[:1]])[None], alpha, width_px)
+    canvas.blend(colour)

@@ -30,7 +30,7 @@ def _badge(canvas: Canvas, what: str, row: float, colour: Colour) -> None:
     width = canvas.text_width(what)
     right = canvas.width - MARGIN_PX
     canvas.field(right - width - 16, row - 16, right, row + 8, colour)
-    canvas.text(what, right - width - 8, row, SHADE)
+    canvas.text(what, right - width - 8, row, SHADE, rim=False)
 
 
 def _scale_bar(canvas: Canvas) -> None:
@@ -81,6 +81,6 @@ def draw_time_line(
     canvas.field(0.0, top, width, height, SHADE)
     canvas.field(0.0, top, done * width, height, FAINT)
     for begin, end, colour in spells:
-        left = begin * width
-        canvas.field(left, top, max(end * width, left + 3), height, colour)
+        left = min(begin * width, width - 5)
+        canvas.field(left, top, max(end * width, left + 5), height, colour)
     canvas.field(done * width - 1.5, top - 2, done * width + 1.5, height, TEXT)

@@ -45,7 +45,7 @@ class Live:
         self,
         scene: Scene,
         forecast: Forecast | None,
-        plan: Shaped[np.ndarray, "steps n"] | None,
+        plan: Shaped[np.ndarray, "..."] | None,
     ) -> None:
         """Takes what is forecast and planned; what is still to come of it is shown from now on.
 

@@ -2,6 +2,7 @@
 
 import os
 from collections.abc import Iterable, Mapping
+from contextlib import suppress
 from dataclasses import dataclass
 from fractions import Fraction
 from importlib.util import find_spec
@@ -101,7 +102,7 @@ def write_video(
     except OSError as error:
         raise AspEnvError(f"video {path}: cannot be written ({error.strerror or error})") from error
     finally:
-        if aside.is_file():
+        with suppress(OSError):
             aside.unlink()
     return count
 
