@@ -189,12 +189,11 @@ def _table(folder: Path, rollouts: Mapping[Path, Rollout]) -> Table:
     for name in ("rollout", "seconds", "tags", "what went wrong"):
         table.add_column(name, overflow="fold")
     for path, rollout in rollouts.items():
-        wrong = [
-            name
-            for name, held in zip(rollout.event_names, rollout.events.any(axis=0), strict=True)
-            if held
-        ]
-        seconds = f"{(len(rollout.states) - 1) * rollout.dt_s:.1f}"
-        name = path.relative_to(folder) if path != folder else path
-        table.add_row(str(name), seconds, ", ".join(rollout.scenario.tags), ", ".join(wrong))
+        happened = np.flatnonzero(rollout.events.any(axis=0)).tolist()
+        table.add_row(
+            str(path.relative_to(folder) if path != folder else path),
+            f"{(len(rollout.states) - 1) * rollout.dt_s:.1f}",
+            ", ".join(rollout.scenario.tags),
+            ", ".join(rollout.event_names[kind] for kind in happened),
+        )
     return table

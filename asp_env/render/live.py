@@ -37,8 +37,8 @@ class Live:
         self._plan: Shaped[np.ndarray, "steps n"] | None = None
         self._told_tick = 0
 
-    def begin(self) -> None:
-        """Forgets what was told of the last episode."""
+    def forget(self) -> None:
+        """Shows no more of what was told."""
         self._forecast = self._plan = None
 
     def tell(
@@ -66,7 +66,7 @@ class Live:
         self._forecast, self._plan, self._told_tick = forecast, plan, int(scene.tick[0])
 
     def keep_up(self, scene: Scene, background: Background | None) -> None:
-        """After a tick: the window, if that is the mode, shows it for as long as it takes."""
+        """After a tick, in mode `human`: the window shows it for as long as it takes."""
         if self._window is not None and not self._window.closed:
             self.render(scene, background)
             self._window.wait_s(self._fps)

@@ -120,6 +120,7 @@ def _encode(
         str(aside), "w", format=kind.container, options=dict(kind.container_options)
     ) as container:
         stream = container.add_stream(kind.codec, rate=rate, options=dict(kind.codec_options))
+        assert isinstance(stream, av.VideoStream)
         stream.height, stream.width = first.shape[:2]
         stream.pix_fmt = "yuv420p"
         context = stream.codec_context
