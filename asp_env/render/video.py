@@ -31,7 +31,8 @@ KINDS: Mapping[str, _Kind] = {
         # The index stands first, so that a browser can play before it has read everything.
         container_options={"movflags": "+faststart", "fflags": "+bitexact"},
         codec="libx264",
-        codec_options={"crf": "20", "preset": "medium"},
+        # With its macroblock tree x264 gives other bytes each time, for some sizes of picture.
+        codec_options={"crf": "21", "preset": "medium", "x264-params": "mbtree=0"},
     ),
     ".webm": _Kind(
         container="webm",
