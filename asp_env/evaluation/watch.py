@@ -155,8 +155,8 @@ def _recording(path: Path, rollout: Rollout, recordings: Recordings) -> Recordin
     what = f"{path}: was driven on other DATA than {recordings.source!r}"
     if scenario.recording_name not in recordings.names:
         raise DataError(
-            f"{what}, which have no recording {scenario.recording_name!r}; name the right with "
-            "--data"
+            f"{what}, which have no recording {scenario.recording_name!r}; name the "
+            "right one with --data"
         )
     recording = recordings[recordings.names.index(scenario.recording_name)]
     track_number = np.flatnonzero(recording.track_ids == scenario.ego_id)
@@ -171,7 +171,7 @@ def _recording(path: Path, rollout: Rollout, recordings: Recordings) -> Recordin
     if not (len(away_m) and away_m[0] < SAME_PLACE_M):
         raise DataError(
             f"{what}, whose track {scenario.ego_id} of recording {recording.name} is not there at "
-            f"tick {scenario.start_tick}; name the right with --data"
+            f"tick {scenario.start_tick}; name the right one with --data"
         )
     return recording
 

@@ -1,6 +1,7 @@
 """A window on the screen that shows pictures, by pygame-ce."""
 
 import os
+import sys
 from importlib.util import find_spec
 from typing import Any
 
@@ -11,6 +12,7 @@ from asp_env.errors import AspEnvError, MissingExtraError
 
 UNSEEN = "offscreen"
 """What SDL falls back to where there is no screen."""
+SCREENS = ("DISPLAY", "WAYLAND_DISPLAY")
 
 
 class Window:
@@ -100,11 +102,15 @@ def _open(title: str, size_px: tuple[int, int]) -> Any:
     pygame = _pygame()
     if not hasattr(pygame, "Window"):  # the other package of this name
         raise MissingExtraError("pygame-ce", "render", "a window")
+    told = os.environ.get("SDL_VIDEODRIVER")
+    no_screen = AspEnvError("there is no screen to open a window on; a video needs none")
+    if sys.platform == "linux" and not (told or any(map(os.environ.get, SCREENS))):
+        raise no_screen  # SDL would find it out too, with words of its own on stderr
     try:
         pygame.display.init()
-        if pygame.display.get_driver() == UNSEEN != os.environ.get("SDL_VIDEODRIVER"):
+        if pygame.display.get_driver() == UNSEEN != told:
             pygame.display.quit()
-            raise AspEnvError("there is no screen to open a window on; a video needs none")
+            raise no_screen
         return pygame.Window(title, size_px, resizable=True)
     except pygame.error as error:
         raise AspEnvError(f"no window can be opened: {error}") from error

@@ -220,3 +220,42 @@ def test_what_cannot_be_drawn_is_refused(tmp_path: Path) -> None:
         draw_frame(scene, extent_m=0.0)
     with pytest.raises(DataError, match="not a picture that can be read"):
         draw_frame(scene, background=Background(path=tmp_path / "no.png", metres_per_pixel=0.1))
+
+
+def test_people_are_never_too_small_to_be_seen() -> None:
+    """At 1 pixel a metre a car is drawn 6 pixels wide, without a wedge that would cover it."""
+    scene = make_scene((AgentClass.CAR, 0.0, 0.0, 0.0), (AgentClass.PEDESTRIAN, 20.0, 0.0, 0.0))
+    image = draw_frame(scene, size_px=(100, 100), extent_m=100.0)
+    people = (image == CLASS_COLOURS[AgentClass.PEDESTRIAN]).all(axis=-1)
+    rows, columns = np.nonzero(people)
+    assert 16 <= len(rows) <= 36
+    assert np.abs(rows - 49.5).max() <= 3
+    assert np.abs(columns - 69.5).max() <= 3
+
+
+def test_the_road_goes_on_beyond_the_photograph(tmp_path: Path) -> None:
+    """A photograph of 10 m by 10 m below the crossing: the road in the north keeps its colour."""
+    path = tmp_path / "00_background.png"
+    assert cv2.imwrite(str(path), np.full((100, 100, 3), 255, dtype=np.uint8))
+    background = Background(path=path, metres_per_pixel=0.1)
+    scene = make_scene((AgentClass.CAR, -20.0, 1.75, 0.0))
+    image = draw_frame(scene, background=background, **SIZE)
+    assert pixel(image, 10, 0) == ROAD
+    scene = make_scene((AgentClass.CAR, 0.0, 1.75, 0.0))
+    image = draw_frame(scene, background=background, **SIZE)
+    assert pixel(image, 5, -3.0)[0] > 150
+
+
+def test_of_an_earlier_forecast_the_rest_is_shown() -> None:
+    """Ten steps of 2 m to the north, said 3 ticks ago: the first point is the fourth, at 8 m."""
+    scene = make_scene((AgentClass.CAR, 50.0, 40.0, np.pi / 2))
+    forecast = forecast_of(scene, (1.0,))
+    late = dataclasses.replace(forecast, tick=forecast.tick - 3)
+    bent = late.states.copy()
+    bent[:, :, :3, 0] += 30.0
+    assert np.array_equal(
+        draw_frame(scene, forecast=late, **SIZE),
+        draw_frame(scene, forecast=dataclasses.replace(late, states=bent), **SIZE),
+    )
+    gone = dataclasses.replace(forecast, tick=forecast.tick - 10)
+    assert np.array_equal(draw_frame(scene, forecast=gone, **SIZE), draw_frame(scene, **SIZE))

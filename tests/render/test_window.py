@@ -149,8 +149,10 @@ def test_without_a_screen_there_is_one_line(monkeypatch: pytest.MonkeyPatch) -> 
     with pytest.raises(AspEnvError, match="no screen to open a window on") as caught:
         Window("one", SIZE).show(IMAGE)
     assert "\n" not in str(caught.value)
-    monkeypatch.setenv("SDL_VIDEODRIVER", "x11")
     monkeypatch.setenv("DISPLAY", ":987654")
+    with pytest.raises(AspEnvError, match="no screen to open a window on"):
+        Window("one", SIZE).show(IMAGE)
+    monkeypatch.setenv("SDL_VIDEODRIVER", "x11")
     with pytest.raises(AspEnvError, match="no window can be opened"):
         Window("one", SIZE).show(IMAGE)
 
