@@ -37,9 +37,9 @@ TRAIL: Colour = (170, 182, 200)
 GHOST: Colour = (242, 245, 249)
 ALARM_GAP_M = 1.2
 """How much larger than the ego the frame is that shows something to be wrong."""
-MIN_BOX_PX = 6.0
+MIN_BOX_PX = 8.0
 """Nobody is drawn smaller than this, so that pedestrians are seen."""
-MIN_WEDGE_PX = 8.0
+MIN_WEDGE_PX = 9.0
 """Narrower boxes have no room for a wedge."""
 FIT_MARGIN = 1.06
 """The whole map is shown with this much room about it."""

@@ -223,7 +223,7 @@ def test_what_cannot_be_drawn_is_refused(tmp_path: Path) -> None:
 
 
 def test_people_are_never_too_small_to_be_seen() -> None:
-    """At 1 pixel a metre a car is drawn 6 pixels wide, without a wedge that would cover it."""
+    """At 1 pixel a metre a pedestrian is 8 pixels wide with its dark edge, and has no wedge."""
     scene = make_scene((AgentClass.CAR, 0.0, 0.0, 0.0), (AgentClass.PEDESTRIAN, 20.0, 0.0, 0.0))
     image = draw_frame(scene, size_px=(100, 100), extent_m=100.0)
     people = (image == CLASS_COLOURS[AgentClass.PEDESTRIAN]).all(axis=-1)
