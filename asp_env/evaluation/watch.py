@@ -19,10 +19,9 @@ from asp_env.data.source import Recordings, open_data
 from asp_env.errors import AspEnvError, DataError
 from asp_env.render.film import Film, frames_of
 from asp_env.render.player import Playing, play
-from asp_env.render.video import check_video_possible, write_video
+from asp_env.render.video import MAX_SIDE_PX, check_video_possible, write_video
 
 SAME_PLACE_M = 1.0
-MAX_SIDE_PX = 4096
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -6,8 +6,8 @@ from contextlib import suppress
 from dataclasses import dataclass
 from fractions import Fraction
 from importlib.util import find_spec
+from itertools import chain
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from jaxtyping import UInt8
@@ -129,7 +129,7 @@ def _encode(
         context.time_base = 1 / rate
         context.color_primaries = context.color_trc = context.colorspace = BT709
         context.color_range = LIMITED_RANGE
-        for image in _all(first, rest):
+        for image in chain((first,), rest):
             if image.shape != first.shape:
                 raise AspEnvError(f"picture {count}: {image.shape}, the first was {first.shape}")
             frame = av.VideoFrame.from_ndarray(np.ascontiguousarray(image), format="rgb24")
@@ -139,8 +139,3 @@ def _encode(
             count += 1
         container.mux(stream.encode(None))
     return count
-
-
-def _all(first: Any, rest: Iterable[Any]) -> Iterable[Any]:
-    yield first
-    yield from rest
