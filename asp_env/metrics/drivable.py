@@ -9,14 +9,22 @@ import numpy as np
 from jaxtyping import Bool, Float
 from numba import njit
 
+from asp_env.data.geometry import path_length
 from asp_env.data.road_map import RoadMap
 from asp_env.errors import DataError
 from asp_env.metrics.per_map import PerMap
+from asp_env.metrics.route import route_coordinates
 
 CELL_M = 0.1
 MARGIN_M = 5.0
 OFF_ROAD_M = 0.3
 """nuPlan's tolerance: a corner further outside than this is off the road."""
+
+LOG_NEAR_M = 5.0
+"""So far along its way the logged ego vouches for the road that it drives on."""
+
+LOG_BESIDE_M = 2.0
+"""And so far beside it."""
 
 _SUBPIXEL_BITS = 8
 
@@ -126,3 +134,42 @@ def off_road_m(
     everybody = np.ones(len(flat), dtype=bool)
     drivable_field(road_map).corners_m(flat, sizes.reshape(-1, 2), everybody, out)
     return out.reshape(states.shape[:-1])
+
+
+def log_off_road_m(
+    road_map: RoadMap,
+    states: Float[np.ndarray, "t 4"],
+    size: Float[np.ndarray, " 2"],
+    route: Float[np.ndarray, "p 2"],
+) -> Float[np.ndarray, " p"]:
+    """How far off the road, by over 0.3 m, a log itself is within 5 m of each point of its route.
+
+    Where it is, the map has a gap, or lies beside the tracks; elsewhere 0.
+    """
+    outside = off_road_m(road_map, states, np.broadcast_to(size, (len(states), 2)))
+    off = np.flatnonzero(outside > OFF_ROAD_M)
+    if not len(off):
+        return np.zeros(len(route), dtype=np.float32)
+    driven_m = np.array([path_length(states[: k + 1, :2]) for k in off])
+    routes = np.repeat(route[None], len(off), axis=0)
+    arc = route_coordinates(routes, np.ones(routes.shape[:2], dtype=bool), states[off], driven_m)
+    near = np.abs(arc[:, :1] - np.arange(len(route))) <= LOG_NEAR_M
+    return np.where(near, outside[off, None], 0.0).max(axis=0).astype(np.float32)
+
+
+def beyond_log_m(
+    outside_m: Float[np.ndarray, " b"],
+    on_route: Float[np.ndarray, "b 3"],
+    log_off_road_m: Float[np.ndarray, "b p"],
+) -> Float[np.ndarray, " b"]:
+    """How far outside boxes are, less what the log is there, for those within 2 m of its way.
+
+    Args:
+        outside_m: how far each box lies outside the drivable area.
+        on_route: its arc length and offset on the logged route, and the route's heading.
+        log_off_road_m: of each of their logs.
+    """
+    points = np.clip(np.rint(on_route[:, 0]), 0, log_off_road_m.shape[1] - 1).astype(np.int64)
+    excused = log_off_road_m[np.arange(len(points)), points]
+    beside = np.abs(on_route[:, 1]) <= LOG_BESIDE_M
+    return np.maximum(outside_m - np.where(beside, excused, 0), 0).astype(np.float32)

@@ -11,6 +11,7 @@ from asp_env.data.scene import infer_actions
 from asp_env.data.snippets import gather_window
 from asp_env.errors import AspEnvError
 from asp_env.metrics.boxes import ego_contacts, touching_trailers
+from asp_env.metrics.drivable import log_off_road_m
 from asp_env.metrics.route import route_coordinates
 from asp_env.sim.episodes import Episodes
 from asp_env.sim.world import EGO
@@ -68,6 +69,9 @@ def begin(recording: Recording, scenario: Scenario, *, dt_s: float, history: int
         tracks=tracks[None],
         route=route,
         route_valid=route_valid,
+        log_off_road_m=log_off_road_m(
+            recording.road_map, states[0, history:, EGO], sizes[0, EGO], route[0]
+        )[None],
         on_route=route_coordinates(route, route_valid, first[:, EGO], np.zeros(1)),
         contacts=ego_contacts(first, sizes, valid[:, history] & ~own_trailer),
         own_trailer=own_trailer,

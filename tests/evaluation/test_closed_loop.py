@@ -20,6 +20,7 @@ from asp_env.errors import AspEnvError
 from asp_env.evaluation.closed_loop import ClosedLoop, Drive, drive
 from asp_env.evaluation.episodes import FORECAST_WITHIN_M, Driven, drive_episodes
 from asp_env.metrics.driving import driving_metrics
+from asp_env.metrics.presets import PDMS
 from asp_env.planning.planner import load_planner
 from asp_env.sim.world import Ending
 from predictors.physical import ConstantVelocity, Oracle
@@ -60,6 +61,7 @@ def _drive(
         scenarios,
         load_planner(planner),
         predictor,
+        preset=PDMS,
         traffic=traffic,
         horizon=15,
         history=HISTORY,
@@ -133,11 +135,11 @@ def test_episodes_side_by_side_equal_episodes_alone(recordings):
     predictor = ConstantVelocity(horizon=15, dt_s=DT_S)
     scenarios = _scenarios(recordings)[:6]
     together = _drive(recordings, scenarios, predictor, traffic="idm")
-    scores = driving_metrics(together.drives)["score"].value
+    scores = driving_metrics(together.drives, PDMS)["score"].value
     for b, each in enumerate(scenarios):
         alone = _drive(recordings, [each], predictor, traffic="idm")
         assert alone.endings.tolist() == together.endings[b : b + 1].tolist()
-        assert driving_metrics(alone.drives)["score"].value[0] == scores[b]
+        assert driving_metrics(alone.drives, PDMS)["score"].value[0] == scores[b]
         one, other = alone.rollouts[0], together.rollouts[b]
         for name in ("states", "valid", "plans", "forecast_states", "forecast_ticks", "events"):
             assert getattr(one, name).tobytes() == getattr(other, name).tobytes(), name
@@ -216,7 +218,7 @@ def test_a_blocked_way_is_no_collision(tmp_path):
     for planner in ("sampling", "idm"):
         driven = _drive(recordings, scenarios, ConstantVelocity(horizon=15, dt_s=DT_S), planner)
         assert set(driven.endings.tolist()) <= {Ending.OUT_OF_DATA, Ending.GOAL}
-        metrics = driving_metrics(driven.drives)
+        metrics = driving_metrics(driven.drives, PDMS)
         assert metrics["no at-fault collision"].value.tolist() == [1.0] * len(scenarios)
         assert metrics["no collision"].value.tolist() == [1.0] * len(scenarios)
 
@@ -248,6 +250,7 @@ def test_a_run_writes_its_folder(crossings, tmp_path):
         ({"scenarios": 0}, "--scenarios 0: expected at least 1"),
         ({"predictors": ()}, "none given"),
         ({"horizon": 0.1}, "no whole number of ticks"),
+        ({"metrics": "nuplna"}, r"unknown metrics 'nuplna' \(did you mean 'nuplan'"),
         ({"dt": 0.3}, "does not divide recordings of 25 Hz"),
     ],
     ids=lambda value: next(iter(value)) if isinstance(value, dict) else None,
