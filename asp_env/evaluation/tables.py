@@ -37,6 +37,9 @@ DRIVING_SHORT = {
 }
 
 
+ROOMY = 6
+"""More metrics than this stand closer together."""
+
 MARK = " *"
 """Stands behind who was handed the recorded future."""
 
@@ -79,6 +82,8 @@ def driving_table(rows: Sequence[Row], privileged: Collection[str], shown: Seque
     """
     rules = " and ".join(dict.fromkeys(row.rules for row in rows))
     table = _table(f"driving by {rules}, mean per episode, 95 % interval over recordings")
+    if len(shown) > ROOMY:
+        table.padding = 0
     short = short_names([row.predictor for row in rows])
     members: dict[str, dict[str, Row]] = {}
     for row in rows:

@@ -167,7 +167,8 @@ def _speed(drives: Drives) -> Masked:
     over = overspeed_mps(drives)
     count = over.valid.sum(axis=1)
     mean = np.where(over.valid, over.value, 0.0).sum(axis=1) / np.maximum(count, 1)
-    return Masked(value=np.maximum(0.0, 1.0 - mean / OVERSPEED_MPS), valid=np.asarray(count > 0))
+    value = np.asarray(np.maximum(0.0, 1.0 - mean / OVERSPEED_MPS))
+    return Masked(value=value, valid=np.asarray(count > 0))
 
 
 def _comfort(drives: Drives) -> Masked:
@@ -183,4 +184,4 @@ def _comfort(drives: Drives) -> Masked:
 def _feasible(drives: Drives) -> Masked:
     both = drives.lasted[:, 1:] & drives.lasted[:, :-1]
     beyond = infeasible_ticks(drives.states, dt_s=drives.dt_s) & both
-    return Masked(value=1.0 - beyond.any(axis=1), valid=np.asarray(both.any(axis=1)))
+    return Masked(value=np.asarray(1.0 - beyond.any(axis=1)), valid=np.asarray(both.any(axis=1)))

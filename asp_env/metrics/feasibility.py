@@ -50,7 +50,8 @@ def infeasible_modes(
     Between consecutive states, the first being `now`, as in `infeasible_ticks`.
     """
     start = np.broadcast_to(now[:, None, None], (*modes.shape[:2], 1, 4))
-    return infeasible_ticks(np.concatenate([start, modes], axis=2), dt_s=dt_s).any(axis=-1)
+    beyond = infeasible_ticks(np.concatenate([start, modes], axis=2), dt_s=dt_s)
+    return np.asarray(beyond.any(axis=2))
 
 
 def infeasible_ticks(

@@ -171,8 +171,9 @@ def in_several_lanes(
     """
     covers = covering(road_map, box_corners(states, sizes))
     held = (covers[..., None, :] & lane_table(road_map).chains).any(axis=-1)
-    unknown = ~covers.any(axis=-1)
-    return ~(held | unknown[..., None]).all(axis=-2).any(axis=-1) & ~unknown.all(axis=-1)
+    unknown = np.asarray(~covers.any(axis=-1))
+    one = np.asarray((held | unknown[..., None]).all(axis=-2)).any(axis=-1)
+    return np.asarray(~one & ~unknown.all(axis=-1))
 
 
 def at_crossing(

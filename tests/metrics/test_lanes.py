@@ -217,7 +217,8 @@ def test_where_the_street_lies_changes_nothing(
     """Turned and shifted, a box has the same lanes; points on borders are left out."""
     elsewhere = moved_map(STREET, pose)
     state = at(x, y, heading)
-    moved = at(*from_frame(state[0, :2], np.array(pose)), heading + pose[2])
+    x_m, y_m = from_frame(state[0, :2], np.array(pose))
+    moved = at(x_m, y_m, heading + pose[2])
     ahead = state[0, :2] + (1, 0)
     two = [
         np.stack([state[0, :2], ahead]),

@@ -127,16 +127,10 @@ def _track_entry(files: RecordingFiles, meta: RecordingMeta) -> Entry:
 
 def _road_map(path: Path, origin: Origin) -> RoadMap:
     facts, arrays = _cached(path, [path], lambda: _map_entry(path, origin), origin)
-    parts = {
-        name: Ragged(points=arrays[f"{name}_points"], starts=arrays[f"{name}_starts"])
-        for name in _MAP_PARTS
-    }
-    return RoadMap(
-        name=path.stem,
-        repairs=tuple(facts["repairs"]),
-        **{name: arrays[name] for name in _MAP_COLUMNS},
-        **parts,
-    )
+    parts: dict[str, Any] = {name: arrays[name] for name in _MAP_COLUMNS}
+    for name in _MAP_PARTS:
+        parts[name] = Ragged(points=arrays[f"{name}_points"], starts=arrays[f"{name}_starts"])
+    return RoadMap(name=path.stem, repairs=tuple(facts["repairs"]), **parts)
 
 
 def _map_entry(path: Path, origin: Origin) -> Entry:
