@@ -26,6 +26,7 @@ DRIVING_SHORT = {
     "no collision": "no coll.",
     "no at-fault collision": "no fault",
     "on road": "road",
+    "on mapped road": "road",
     "direction": "dir.",
     "right way": "way",
     "feasible": "feas.",

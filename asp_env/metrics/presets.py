@@ -105,7 +105,7 @@ WAYMAX = Preset(
 STRICT = Preset(
     name="strict",
     version=1,
-    about="PDMS with the ego at fault in any contact at its side, and TTC to all but those behind",
+    about="PDMS on the road as mapped, at fault at any side, with TTC to all but those behind",
     off_road_m=OFF_ROAD_M,
     any_side_is_fault=True,
     ttc=TtcRule(
@@ -119,9 +119,9 @@ STRICT = Preset(
     ),
     least_way_m=1.0,
     lifts=False,
-    multipliers=("no at-fault collision", "on road"),
+    multipliers=("no at-fault collision", "on mapped road"),
     weights=_PDMS_WEIGHTS,
-    shown=("no at-fault collision", "on road", "TTC", "progress", "comfort"),
+    shown=("no at-fault collision", "on mapped road", "TTC", "progress", "comfort"),
 )
 
 PRESETS = {preset.name: preset for preset in (NUPLAN, PDMS, WAYMAX, STRICT)}

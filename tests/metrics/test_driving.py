@@ -88,6 +88,8 @@ def test_off_road_by_preset(preset: Preset) -> None:
         found = values(drive(outside_m=at_tick(5, outside_m)), preset)
         assert found["on road"] == 1
         assert found["on mapped road"] == (outside_m <= tolerance)
+        if preset.weights:  # only the strict one makes nothing of the log's excuse
+            assert (found["score"] > 0) == (outside_m <= tolerance or preset is not STRICT)
 
 
 @pytest.mark.parametrize(("ttc_s", "fine"), [(0.951, 1), (0.95, 0), (0.9, 0)])

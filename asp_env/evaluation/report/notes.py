@@ -110,7 +110,10 @@ NOTES = {
         "On road",
         "%",
         "higher",
-        "Drives without a corner further outside the drivable area than the preset allows.",
+        "Drives without a corner further outside the drivable area than preset and log allow.",
+    ),
+    "on mapped road": _note(
+        "On the map", "%", "higher", "The same where the log's own way off the map excuses nothing."
     ),
     "progress": _note(
         "Progress", "%", "higher", "Way made good, as a share of the recorded ego's."
