@@ -219,7 +219,8 @@ def _drive_all(
             history=history,
             dt_s=config.dt,
         )
-        for metric, found in driving_metrics(driven.drives, preset).items():
+        metrics_of = {**driving_metrics(driven.drives, preset), **driven.realism}
+        for metric, found in metrics_of.items():
             metrics.setdefault(metric, []).append(found)
         endings += [Ending(kind) for kind in driven.endings.tolist()]
         rollouts += driven.rollouts

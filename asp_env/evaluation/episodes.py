@@ -1,7 +1,7 @@
 """Driving many episodes at once, and what is kept of them."""
 
 import dataclasses
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -13,6 +13,7 @@ from asp_env.data.rollout import Rollout
 from asp_env.data.scenario import Scenario
 from asp_env.data.scene import Scene
 from asp_env.data.source import Recordings
+from asp_env.evaluation.traffic_realism import traffic_realism
 from asp_env.metrics.driving import (
     COMPLIANT_M,
     OVERSPEED_MPS,
@@ -54,6 +55,8 @@ class Driven:
     """Episodes that have been driven, side by side, with everything that was said on the way."""
 
     drives: Drives
+    realism: Mapping[str, Masked]
+    """Of the traffic; missing where it was replayed."""
     endings: Int[np.ndarray, " b"]
     rollouts: tuple[Rollout, ...]
 
@@ -198,7 +201,12 @@ def _collect(
         _rollout(world, scenario, b, int(drives.lasted[b].sum()), flags[b], said)
         for b, scenario in enumerate(scenarios)
     )
-    return Driven(drives=drives, endings=endings, rollouts=rollouts)
+    return Driven(
+        drives=drives,
+        realism=traffic_realism(world, drives.lasted),
+        endings=endings,
+        rollouts=rollouts,
+    )
 
 
 def _rollout(

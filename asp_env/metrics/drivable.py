@@ -94,7 +94,8 @@ def _outermost(grid, x_0, y_0, states, sizes, chosen, out):
         out[i] = max(front, rear)
 
 
-def _draw(road_map: RoadMap) -> DrivableField:
+def _image(road_map: RoadMap) -> tuple[np.ndarray, tuple[float, float]]:
+    """0 where the road is, else 255, and the centre of the first cell."""
     points = road_map.drivable.points
     if not len(points):
         raise DataError(f"map {road_map.name}: no drivable area; expected one lanelet at least")
@@ -104,14 +105,27 @@ def _draw(road_map: RoadMap) -> DrivableField:
     for i in range(len(road_map.drivable)):
         ring = (road_map.drivable[i] - low) / CELL_M * 2**_SUBPIXEL_BITS
         cv2.fillPoly(image, [np.round(ring).astype(np.int32)], 0, shift=_SUBPIXEL_BITS)
+    return image, (float(low[0]), float(low[1]))
+
+
+def _draw(road_map: RoadMap) -> DrivableField:
+    image, origin_m = _image(road_map)
     outside = cv2.distanceTransform(image, cv2.DIST_L2, cv2.DIST_MASK_PRECISE) * CELL_M
     return DrivableField(
-        outside_m=np.minimum(outside, MARGIN_M).astype(np.float32),
-        origin_m=(float(low[0]), float(low[1])),
+        outside_m=np.minimum(outside, MARGIN_M).astype(np.float32), origin_m=origin_m
     )
 
 
+def _draw_signed(road_map: RoadMap) -> DrivableField:
+    """The same with how far from the road's edge its inside is, below 0."""
+    image, origin_m = _image(road_map)
+    inside = cv2.distanceTransform(255 - image, cv2.DIST_L2, cv2.DIST_MASK_PRECISE) * CELL_M
+    outside = drivable_field(road_map).outside_m
+    return DrivableField(outside_m=(outside - inside).astype(np.float32), origin_m=origin_m)
+
+
 _fields = PerMap(_draw)
+_signed_fields = PerMap(_draw_signed)
 
 
 def drivable_field(road_map: RoadMap) -> DrivableField:
@@ -129,10 +143,25 @@ def off_road_m(
     sizes: Float[np.ndarray, "*batch 2"],
 ) -> Float[np.ndarray, "*batch"]:
     """How far the outermost corner of each box lies outside the drivable area, metres."""
+    return _of_boxes(drivable_field(road_map), states, sizes)
+
+
+def road_edge_m(
+    road_map: RoadMap,
+    states: Float[np.ndarray, "*batch 4"],
+    sizes: Float[np.ndarray, "*batch 2"],
+) -> Float[np.ndarray, "*batch"]:
+    """The same, but how far inside it is, below 0, where all corners are within the area."""
+    return _of_boxes(_signed_fields(road_map), states, sizes)
+
+
+def _of_boxes(
+    grid: DrivableField, states: Float[np.ndarray, "*batch 4"], sizes: Float[np.ndarray, "*batch 2"]
+) -> Float[np.ndarray, "*batch"]:
     flat = np.ascontiguousarray(states.reshape(-1, 4))
     out = np.empty(len(flat), dtype=np.float32)
     everybody = np.ones(len(flat), dtype=bool)
-    drivable_field(road_map).corners_m(flat, sizes.reshape(-1, 2), everybody, out)
+    grid.corners_m(flat, sizes.reshape(-1, 2), everybody, out)
     return out.reshape(states.shape[:-1])
 
 

@@ -145,6 +145,18 @@ def test_episodes_side_by_side_equal_episodes_alone(recordings):
             assert getattr(one, name).tobytes() == getattr(other, name).tobytes(), name
 
 
+def test_simulated_traffic_has_a_realism(recordings):
+    """From 0 to 1 where somebody was simulated; of replayed traffic there is none to speak of."""
+    scenarios = _scenarios(recordings)[:4]
+    predictor = ConstantVelocity(horizon=15, dt_s=DT_S)
+    simulated = _drive(recordings, scenarios, predictor, planner="expert", traffic="idm").realism
+    assert simulated["realism"].valid.any()
+    for each in simulated.values():
+        assert ((each.value[each.valid] > 0) & (each.value[each.valid] < 1)).all()
+    replayed = _drive(recordings, scenarios, predictor, planner="expert").realism
+    assert not any(each.valid.any() for each in replayed.values())
+
+
 def test_only_those_near_a_running_ego_are_forecast(recordings):
     """Targets are present, not egos, within 60 m, and in episodes that are not over."""
     spy = Spy()

@@ -145,6 +145,12 @@ NOTES = {
     "log divergence": _note(
         "Off the log", "m", "neither", "Mean distance between the ego and the recorded one."
     ),
+    "realism": _note(
+        "Realism",
+        "%",
+        "higher",
+        "How likely the recorded traffic is under the simulated one, by the weights of WOSAC 2025.",
+    ),
     "route deviation": _note(
         "Off the route", "m", "neither", "Mean distance to the way that the recorded ego took."
     ),
