@@ -9,7 +9,6 @@ import numpy as np
 from jaxtyping import Bool, Float
 from numba import njit
 
-from asp_env.data.geometry import path_length
 from asp_env.data.road_map import RoadMap
 from asp_env.errors import DataError
 from asp_env.metrics.per_map import PerMap
@@ -179,7 +178,8 @@ def log_off_road_m(
     off = np.flatnonzero(outside > OFF_ROAD_M)
     if not len(off):
         return np.zeros(len(route), dtype=np.float32)
-    driven_m = np.array([path_length(states[: k + 1, :2]) for k in off])
+    steps = np.hypot(*np.diff(states[:, :2], axis=0, prepend=states[:1, :2]).T)
+    driven_m = np.cumsum(steps, dtype=np.float64)[off]
     routes = np.repeat(route[None], len(off), axis=0)
     arc = route_coordinates(routes, np.ones(routes.shape[:2], dtype=bool), states[off], driven_m)
     near = np.abs(arc[:, :1] - np.arange(len(route))) <= LOG_NEAR_M
