@@ -257,7 +257,7 @@ def test_a_run_writes_its_folder(crossings, tmp_path):
 @pytest.mark.parametrize(
     ("options", "what"),
     [
-        ({"traffic": "logs"}, r"unknown traffic 'logs' \(did you mean 'log'"),
+        ({"traffic": "logs"}, r"unknown driver 'logs' \(did you mean 'log'"),
         ({"planner": "sampler"}, "unknown planner 'sampler'"),
         ({"scenarios": 0}, "--scenarios 0: expected at least 1"),
         ({"predictors": ()}, "none given"),
