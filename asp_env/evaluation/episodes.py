@@ -3,6 +3,7 @@
 import dataclasses
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from jaxtyping import Bool, Int
@@ -12,7 +13,6 @@ from asp_env.data.predictor import Predictor
 from asp_env.data.rollout import Rollout
 from asp_env.data.scenario import Scenario
 from asp_env.data.scene import Scene
-from asp_env.data.source import Recordings
 from asp_env.evaluation.traffic_realism import traffic_realism
 from asp_env.metrics.driving import (
     COMPLIANT_M,
@@ -62,7 +62,7 @@ class Driven:
 
 
 def drive_episodes(
-    recordings: Recordings,
+    recordings: Sequence[Any],  # of Recording: checking its items at run time opens them
     scenarios: Sequence[Scenario],
     planner: Planner,
     predictor: Predictor,

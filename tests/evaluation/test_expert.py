@@ -1,14 +1,18 @@
 """The logged ego judged by every preset: what data and metrics themselves cost."""
 
 from collections.abc import Sequence
+from dataclasses import replace
 
 import numpy as np
 import pytest
 
+from asp_env.data.recording import Recording
+from asp_env.data.road_map import Ragged, RoadMap
 from asp_env.data.scenario import Scenario, find_scenarios
 from asp_env.data.source import Recordings, open_data
 from asp_env.evaluation.episodes import Driven, drive_episodes
 from asp_env.metrics.driving import driving_metrics
+from asp_env.metrics.lanes import covering
 from asp_env.metrics.presets import NUPLAN, PRESETS, Preset
 from asp_env.planning.planner import load_planner
 from asp_env.sim.world import Ending
@@ -18,7 +22,9 @@ from tests.sim.worlds import DT_S, HISTORY
 
 
 def judged(
-    recordings: Recordings, preset: Preset, scenarios: Sequence[Scenario] | None = None
+    recordings: Recordings | list[Recording],
+    preset: Preset,
+    scenarios: Sequence[Scenario] | None = None,
 ) -> tuple[Driven, dict[str, np.ndarray]]:
     """The expert's drives, and its metrics where they apply."""
     found = scenarios or list(find_scenarios(recordings, source="", dt_s=DT_S, history=HISTORY))
@@ -59,6 +65,42 @@ def test_on_synthetic_traffic(site: str, preset: Preset) -> None:
     if preset.weights:
         assert 0.9 < found["score"].mean() <= 1
         assert found["on road"].tolist() == [1.0] * len(driven.rollouts)
+    assert set(driven.endings.tolist()) == {int(Ending.GOAL)}
+
+
+def without_lane(road_map: RoadMap, lane: int) -> RoadMap:
+    """The map with a lane, its area and its piece of road left out."""
+    kept = [number for number in range(len(road_map.lanes)) if number != lane]
+    rings = [number for number in range(len(road_map.drivable)) if number != lane]
+    edges = road_map.successors[(road_map.successors != lane).all(axis=1)]
+    return replace(
+        road_map,
+        drivable=Ragged.pack([road_map.drivable[number] for number in rings]),
+        lanes=Ragged.pack([road_map.lanes[number] for number in kept]),
+        areas=Ragged.pack([road_map.areas[number] for number in kept]),
+        successors=edges - (edges > lane),
+        two_way=road_map.two_way[kept],
+        limits_mps=road_map.limits_mps[kept],
+        limited=road_map.limited[kept],
+    )
+
+
+def test_a_missing_lanelet_raises_no_alarm() -> None:
+    """A roundabout without its busiest lanelet, as a published map lacks one, accuses nobody.
+
+    Neither of leaving the road nor of the wrong direction or way; only the map's own test shows it.
+    """
+    recordings = open_data("sample:roundabout")
+    scenarios = list(find_scenarios(recordings, source="", dt_s=DT_S, history=HISTORY))
+    recording = recordings[0]
+    road_map = recording.road_map
+    followed = np.concatenate([recording.track(i)[::25, :2] for i in range(len(recording))])
+    busiest = int(covering(road_map, followed).sum(axis=0).argmax())
+    gappy = replace(recording, road_map=without_lane(road_map, busiest))
+    driven, found = judged([gappy], NUPLAN, scenarios)
+    for name in ("on road", "direction", "right way", "no at-fault collision", "progress"):
+        assert found[name].min() > 0.99, name
+    assert found["on mapped road"].mean() < 0.9
     assert set(driven.endings.tolist()) == {int(Ending.GOAL)}
 
 
