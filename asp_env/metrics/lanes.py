@@ -36,8 +36,8 @@ class LaneTable:
 
     boxes: Float[np.ndarray, "lanes 4"]
     """Smallest x, smallest y, largest x, largest y of each area."""
-    chains: Bool[np.ndarray, "chains lanes"]
-    """Every lane alone, and every path of two and of three lanes that follow each other."""
+    chains: Float[np.ndarray, "chains lanes"]
+    """1 for the members of every path of one, two or three lanes that follow each other."""
     crossed: Bool[np.ndarray, "lanes metres"]
     """Metres along each lane at which others cross it."""
 
@@ -121,7 +121,7 @@ def _tabulate(road_map: RoadMap) -> LaneTable:
 lane_table = PerMap(_tabulate)
 
 
-def _chains(road_map: RoadMap) -> Bool[np.ndarray, "chains lanes"]:
+def _chains(road_map: RoadMap) -> Float[np.ndarray, "chains lanes"]:
     count = len(road_map.areas)
     after: list[list[int]] = [[] for _ in range(count)]
     if count:
@@ -130,9 +130,9 @@ def _chains(road_map: RoadMap) -> Bool[np.ndarray, "chains lanes"]:
     one = [(lane,) for lane in range(count)]
     two = [(lane, second) for lane in range(count) for second in after[lane]]
     three = [(*pair, third) for pair in two for third in after[pair[1]]]
-    chains = np.zeros((len(one) + len(two) + len(three), count), dtype=bool)
+    chains = np.zeros((len(one) + len(two) + len(three), count), dtype=np.float32)
     for number, chain in enumerate((*one, *two, *three)):
-        chains[number, list(chain)] = True
+        chains[number, list(chain)] = 1
     return chains
 
 
@@ -170,7 +170,7 @@ def in_several_lanes(
     Corners that no lane covers do not count.
     """
     covers = covering(road_map, box_corners(states, sizes))
-    held = (covers[..., None, :] & lane_table(road_map).chains).any(axis=-1)
+    held = covers.astype(np.float32) @ lane_table(road_map).chains.T > 0
     unknown = np.asarray(~covers.any(axis=-1))
     one = np.asarray((held | unknown[..., None]).all(axis=-2)).any(axis=-1)
     return np.asarray(~one & ~unknown.all(axis=-1))
