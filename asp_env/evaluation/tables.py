@@ -77,9 +77,9 @@ def open_loop_tables(rows: Sequence[Row], privileged: Collection[str] = ()) -> l
 
 
 def driving_table(rows: Sequence[Row], privileged: Collection[str], shown: Sequence[str]) -> Table:
-    """Driver by the shown metrics and score, if there is one; * knows the future.
+    """Driver by the shown metrics over all scenarios, and score, if there is one.
 
-    The expert, which is the noise floor, stands first.
+    The expert, which is the noise floor, stands first; * knows the future.
     """
     rules = " and ".join(dict.fromkeys(row.rules for row in rows))
     table = _table(f"driving by {rules}, mean per episode, 95 % interval over recordings")
@@ -88,6 +88,8 @@ def driving_table(rows: Sequence[Row], privileged: Collection[str], shown: Seque
     short = short_names([row.predictor for row in rows])
     members: dict[str, dict[str, Row]] = {}
     for row in rows:
+        if row.subset != "all":
+            continue
         name = " + ".join(part for part in (row.planner, short[row.predictor]) if part)
         mark = MARK if row.planner in privileged or row.predictor in privileged else ""
         members.setdefault(name + mark, {})[row.metric] = row
