@@ -25,7 +25,7 @@ DT_S = 0.2
 HISTORY = 15
 REPEATS = 5
 SIZES_PX = ((360, 240), (90, 60))
-TRAFFICS = ("log", "log-actions", "idm", "predictor:constant-velocity")
+TRAFFICS = ("log", "log-actions", "idm", "hybrid", "predictor:constant-velocity")
 COPY_BYTES = 256 * 2**20
 STATE_BYTES = 4 * np.dtype(np.float32).itemsize
 

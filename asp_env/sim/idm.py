@@ -153,10 +153,10 @@ def pursuit_steering(x, y, heading, speed, length, path, count, arc, offset_m):
     px = path[i, 0] + (at - i) * dx - offset_m * dy / norm - x
     py = path[i, 1] + (at - i) * dy + offset_m * dx / norm - y
     left = math.cos(heading) * py - math.sin(heading) * px
-    distance = max(px * px + py * py, 1.0)
-    sin_slip = AXLE_SHARE_OF_LENGTH * length * 2.0 * left / distance
-    sin_slip = min(max(sin_slip, -0.99), 0.99)
-    steering = math.atan(2.0 * sin_slip / math.sqrt(1.0 - sin_slip * sin_slip))
+    along = math.cos(heading) * px + math.sin(heading) * py
+    distance = max(math.hypot(px, py), 1.0)
+    axle = 2.0 * AXLE_SHARE_OF_LENGTH * length
+    steering = math.atan(2.0 * axle * left / max(distance * distance + axle * along, 1.0))
     return min(max(steering, -MAX_STEERING_RAD), MAX_STEERING_RAD)
 
 

@@ -9,6 +9,7 @@ from numba import njit
 from asp_env.dynamics import MAX_ACCELERATION_MPS2
 from asp_env.sim.drivers.conflicts import A_FIRST, IN_A, IN_B, IN_FILE, OUT_A, OUT_B
 from asp_env.sim.idm import free_ahead, idm_acceleration, pursuit_steering
+from asp_env.sim.world import EGO
 
 STANDING_MPS = 0.2
 PATIENCE_S = 3.0
@@ -19,6 +20,8 @@ EARLY_S = 2.5
 """The same for one who goes first although the log says otherwise."""
 BINDING_MPS2 = 2.5
 """Whoever needs more than this to stop before a zone is taken to drive into it."""
+SLOW_MPS, SLOWS_MPS2 = 2.0, 0.5
+"""The ego is trusted to give way where it should while it is slow, or slows down by so much."""
 OFF_PATH_M = 1.5
 """Further from its path nobody is taken to follow it."""
 
@@ -69,6 +72,13 @@ def _has_stood(states, valid, now, a, ticks):
         if not valid[t, a] or abs(states[t, a, 3]) > STANDING_MPS:
             return False
     return True
+
+
+@njit(cache=True)
+@no_type_check
+def _slows(speed, before, dt):
+    """Whether the ego looks as if it gave way: who drives it, and how, is not known."""
+    return speed < SLOW_MPS or speed - before < -SLOWS_MPS2 * dt
 
 
 @njit(cache=True)
@@ -181,6 +191,7 @@ def follow_and_yield(
     agents = numbers.shape[1]
     wanted, stood = np.zeros(agents), np.zeros(agents, np.bool_)
     follows, counts_for = np.zeros(agents, np.bool_), np.zeros(agents, np.bool_)
+    decides = np.zeros(agents, np.bool_)
     patience = int(round(PATIENCE_S / dt))
     for b in range(len(now)):
         if not running[b] or not driven[b].any():
@@ -205,6 +216,8 @@ def follow_and_yield(
             follows[a] = abs(offset) < OFF_PATH_M
             wanted[a] = limits[firsts[n] + min(int(arcs[b, a] + 0.5), len(path) - 1)]
             stood[a] = _has_stood(states[b], valid[b], t, a, patience)
+        decides[:] = driven[b]
+        decides[EGO] = _slows(states[b, t, EGO, 3], states[b, max(t - 1, 0), EGO, 3], dt)
         for a in range(agents):
             if not driven[b, a]:
                 continue
@@ -212,7 +225,7 @@ def follow_and_yield(
             path, arc = points[firsts[n] : firsts[n + 1]], arcs[b, a]
             counts_for[:] = valid[b, t]
             gap, leader, clear_from, clear_to = _zones(
-                a, here, sizes[b], arcs[b], wanted, counts_for, follows, stood, driven[b],
+                a, here, sizes[b], arcs[b], wanted, counts_for, follows, stood, decides,
                 zones, mine[b, a, : counts[b, a]], others[b, a], law,
             )  # fmt: skip
             speed = here[a, 3]
