@@ -26,7 +26,7 @@ OFF_PATH_M = 1.5
 """Further from its path nobody is taken to follow it."""
 
 
-@njit(cache=True)
+@njit(cache=True, error_model="numpy")
 @no_type_check
 def advance(path, arc, x, y):
     """(arc length, offset to the left) of the nearest point of a path, walking from `arc`."""
@@ -50,7 +50,7 @@ def advance(path, arc, x, y):
     return i + share, offset
 
 
-@njit(cache=True)
+@njit(cache=True, error_model="numpy")
 @no_type_check
 def arrival_s(distance, speed, wanted, acceleration):
     """Time to cover a distance, picking up speed until the wanted one; never less than 0."""
@@ -65,7 +65,7 @@ def arrival_s(distance, speed, wanted, acceleration):
     return picking_up + (distance - covered) / wanted
 
 
-@njit(cache=True)
+@njit(cache=True, error_model="numpy")
 @no_type_check
 def _has_stood(states, valid, now, a, ticks):
     for t in range(now, max(now - ticks, -1), -1):
@@ -74,14 +74,14 @@ def _has_stood(states, valid, now, a, ticks):
     return True
 
 
-@njit(cache=True)
+@njit(cache=True, error_model="numpy")
 @no_type_check
 def _slows(speed, before, dt):
     """Whether the ego looks as if it gave way: who drives it, and how, is not known."""
     return speed < SLOW_MPS or speed - before < -SLOWS_MPS2 * dt
 
 
-@njit(cache=True)
+@njit(cache=True, error_model="numpy")
 @no_type_check
 def _in_file(x, v, wanted, half, law, enters, s, u, wanted_o, enters_o, first, trusts):
     """(gap, speed of what ends it) that keeps the order where two paths lead the same way."""
@@ -104,7 +104,7 @@ def _in_file(x, v, wanted, half, law, enters, s, u, wanted_o, enters_o, first, t
     return enters - x, 0.0
 
 
-@njit(cache=True)
+@njit(cache=True, error_model="numpy")
 @no_type_check
 def _crossing(x, v, wanted, law, enters, leaves, s, u, wanted_o, enters_o, leaves_o, first, trusts):
     """How one stands to a zone that another one crosses.
@@ -128,17 +128,18 @@ def _crossing(x, v, wanted, law, enters, leaves, s, u, wanted_o, enters_o, leave
     return 1 if clear else 0
 
 
-@njit(cache=True)
+@njit(cache=True, error_model="numpy")
 @no_type_check
 def _zones(
-    me, states, sizes, arcs, wanted, counts_for, follows, stood, decides, zones, mine, others, law
-):
+    me, states, sizes, arcs, wanted, counts_for, follows, stood, decides, zones, mine, others,
+    count, law,
+):  # fmt: skip
     """(gap to what is to be followed or stopped for, its speed, gap that must be clear, until)."""
     x, v = arcs[me], max(states[me, 3], 0.0)
     best, best_gap, best_speed = law[0], np.inf, 0.0
     clear_from, clear_to = np.inf, np.inf
     reach = max(law[5], law[4] * v)
-    for k in range(len(mine)):
+    for k in range(count):
         z, o = mine[k], others[k]
         if not follows[o]:
             continue
@@ -164,7 +165,19 @@ def _zones(
             )
         else:
             how = _crossing(
-                x, v, wanted[me], law, enters, leaves, s, u, wanted[o], enters_o, leaves_o, first, decides[o]
+                x,
+                v,
+                wanted[me],
+                law,
+                enters,
+                leaves,
+                s,
+                u,
+                wanted[o],
+                enters_o,
+                leaves_o,
+                first,
+                decides[o],
             )
             if how == 0:
                 gap = enters - x
@@ -181,7 +194,7 @@ def _zones(
     return best_gap, best_speed, clear_from, clear_to
 
 
-@njit(cache=True)
+@njit(cache=True, error_model="numpy")
 @no_type_check
 def follow_and_yield(
     states, valid, sizes, now, running, driven, numbers, log_rows, strides, elapsed, arcs,
@@ -191,51 +204,51 @@ def follow_and_yield(
     agents = numbers.shape[1]
     wanted, stood = np.zeros(agents), np.zeros(agents, np.bool_)
     follows, counts_for = np.zeros(agents, np.bool_), np.zeros(agents, np.bool_)
-    decides = np.zeros(agents, np.bool_)
+    decides, radii = np.zeros(agents, np.bool_), np.zeros(agents)
     patience = int(round(PATIENCE_S / dt))
     for b in range(len(now)):
         if not running[b] or not driven[b].any():
             continue
         t = now[b]
-        here = states[b, t]
+        past, there, box, gone_m = states[b], valid[b], sizes[b], arcs[b]
+        here, present = past[t], there[t]
         for a in range(agents):
-            follows[a] = False
-            n = numbers[b, a]
-            if not valid[b, t, a]:
-                arcs[b, a] = -1.0
+            follows[a], n = False, numbers[b, a]
+            if not present[a]:
+                gone_m[a] = -1.0
                 continue
+            radii[a] = 0.5 * math.sqrt(box[a, 0] ** 2 + box[a, 1] ** 2)
             if n < 0:
                 continue
-            path = points[firsts[n] : firsts[n + 1]]
-            arc = arcs[b, a]
+            path, arc = points[firsts[n] : firsts[n + 1]], gone_m[a]
             if arc < 0.0:
                 row = rows[n] + log_rows[b, a] + elapsed[b] * strides[b]
                 arc = log_arcs[min(max(row, rows[n]), rows[n + 1] - 1)]
             arc, offset = advance(path, arc, here[a, 0], here[a, 1])
-            arcs[b, a] = max(arc, 0.0)
+            gone_m[a] = max(arc, 0.0)
             follows[a] = abs(offset) < OFF_PATH_M
-            wanted[a] = limits[firsts[n] + min(int(arcs[b, a] + 0.5), len(path) - 1)]
-            stood[a] = _has_stood(states[b], valid[b], t, a, patience)
+            wanted[a] = limits[firsts[n] + min(int(gone_m[a] + 0.5), len(path) - 1)]
+            stood[a] = abs(here[a, 3]) <= STANDING_MPS and _has_stood(past, there, t, a, patience)
         decides[:] = driven[b]
-        decides[EGO] = _slows(states[b, t, EGO, 3], states[b, max(t - 1, 0), EGO, 3], dt)
+        decides[EGO] = _slows(here[EGO, 3], past[max(t - 1, 0), EGO, 3], dt)
         for a in range(agents):
             if not driven[b, a]:
                 continue
             n = numbers[b, a]
-            path, arc = points[firsts[n] : firsts[n + 1]], arcs[b, a]
-            counts_for[:] = valid[b, t]
+            path, arc, speed = points[firsts[n] : firsts[n + 1]], gone_m[a], here[a, 3]
+            counts_for[:] = present
             gap, leader, clear_from, clear_to = _zones(
-                a, here, sizes[b], arcs[b], wanted, counts_for, follows, stood, decides,
-                zones, mine[b, a, : counts[b, a]], others[b, a], law,
+                a, here, box, gone_m, wanted, counts_for, follows, stood, decides, zones,
+                mine[b, a], others[b, a], counts[b, a], law,
             )  # fmt: skip
-            speed = here[a, 3]
             acceleration = idm_acceleration(speed, wanted[a], gap, leader, law)
             reach = max(law[5], law[4] * speed)
-            gap, leader = free_ahead(here, sizes[b], counts_for, a, path, len(path), arc, reach)
+            gap, leader = free_ahead(here, box, radii, counts_for, a, path, len(path), arc, reach)
             if gap < clear_to + 1.0 and leader < 1.0:
                 gap, leader = min(gap, clear_from), 0.0
-            acceleration = min(acceleration, idm_acceleration(speed, wanted[a], gap, leader, law))
-            actions[b, a, 0] = acceleration
+            actions[b, a, 0] = min(
+                acceleration, idm_acceleration(speed, wanted[a], gap, leader, law)
+            )
             actions[b, a, 1] = pursuit_steering(
-                here[a, 0], here[a, 1], here[a, 2], speed, sizes[b, a, 0], path, len(path), arc, 0.0
+                here[a, 0], here[a, 1], here[a, 2], speed, box[a, 0], path, len(path), arc, 0.0
             )
