@@ -7,7 +7,7 @@ import numpy as np
 from numba import njit
 
 from asp_env.dynamics import MAX_ACCELERATION_MPS2
-from asp_env.sim.drivers.conflicts import A_FIRST, IN_A, IN_B, IN_FILE, OUT_A, OUT_B
+from asp_env.sim.drivers.conflicts import A_FIRST, AHEAD_B, IN_A, IN_B, IN_FILE, OUT_A, OUT_B
 from asp_env.sim.idm import free_ahead, idm_acceleration, pursuit_steering
 from asp_env.sim.world import EGO
 
@@ -24,6 +24,11 @@ SLOW_MPS, SLOWS_MPS2 = 2.0, 0.5
 """The ego is trusted to give way where it should while it is slow, or slows down by so much."""
 OFF_PATH_M = 1.5
 """Further from its path nobody is taken to follow it."""
+
+
+STOPS, AHEAD, IN_TURN, GONE = range(4)
+"""One stops before a zone; or it drives in first, although it is not its turn; or because it is; or
+since the other one will have left it."""
 
 
 @njit(cache=True, error_model="numpy")
@@ -83,9 +88,11 @@ def _slows(speed, before, dt):
 
 @njit(cache=True, error_model="numpy")
 @no_type_check
-def _in_file(x, v, wanted, half, law, enters, s, u, wanted_o, enters_o, first, trusts):
-    """(gap, speed of what ends it) that keeps the order where two paths lead the same way."""
-    ahead = enters + s - enters_o - x  # how far ahead the other one is, seen along my path
+def _in_file(x, v, wanted, half, law, enters, s, u, wanted_o, enters_o, ahead, first, trusts):
+    """(gap, speed of what ends it) that keeps the order where two paths lead the same way.
+
+    The other one is `ahead` by so much along the own path.
+    """
     if s >= enters_o:
         return (ahead - half, u) if ahead > half else (enters - x, 0.0)
     to_o = enters_o - s
@@ -107,25 +114,32 @@ def _in_file(x, v, wanted, half, law, enters, s, u, wanted_o, enters_o, first, t
 @njit(cache=True, error_model="numpy")
 @no_type_check
 def _crossing(x, v, wanted, law, enters, leaves, s, u, wanted_o, enters_o, leaves_o, first, trusts):
-    """How one stands to a zone that another one crosses.
-
-    0: it stops before it, 1: it drives in first, 2: in its turn, 3: when the other one is out.
-    """
+    """How one stands to a zone that another one crosses."""
     enters_s = arrival_s(enters - x, v, wanted, law[0])
     out_s = (leaves_o - s) / u if u > STANDING_MPS else np.inf
     if enters_s > out_s + MARGIN_S:
-        return 3
+        return GONE
     if s >= enters_o - 0.5:
-        return 0
+        return STOPS
     if first and trusts:
         binding = enters_o - s < u * u / (2.0 * BINDING_MPS2)
         mine = enters - x < v * v / (2.0 * BINDING_MPS2)
         if mine or not binding:
-            return 2
+            return IN_TURN
     margin = MARGIN_S if first else EARLY_S
     enters_o_s = arrival_s(enters_o - s, u, wanted_o, law[0])
     clear = arrival_s(leaves - x, v, wanted, law[0]) + margin < enters_o_s
-    return 1 if clear else 0
+    return AHEAD if clear else STOPS
+
+
+@njit(cache=True, error_model="numpy")
+@no_type_check
+def _limits(zones, z):
+    """(enters, leaves) of the agent and of the other one, its arc's lead, whether one is first."""
+    zone = zones[z] if z >= 0 else zones[-1 - z]
+    if z >= 0:
+        return zone[IN_A], zone[OUT_A], zone[IN_B], zone[OUT_B], zone[AHEAD_B], zone[A_FIRST] > 0
+    return zone[IN_B], zone[OUT_B], zone[IN_A], zone[OUT_A], -zone[AHEAD_B], zone[A_FIRST] == 0
 
 
 @njit(cache=True, error_model="numpy")
@@ -134,63 +148,43 @@ def _zones(
     me, states, sizes, arcs, wanted, counts_for, follows, stood, decides, zones, mine, others,
     count, law,
 ):  # fmt: skip
-    """(gap to what is to be followed or stopped for, its speed, gap that must be clear, until)."""
+    """(gap to what is to be followed or stopped for, its speed, gap that must be clear, until).
+
+    Those whom the agent will find gone from a zone no longer count for anything.
+    """
     x, v = arcs[me], max(states[me, 3], 0.0)
-    best, best_gap, best_speed = law[0], np.inf, 0.0
+    most, best_gap, best_speed = law[0], np.inf, 0.0
     clear_from, clear_to = np.inf, np.inf
     reach = max(law[5], law[4] * v)
     for k in range(count):
-        z, o = mine[k], others[k]
-        if not follows[o]:
-            continue
-        if z >= 0:
-            enters, leaves = zones[z, IN_A], zones[z, OUT_A]
-            enters_o, leaves_o = zones[z, IN_B], zones[z, OUT_B]
-        else:
-            z = -1 - z
-            enters, leaves = zones[z, IN_B], zones[z, OUT_B]
-            enters_o, leaves_o = zones[z, IN_A], zones[z, OUT_A]
-        s = arcs[o]
-        if x >= enters - 0.1 or s > leaves_o or enters - x > reach:
-            continue
-        first = (zones[z, A_FIRST] > 0) == (mine[k] >= 0)
-        u = max(states[o, 3], 0.0)
-        if stood[o] and s < enters_o - 0.5:
+        o = others[k]
+        z = mine[k]
+        enters, leaves, enters_o, leaves_o, lead, first = _limits(zones, z)
+        s, u = arcs[o], max(states[o, 3], 0.0)
+        ahead = 0.1 <= enters - x <= reach and s <= leaves_o
+        if not (ahead and follows[o]) or (stood[o] and s < enters_o - 0.5):
             continue
         gap, speed = np.inf, 0.0
-        if zones[z, IN_FILE]:
+        if zones[z if z >= 0 else -1 - z, IN_FILE]:
             half = 0.5 * (sizes[me, 0] + sizes[o, 0])
             gap, speed = _in_file(
-                x, v, wanted[me], half, law, enters, s, u, wanted[o], enters_o, first, decides[o]
-            )
+                x, v, wanted[me], half, law, enters, s, u, wanted[o], enters_o, s - lead - x, first,
+                decides[o],
+            )  # fmt: skip
         else:
             how = _crossing(
-                x,
-                v,
-                wanted[me],
-                law,
-                enters,
-                leaves,
-                s,
-                u,
-                wanted[o],
-                enters_o,
-                leaves_o,
-                first,
+                x, v, wanted[me], law, enters, leaves, s, u, wanted[o], enters_o, leaves_o, first,
                 decides[o],
-            )
-            if how == 0:
-                gap = enters - x
-            elif how == 1 and enters - x < clear_from:
+            )  # fmt: skip
+            counts_for[o] &= how != GONE
+            gap = enters - x if how == STOPS else np.inf
+            if how == AHEAD and enters - x < clear_from:
                 clear_from, clear_to = enters - x, leaves - x
-            elif how == 3:
-                counts_for[o] = False
         if speed == 0.0 and gap < v * v / (2.0 * MAX_ACCELERATION_MPS2):
             continue  # too late to stop before the zone
-        if gap < np.inf:
-            acceleration = idm_acceleration(v, wanted[me], gap, speed, law)
-            if acceleration < best:
-                best, best_gap, best_speed = acceleration, gap, speed
+        acceleration = idm_acceleration(v, wanted[me], gap, speed, law)
+        if acceleration < most:
+            most, best_gap, best_speed = acceleration, gap, speed
     return best_gap, best_speed, clear_from, clear_to
 
 
@@ -205,7 +199,7 @@ def follow_and_yield(
     wanted, stood = np.zeros(agents), np.zeros(agents, np.bool_)
     follows, counts_for = np.zeros(agents, np.bool_), np.zeros(agents, np.bool_)
     decides, radii = np.zeros(agents, np.bool_), np.zeros(agents)
-    patience = int(round(PATIENCE_S / dt))
+    patience = round(PATIENCE_S / dt)
     for b in range(len(now)):
         if not running[b] or not driven[b].any():
             continue
