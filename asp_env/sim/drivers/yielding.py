@@ -173,32 +173,12 @@ def _zones(
             )  # fmt: skip
         else:
             how = _crossing(
-<<<<<<< HEAD
                 x, v, wanted[me], law, enters, leaves, s, u, wanted[o], enters_o, leaves_o, first,
                 decides[o],
             )  # fmt: skip
             counts_for[o] &= how != GONE
             gap = enters - x if how == STOPS else np.inf
             if how == AHEAD and enters - x < clear_from:
-=======
-                x,
-                v,
-                wanted[me],
-                law,
-                enters,
-                leaves,
-                s,
-                u,
-                wanted[o],
-                enters_o,
-                leaves_o,
-                first,
-                decides[o],
-            )
-            if how == 0:
-                gap = enters - x
-            elif how == 1 and enters - x < clear_from:
->>>>>>> main
                 clear_from, clear_to = enters - x, leaves - x
         if speed == 0.0 and gap < v * v / (2.0 * MAX_ACCELERATION_MPS2):
             continue  # too late to stop before the zone
