@@ -29,6 +29,7 @@ from asp_env.evaluation.unseen import PartChoice, nothing_left, ticks_to_judge
 from asp_env.metrics.driving import driving_metrics
 from asp_env.metrics.masked import Masked
 from asp_env.planning.planner import Planner, load_planner
+from asp_env.sim.drivers import Driver
 from asp_env.sim.traffic import make_traffic
 from asp_env.sim.world import Ending
 
@@ -109,7 +110,7 @@ class ClosedLoop:
 
 def drive(config: Drive) -> ClosedLoop:
     """Drives with every predictor, the expert first."""
-    make_traffic(config.traffic, dt_s=config.dt)  # refused before anything is computed
+    traffic = make_traffic(config.traffic, dt_s=config.dt)  # refused before anything is computed
     recordings = open_data(config.data)
     horizon, history = ticks(config.horizon, config.dt), ticks(HISTORY_S, config.dt)
     predictors = load_predictors(config.predictors, horizon=horizon, dt_s=config.dt)
@@ -133,7 +134,7 @@ def drive(config: Drive) -> ClosedLoop:
         task = progress.add_task("driving", total=len(entrants) * len(scenarios))
         runs = [
             _drive_all(
-                config, recordings, scenarios, *entrant, horizon, history,
+                config, traffic, recordings, scenarios, *entrant, horizon, history,
                 lambda count: progress.advance(task, count),
             )
             for entrant in entrants
@@ -187,6 +188,7 @@ def _spread(scenarios: ScenarioSet, most: int | None) -> list[Scenario]:
 
 def _drive_all(
     config: Drive,
+    traffic: Driver,
     recordings: Recordings,
     scenarios: Sequence[Scenario],
     planner: Planner,
@@ -206,7 +208,7 @@ def _drive_all(
             some,
             planner,
             predictor,
-            traffic=config.traffic,
+            traffic=traffic,
             horizon=horizon,
             history=history,
             dt_s=config.dt,
