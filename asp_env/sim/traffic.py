@@ -2,6 +2,7 @@
 
 import re
 from collections.abc import Mapping, Sequence
+from typing import Any
 
 import numpy as np
 from jaxtyping import Bool
@@ -14,7 +15,7 @@ from asp_env.sim.drivers import Control, Driver, DriverPlug
 from asp_env.sim.drivers.driver import idle, resized, vehicles
 from asp_env.sim.replay import ReplayWorld
 
-TrafficSpec = str | Driver | Mapping[int | str, str | Driver]
+TrafficSpec = str | Driver | Mapping[Any, str | Driver]
 """A driver or its name, or a table from ids, names of classes and `default` to those."""
 
 DEFAULT = "default"
@@ -102,9 +103,9 @@ def make_traffic(spec: TrafficSpec, *, dt_s: float = DEFAULT_DT_S) -> Driver:
     return _make_table({DEFAULT: "log", **spec}, dt_s)
 
 
-def _parse(text: str) -> dict[int | str, str | Driver]:
+def _parse(text: str) -> dict[str, str]:
     """`idm` stands for itself; `default=idm,17=log` for a table."""
-    table: dict[int | str, str | Driver] = {}
+    table: dict[str, str] = {}
     for pair in _NEXT_PAIR.split(text):
         key, _, name = (part.strip() for part in pair.partition("="))
         if key in table:
@@ -113,7 +114,7 @@ def _parse(text: str) -> dict[int | str, str | Driver]:
     return table
 
 
-def _make_table(spec: Mapping[int | str, str | Driver], dt_s: float) -> Traffic:
+def _make_table(spec: Mapping[Any, str | Driver], dt_s: float) -> Traffic:
     drivers: list[Driver] = []
     numbers: dict[str | int, int] = {}
     by_class: dict[AgentClass, int] = {}

@@ -22,9 +22,9 @@ def _run(traffic: str, scenarios: list) -> np.ndarray:
         history=HISTORY,
     )
     simulation.reset(scenarios, [np.random.default_rng(3) for _ in scenarios])
-    for _ in range(20):
-        snapshot = simulation.snapshot()
-        replay(simulation, 1)
+    replay(simulation, 19)
+    snapshot = simulation.snapshot()
+    replay(simulation, 1)
     after = simulation.world.episodes.states.copy()
     simulation.restore(snapshot)
     replay(simulation, 1)

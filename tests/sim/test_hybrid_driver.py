@@ -82,6 +82,8 @@ def test_those_behind_turn_in_their_turn():
         assert second is not None
         assert third is not None
         assert second[0] - third[0] > 4.5
+    third = now(simulation, 3)
+    assert third is not None
     assert third[3] < 0.05
 
 

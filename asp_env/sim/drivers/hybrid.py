@@ -7,6 +7,7 @@ import numpy as np
 from jaxtyping import Bool
 from numba import njit
 
+from asp_env.dynamics import MAX_ACCELERATION_MPS2
 from asp_env.metrics.boxes import overlaps
 from asp_env.sim.drivers.driver import Control, refuse_argument, resized, vehicles
 from asp_env.sim.drivers.idm import IDMDriver
@@ -56,6 +57,15 @@ def _expect(states, now, a, route, count, on_route, dt, ways):
 
 @njit(cache=True)
 @no_type_check
+def _far(state, size, other, size_o):
+    """Whether two cannot meet within the horizon, even if both speed up by 5 m/s²."""
+    way = (abs(state[3]) + abs(other[3])) * HORIZON_S + MAX_ACCELERATION_MPS2 * HORIZON_S**2
+    reach = way + size[0] + size[1] + size_o[0] + size_o[1]
+    return (state[0] - other[0]) ** 2 + (state[1] - other[1]) ** 2 > reach * reach
+
+
+@njit(cache=True)
+@no_type_check
 def _meets(log_states, log_valid, now, a, sizes, o, ways):
     for h in range(min(len(ways), len(log_valid) - 1 - now)):
         if not log_valid[now + h + 1, a]:
@@ -87,7 +97,8 @@ def _turn(
                 continue
             _expect(states[b], t, o, routes[b], counts[b], on_route[b], dt, ways)
             for a in range(mine.shape[1]):
-                if mine[b, a] and valid[b, t, a] and not turned[b, a]:
+                replays = mine[b, a] and valid[b, t, a] and not turned[b, a]
+                if replays and not _far(states[b, t, a], sizes[b, a], states[b, t, o], sizes[b, o]):
                     turned[b, a] = _meets(log_states[b], log_valid[b], t, a, sizes[b], o, ways)
 
 
