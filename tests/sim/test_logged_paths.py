@@ -9,6 +9,7 @@ from asp_env.sim.beginning import BEYOND_M
 from asp_env.sim.drivers.paths import Paths
 from asp_env.sim.idm import IDM, speed_limits
 from tests.builders import make_recording
+from tests.real_data import real_data
 
 RECORDINGS = [make_recording(), make_recording(name="01", seed=4, frame_rate_hz=10.0)]
 
@@ -17,10 +18,16 @@ def _path(paths: Paths, track: int) -> np.ndarray:
     return paths.points[paths.firsts[track] : paths.firsts[track + 1]]
 
 
-@pytest.mark.parametrize("source", ["made up", "sample:roundabout"])
+@pytest.mark.parametrize(
+    "source",
+    ["made up", "sample:roundabout", pytest.param("karlsruhe", marks=pytest.mark.data)],
+)
 def test_every_path_is_the_route_of_its_track(source):
     """The kernel and `route_along` lay the same points, to a millimetre."""
-    recordings = RECORDINGS if source == "made up" else open_data(source)
+    recordings = RECORDINGS
+    if source != "made up":
+        folder = real_data(source) if source == "karlsruhe" else source
+        recordings = open_data(folder).subset(range(2 if source == "karlsruhe" else 1))
     paths = Paths(IDM())
     for number, recording in enumerate(recordings):
         base = paths.base(recordings, number)
