@@ -169,6 +169,22 @@ def test_nobody_comes_where_it_could_not_stop(standing_x_m, comes):
     assert (now(simulation, 3) is not None) == comes
 
 
+@pytest.mark.parametrize(("speed_mps", "brakes"), [(6.0, True), (0.0, False)])
+def test_an_ego_off_its_way_is_looked_for_where_it_will_be(speed_mps, brakes):
+    """It drives north at x = 8 m, 6 m beside its path; in a second it will be on the road.
+
+    The road begins 0.85 m above its front, which is 3.4 m below the car's lane: standing there it
+    is in nobody's way.
+    """
+    simulation = simulate(on_road(car(-60, 8)), scenario(length=60), "idm")
+    replay(simulation, 10)
+    episodes, tick = simulation.world.episodes, simulation.world.now[0]
+    episodes.states[0, tick, 0] = 8.0, -8.0, np.pi / 2, speed_mps
+    episodes.states[0, tick, 1, 0] = -12.0
+    control = simulation.driver.control(simulation.world)
+    assert (control.actions[0, 1, 0] < -0.5) == brakes
+
+
 def test_arrival_by_hand():
     """From 4 m/s at 2 m/s² to 10: 3 s and 21 m; 16 m take √(16 + 64) - 4 over 2, then 10 m/s."""
     assert arrival_s(21.0, 4.0, 10.0, 2.0) == pytest.approx(3.0)

@@ -24,6 +24,8 @@ SLOW_MPS, SLOWS_MPS2 = 2.0, 0.5
 """The ego is trusted to give way where it should while it is slow, or slows down by so much."""
 OFF_PATH_M = 1.5
 """Further from its path nobody is taken to follow it."""
+SOON_S = 1.0
+"""Those who do not are also looked for where they will be by then if they go straight on."""
 
 
 STOPS, AHEAD, IN_TURN, GONE = range(4)
@@ -84,6 +86,28 @@ def _has_stood(states, valid, now, a, ticks):
 def _slows(speed, before, dt):
     """Whether the ego looks as if it gave way: who drives it, and how, is not known."""
     return speed < SLOW_MPS or speed - before < -SLOWS_MPS2 * dt
+
+
+@njit(cache=True, error_model="numpy")
+@no_type_check
+def _stray(here, present, numbers, follows, driven, strays, soon):
+    """Marks those who drive elsewhere than on their path, and says where they will be soon."""
+    found = False
+    for a in range(len(strays)):
+        # whoever is driven here is on its way back
+        strays[a] = present[a] and numbers[a] >= 0 and not (follows[a] or driven[a])
+        if strays[a]:
+            found = True
+            way = here[a, 3] * SOON_S
+            soon[a, 0] = here[a, 0] + way * math.cos(here[a, 2])
+            soon[a, 1] = here[a, 1] + way * math.sin(here[a, 2])
+            soon[a, 2], soon[a, 3] = here[a, 2], here[a, 3]
+    # those who look ahead do so from where they are
+    if found:
+        for a in range(len(strays)):
+            if driven[a]:
+                soon[a] = here[a]
+    return found
 
 
 @njit(cache=True, error_model="numpy")
@@ -199,6 +223,7 @@ def follow_and_yield(
     wanted, stood = np.zeros(agents), np.zeros(agents, np.bool_)
     follows, counts_for = np.zeros(agents, np.bool_), np.zeros(agents, np.bool_)
     decides, radii = np.zeros(agents, np.bool_), np.zeros(agents)
+    strays, soon = np.zeros(agents, np.bool_), np.zeros((agents, 4), states.dtype)
     patience = round(PATIENCE_S / dt)
     for b in range(len(now)):
         if not running[b] or not driven[b].any():
@@ -215,14 +240,15 @@ def follow_and_yield(
             if n < 0:
                 continue
             path, arc = points[firsts[n] : firsts[n + 1]], gone_m[a]
-            if arc < 0.0:
-                row = rows[n] + log_rows[b, a] + elapsed[b] * strides[b]
-                arc = log_arcs[min(max(row, rows[n]), rows[n + 1] - 1)]
+            row = rows[n] + log_rows[b, a] + elapsed[b] * strides[b]
+            row = min(max(row, rows[n]), rows[n + 1] - 1)
+            arc = log_arcs[row] if arc < 0.0 else arc
             arc, offset = advance(path, arc, here[a, 0], here[a, 1])
             gone_m[a] = max(arc, 0.0)
             follows[a] = abs(offset) < OFF_PATH_M
             wanted[a] = limits[firsts[n] + min(int(gone_m[a] + 0.5), len(path) - 1)]
             stood[a] = abs(here[a, 3]) <= STANDING_MPS and _has_stood(past, there, t, a, patience)
+        some_stray = _stray(here, present, numbers[b], follows, driven[b], strays, soon)
         decides[:] = driven[b]
         decides[EGO] = _slows(here[EGO, 3], past[max(t - 1, 0), EGO, 3], dt)
         for a in range(agents):
@@ -238,11 +264,14 @@ def follow_and_yield(
             acceleration = idm_acceleration(speed, wanted[a], gap, leader, law)
             reach = max(law[5], law[4] * speed)
             gap, leader = free_ahead(here, box, radii, counts_for, a, path, len(path), arc, reach)
-            if gap < clear_to + 1.0 and leader < 1.0:
+            if clear_from < np.inf and gap < clear_to + 1.0 and leader < 1.0:
                 gap, leader = min(gap, clear_from), 0.0
-            actions[b, a, 0] = min(
-                acceleration, idm_acceleration(speed, wanted[a], gap, leader, law)
-            )
+            acceleration = min(acceleration, idm_acceleration(speed, wanted[a], gap, leader, law))
+            gap = np.inf
+            if some_stray:
+                gap, leader = free_ahead(soon, box, radii, strays, a, path, len(path), arc, reach)
+            acceleration = min(acceleration, idm_acceleration(speed, wanted[a], gap, leader, law))
+            actions[b, a, 0] = acceleration
             actions[b, a, 1] = pursuit_steering(
                 here[a, 0], here[a, 1], here[a, 2], speed, box[a, 0], path, len(path), arc, 0.0
             )
