@@ -5,14 +5,16 @@ from typing import Any
 
 import gymnasium
 import numpy as np
+from jaxtyping import Shaped
 
+from asp_env.data.forecast import Forecast
+from asp_env.data.recording import Background
 from asp_env.data.scene import Scene
 from asp_env.envs.episodes import ReplayEpisodes, as_actions
-from asp_env.errors import AspEnvError
-from asp_env.render.frames import draw_frame
+from asp_env.render.live import MODES, Live
 from asp_env.sim.replay import ReplayWorld
 
-METADATA = {"render_modes": ["rgb_array"], "render_fps": 5}
+METADATA = {"render_modes": [*MODES], "render_fps": 5}
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -63,6 +65,10 @@ width m |
     `idm`. `dt_s`: length of a tick. `reward_weights`: weights by name, where they differ from the
     defaults.
 
+    ## Rendering
+    `render_mode`: `rgb_array`, a picture from above of 80 m by 80 m, or `human`, a window that
+    keeps up with the episode (extra `render`). `show` adds a forecast and a plan.
+
     ## Version history
     v0: first.
     """
@@ -77,8 +83,6 @@ width m |
         Raises:
             AspEnvError: an argument is not understood, or the data hold no scenario.
         """
-        if render_mode is not None and render_mode not in self.metadata["render_modes"]:
-            raise AspEnvError(f"render mode {render_mode!r}: expected rgb_array or None")
         self.render_mode = render_mode
         self._episodes = ReplayEpisodes(data, options, 1)
         self.recordings = self._episodes.recordings
@@ -86,6 +90,9 @@ width m |
         self.observation_space = self._episodes.observer.space
         self.action_space = self._episodes.action_space
         self._running = False
+        dt_s = self._episodes.simulation.world.dt_s
+        self.metadata = {**METADATA, "render_fps": round(1 / dt_s, 6)}
+        self._live = Live(render_mode, title=f"asp-env: {data}", dt_s=dt_s)
 
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
@@ -104,6 +111,8 @@ width m |
         scenario, rng = self._episodes.draw(self.np_random, options or {})
         self._episodes.begin([scenario], [rng], np.ones(1, dtype=bool))
         self._running = True
+        self._live.forget()
+        self._keep_up()
         return self._observe(), self._info()
 
     def step(self, action: Any) -> tuple[dict[str, Any], float, bool, bool, dict[str, Any]]:
@@ -122,6 +131,7 @@ width m |
             "reward_terms": {name: float(value[0]) for name, value in outcome.terms.items()},
             "ending": outcome.ending[0],
         }
+        self._keep_up()
         return self._observe(), float(outcome.reward[0]), terminated, truncated, info
 
     def snapshot(self) -> EnvSnapshot:
@@ -147,6 +157,7 @@ width m |
         self.np_random.bit_generator.state = snapshot.generator
         self._np_random_seed = snapshot.seed
         self._running = snapshot.running
+        self._live.forget()
 
     def scene(self) -> Scene:
         """All that may be known now, for a predictor in anybody's loop; the ego is slot 0.
@@ -156,13 +167,44 @@ width m |
         """
         return self._world().scene()
 
+    def show(
+        self, *, forecast: Forecast | None = None, plan: Shaped[np.ndarray, "..."] | None = None
+    ) -> None:
+        """Hands over what to draw besides, until the next time; `reset` forgets it.
+
+        Args:
+            forecast: of `scene()`. Later pictures show what is still to come of it.
+            plan: the ego's positions at the next ticks, metres, in the first two columns.
+
+        Raises:
+            gymnasium.error.ResetNeeded: no episode has begun.
+            AspEnvError: it is not of this scene, or not finite.
+        """
+        self._live.tell(self.scene(), forecast, plan)
+        if self.render_mode == "human":
+            self.render()
+
     def render(self) -> Any:
-        """An RGB picture uint8 (H, W, 3) from above in mode `rgb_array`, else None."""
+        """A picture from above: RGB uint8 (H, W, 3) in mode `rgb_array`, on screen in `human`.
+
+        Raises:
+            gymnasium.error.ResetNeeded: no episode has begun.
+            AspEnvError: there is no screen.
+        """
         if self.render_mode is None:
             return None
-        scene = self.scene()
-        recording = self.recordings[int(self._world().episodes.recording[0])]
-        return draw_frame(scene, background=recording.background)
+        return self._live.render(self.scene(), self._background())
+
+    def close(self) -> None:
+        """Closes the window, if there is one."""
+        self._live.close()
+
+    def _keep_up(self) -> None:
+        if self.render_mode == "human":
+            self._live.keep_up(self.scene(), self._background())
+
+    def _background(self) -> Background | None:
+        return self.recordings[int(self._world().episodes.recording[0])].background
 
     def _observe(self) -> dict[str, Any]:
         return {name: value[0] for name, value in self._episodes.observe().items()}

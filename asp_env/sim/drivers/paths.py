@@ -9,7 +9,7 @@ from numba import njit
 
 from asp_env.data.geometry import MIN_STEP_M
 from asp_env.data.recording import Recording
-from asp_env.data.scenario import STANDING_MPS
+from asp_env.data.scenario_rules import STANDING_MPS
 from asp_env.sim.beginning import BEYOND_M
 from asp_env.sim.idm import IDM, limit_speeds
 
