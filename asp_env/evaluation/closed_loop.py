@@ -33,6 +33,7 @@ from asp_env.metrics.driving import driving_metrics
 from asp_env.metrics.masked import Masked
 from asp_env.metrics.presets import DEFAULT_PRESET, PRESETS, Preset, find_preset
 from asp_env.planning.planner import Planner, load_planner
+from asp_env.sim.drivers import Driver
 from asp_env.sim.traffic import make_traffic
 from asp_env.sim.world import Ending
 
@@ -122,7 +123,7 @@ class ClosedLoop:
 
 def drive(config: Drive) -> ClosedLoop:
     """Drives with every predictor, the expert first."""
-    make_traffic(config.traffic, dt_s=config.dt)  # refused before anything is computed
+    traffic = make_traffic(config.traffic, dt_s=config.dt)  # refused before anything is computed
     preset = find_preset(config.metrics)
     recordings = open_data(config.data)
     horizon, history = ticks(config.horizon, config.dt), ticks(HISTORY_S, config.dt)
@@ -148,7 +149,7 @@ def drive(config: Drive) -> ClosedLoop:
         task = progress.add_task("driving", total=len(entrants) * len(scenarios))
         runs = [
             _drive_all(
-                config, preset, recordings, scenarios, *entrant, horizon, history,
+                config, preset, traffic, recordings, scenarios, *entrant, horizon, history,
                 lambda count: progress.advance(task, count),
             )
             for entrant in entrants
@@ -198,6 +199,7 @@ def drive(config: Drive) -> ClosedLoop:
 def _drive_all(
     config: Drive,
     preset: Preset,
+    traffic: Driver,
     recordings: Recordings,
     scenarios: Sequence[Scenario],
     planner: Planner,
@@ -218,7 +220,7 @@ def _drive_all(
             planner,
             predictor,
             preset=preset,
-            traffic=config.traffic,
+            traffic=traffic,
             horizon=horizon,
             history=history,
             dt_s=config.dt,
