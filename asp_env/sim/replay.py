@@ -37,6 +37,7 @@ class ReplayWorld:
         self.episodes = no_episodes(num_episodes, ticks=history + 2, agents=1, points=2)
         self._maps: tuple[RoadMap, ...] = ()
         self._map_index = np.zeros(num_episodes, dtype=np.int64)
+        self._rows = np.arange(num_episodes)
 
     def __len__(self) -> int:
         """How many episodes run side by side."""
@@ -133,9 +134,8 @@ class ReplayWorld:
 
     def _judge_contacts(self) -> None:
         """Brings contacts up to now."""
-        data, rows = self.episodes, np.arange(len(self))
-        states = np.ascontiguousarray(data.states[rows, self.now])
-        valid = np.ascontiguousarray(data.valid[rows, self.now])
+        data, now = self.episodes, self.now
+        states, valid = data.states[self._rows, now], data.valid[self._rows, now]
         data.contacts = ego_contacts(states, data.sizes, valid & ~data.own_trailer, data.contacts)
 
     def scene(self) -> Scene:
@@ -181,7 +181,7 @@ class ReplayWorld:
 
     def ego_states(self) -> Float[np.ndarray, "b 4"]:
         """The egos' states now."""
-        return self.episodes.states[np.arange(len(self)), self.now, EGO]
+        return self.episodes.states[self._rows, self.now, EGO]
 
     def events(self) -> Events:
         """What holds now."""
