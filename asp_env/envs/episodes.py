@@ -1,6 +1,5 @@
 """Episodes of recordings as the environments drive them: one core, of any number side by side."""
 
-import copy
 import dataclasses
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -15,7 +14,7 @@ from asp_env.data.scenario import Scenario, ScenarioSet, find_scenarios
 from asp_env.data.snippets import HISTORY_S
 from asp_env.data.source import open_data
 from asp_env.dynamics import MAX_ACCELERATION_MPS2, MAX_STEERING_RAD
-from asp_env.envs.start import Starts, choose
+from asp_env.envs.start import Starts, checked, tagged
 from asp_env.errors import AspEnvError, unknown_name
 from asp_env.sim.observation import Observation, Observer
 from asp_env.sim.reward import reward_terms, weighted_sum, weights_from
@@ -27,6 +26,9 @@ from asp_env.views import make_picture_view
 
 _ACTION_LIMITS = np.array([MAX_ACCELERATION_MPS2, MAX_STEERING_RAD], dtype=np.float32)
 _TERMINAL = np.array([kind in (Ending.COLLISION, Ending.OFF_ROAD, Ending.GOAL) for kind in Ending])
+Start = tuple[Scenario, int]
+"""A scenario, and the seed of its episode's own generator."""
+
 _ENDING_NAMES = np.array([kind.name for kind in Ending], dtype=object)
 
 
@@ -80,11 +82,9 @@ class ReplayEpisodes:
         chosen = _options(options)
         history = ticks(HISTORY_S, chosen.dt_s)
         self.recordings = open_data(data)
-        found = find_scenarios(self.recordings, source=data, dt_s=chosen.dt_s, history=history)
-        self.scenarios = choose(found, chosen.scenarios, data=data)
         self._starts = Starts(
             recordings=self.recordings,
-            scenarios=self.scenarios,
+            scenarios=self._choose(chosen, history),
             data=data,
             dt_s=chosen.dt_s,
             history=history,
@@ -104,27 +104,39 @@ class ReplayEpisodes:
         self.action_space = spaces.Box(-1.0, 1.0, (2,), dtype=np.float32)
         self.events: Events | None = None
 
-    def __deepcopy__(self, memo: dict[int, Any]) -> "ReplayEpisodes":
-        """A copy shares the recordings and the scenarios, which nobody changes."""
-        copied = object.__new__(type(self))
-        memo[id(self)] = copied
-        for shared in (self.recordings, self.scenarios, self._starts):
-            memo[id(shared)] = shared
-        for name, value in vars(self).items():
-            setattr(copied, name, copy.deepcopy(value, memo))
-        return copied
+    def _choose(self, options: ReplayOptions, history: int) -> ScenarioSet:
+        wanted, recordings = options.scenarios, self.recordings
+        if isinstance(wanted, ScenarioSet):
+            return checked(wanted, recordings.names, data=recordings.source)
+        found = find_scenarios(
+            recordings, source=recordings.source, dt_s=options.dt_s, history=history
+        )
+        return tagged(found, wanted, data=recordings.source)
 
-    def draw(
-        self, np_random: np.random.Generator, options: Mapping[str, Any]
-    ) -> tuple[Scenario, np.random.Generator]:
-        """The scenario of the options of a reset, else a drawn one; and its own generator.
+    @property
+    def scenarios(self) -> ScenarioSet:
+        """Those that are drawn from."""
+        return self._starts.scenarios
+
+    def draw(self, np_random: np.random.Generator, options: Mapping[str, Any]) -> Start:
+        """The scenario of the options of a reset, else a drawn one; and a drawn seed.
 
         Raises:
             AspEnvError: an option is unknown, or what it asks for does not exist.
         """
         drawn = int(np_random.integers(len(self.scenarios)))
-        scenario = self._starts.find(options, drawn)
-        return scenario, np.random.default_rng(np_random.integers(2**63))
+        return self._starts.find(options, drawn), int(np_random.integers(2**63))
+
+    def begin(self, starts: Mapping[int, Start]) -> None:
+        """Starts some episodes, by their number; the others go on."""
+        world = self.simulation.world
+        scenarios, rngs = list(world.scenarios), list(world.rngs)
+        where = np.zeros(len(world), dtype=bool)
+        for b, (scenario, seed) in starts.items():
+            scenarios[b], rngs[b], where[b] = scenario, np.random.default_rng(seed), True
+            self._names[b], self._tags[b] = scenario.name, scenario.tags
+        self.simulation.reset(scenarios, rngs, where)
+        self.events = world.events()
 
     def snapshot(self) -> Any:
         """The whole state, to be handed to `restore`: no recording, no picture."""
@@ -138,18 +150,6 @@ class ReplayEpisodes:
             self._names[b] = None if scenario is None else scenario.name
             self._tags[b] = None if scenario is None else scenario.tags
         self.events = world.events()
-
-    def begin(
-        self,
-        scenarios: Sequence[Scenario],
-        rngs: Sequence[np.random.Generator],
-        where: Bool[np.ndarray, " b"],
-    ) -> None:
-        """Starts the episodes at `where`; the others' entries are not read."""
-        self.simulation.reset(scenarios, rngs, where)
-        for b in np.flatnonzero(where).tolist():
-            self._names[b], self._tags[b] = scenarios[b].name, scenarios[b].tags
-        self.events = self.simulation.world.events()
 
     def step(self, actions: Float[np.ndarray, "b 2"]) -> Outcome:
         """One tick; actions in [-1, 1]."""

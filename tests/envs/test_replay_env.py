@@ -2,7 +2,6 @@
 
 import copy
 import hashlib
-import itertools
 import subprocess
 import sys
 from typing import Any
@@ -10,14 +9,9 @@ from typing import Any
 import gymnasium
 import numpy as np
 import pytest
-from gymnasium.utils.env_checker import check_env
-from stable_baselines3.common.env_checker import check_env as check_env_sb3
 
-import asp_env
 from asp_env.envs.replay import ReplayEnv
 
-PARTS = ("raster", "actions", "state")
-SUBSETS = [names for n in (1, 2, 3) for names in itertools.combinations(PARTS, n)]
 SMALL = (90, 60)
 
 
@@ -49,43 +43,6 @@ def _trace(env: gymnasium.Env, *, seed: int = 5, steps: int = 60) -> str:
         if told[2] or told[3]:
             _digest(env.reset(), seen)
     return seen.hexdigest()
-
-
-@pytest.mark.parametrize("names", SUBSETS, ids="-".join)
-def test_passes_the_checkers_without_a_warning(crossing, names):
-    """Gymnasium's on the environment, stable-baselines3's behind `FlatParts`; warnings are errors.
-
-    stable-baselines3 warns of tables such as the action history, and of nothing else.
-    """
-    made = gymnasium.make(
-        "asp_env/Replay-v0",
-        data=crossing,
-        observations=names,
-        raster_px=SMALL,
-        render_mode="rgb_array",
-    )
-    env = made.unwrapped
-    check_env(env, skip_close_check=True)
-    check_env_sb3(asp_env.FlatParts(env))
-    if "actions" not in names:
-        check_env_sb3(env)
-
-
-def test_the_spaces_are_those_of_the_contract(crossing):
-    """Raster uint8 (12, 360, 240), actions float32 (15, 2), finite bounds, actions in ±1."""
-    env = gymnasium.make("asp_env/Replay-v0", data=crossing)
-    space = env.observation_space
-    assert isinstance(space, gymnasium.spaces.Dict)
-    assert set(space) == {"raster", "actions", "state"}
-    assert (space["raster"].shape, space["raster"].dtype) == ((12, 360, 240), np.uint8)
-    assert (space["actions"].shape, space["actions"].dtype) == ((15, 2), np.float32)
-    for box in space.values():
-        assert isinstance(box, gymnasium.spaces.Box)
-        assert box.is_bounded()
-    assert env.action_space == gymnasium.spaces.Box(-1, 1, (2,), np.float32)
-    obs, _ = env.reset(seed=0)
-    assert obs in space
-    assert set(np.unique(obs["raster"])) == {0, 255}
 
 
 def test_two_instances_agree_bit_for_bit(crossing):
