@@ -26,9 +26,6 @@ from asp_env.views import make_picture_view
 
 _ACTION_LIMITS = np.array([MAX_ACCELERATION_MPS2, MAX_STEERING_RAD], dtype=np.float32)
 _TERMINAL = np.array([kind in (Ending.COLLISION, Ending.OFF_ROAD, Ending.GOAL) for kind in Ending])
-Start = tuple[Scenario, int]
-"""A scenario, and the seed of its episode's own generator."""
-
 _ENDING_NAMES = np.array([kind.name for kind in Ending], dtype=object)
 
 
@@ -82,9 +79,10 @@ class ReplayEpisodes:
         chosen = _options(options)
         history = ticks(HISTORY_S, chosen.dt_s)
         self.recordings = open_data(data)
+        self.scenarios = self._choose(chosen, history)
         self._starts = Starts(
             recordings=self.recordings,
-            scenarios=self._choose(chosen, history),
+            scenarios=self.scenarios,
             data=data,
             dt_s=chosen.dt_s,
             history=history,
@@ -113,30 +111,29 @@ class ReplayEpisodes:
         )
         return tagged(found, wanted, data=recordings.source)
 
-    @property
-    def scenarios(self) -> ScenarioSet:
-        """Those that are drawn from."""
-        return self._starts.scenarios
-
-    def draw(self, np_random: np.random.Generator, options: Mapping[str, Any]) -> Start:
-        """The scenario of the options of a reset, else a drawn one; and a drawn seed.
+    def draw(
+        self, np_random: np.random.Generator, options: Mapping[str, Any]
+    ) -> tuple[Scenario, np.random.Generator]:
+        """The scenario of the options of a reset, else a drawn one; and its own generator.
 
         Raises:
             AspEnvError: an option is unknown, or what it asks for does not exist.
         """
         drawn = int(np_random.integers(len(self.scenarios)))
-        return self._starts.find(options, drawn), int(np_random.integers(2**63))
+        scenario = self._starts.find(options, drawn)
+        return scenario, np.random.default_rng(np_random.integers(2**63))
 
-    def begin(self, starts: Mapping[int, Start]) -> None:
-        """Starts some episodes, by their number; the others go on."""
-        world = self.simulation.world
-        scenarios, rngs = list(world.scenarios), list(world.rngs)
-        where = np.zeros(len(world), dtype=bool)
-        for b, (scenario, seed) in starts.items():
-            scenarios[b], rngs[b], where[b] = scenario, np.random.default_rng(seed), True
-            self._names[b], self._tags[b] = scenario.name, scenario.tags
+    def begin(
+        self,
+        scenarios: Sequence[Scenario],
+        rngs: Sequence[np.random.Generator],
+        where: Bool[np.ndarray, " b"],
+    ) -> None:
+        """Starts the episodes at `where`; the others' entries are not read."""
         self.simulation.reset(scenarios, rngs, where)
-        self.events = world.events()
+        for b in np.flatnonzero(where).tolist():
+            self._names[b], self._tags[b] = scenarios[b].name, scenarios[b].tags
+        self.events = self.simulation.world.events()
 
     def snapshot(self) -> Any:
         """The whole state, to be handed to `restore`: no recording, no picture."""

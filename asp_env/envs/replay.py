@@ -8,10 +8,10 @@ import gymnasium
 import numpy as np
 from jaxtyping import Float
 
-from asp_env.data.scenario import ScenarioSet
+from asp_env.data.scenario import Scenario, ScenarioSet
 from asp_env.data.scene import Scene
 from asp_env.data.source import Recordings
-from asp_env.envs.episodes import Outcome, ReplayEpisodes, Start, as_actions
+from asp_env.envs.episodes import Outcome, ReplayEpisodes, as_actions
 from asp_env.errors import AspEnvError
 from asp_env.render.frames import draw_frame
 from asp_env.sim.replay import ReplayWorld
@@ -28,7 +28,9 @@ class EnvSnapshot:
     with the same arguments gets to the same state by driving there.
     """
 
-    start: Start
+    scenario: Scenario
+    rng: dict[str, Any]
+    """State of the episode's own generator at its start."""
     actions: Float[np.ndarray, "steps 2"]
     """Since the start, in [-1, 1]."""
     generator: dict[str, Any]
@@ -100,7 +102,8 @@ width m |
         self.observation_space = self._episodes.observer.space
         self.action_space = self._episodes.action_space
         self._running = False
-        self._start: Start | None = None
+        self._start: tuple[Scenario, dict[str, Any]] | None = None
+        """The scenario, and the state of its generator when it began."""
         self._actions: list[Float[np.ndarray, " 2"]] = []
 
     def reset(
@@ -117,7 +120,7 @@ width m |
             AspEnvError: an option is unknown, or what it asks for does not exist.
         """
         super().reset(seed=seed)
-        self._begin(self._episodes.draw(self.np_random, options or {}))
+        self._begin(*self._episodes.draw(self.np_random, options or {}))
         self._running = True
         return self._observe(), self._info()
 
@@ -148,7 +151,8 @@ width m |
         if self._start is None:
             raise gymnasium.error.ResetNeeded(NOT_BEGUN)
         return EnvSnapshot(
-            start=self._start,
+            scenario=self._start[0],
+            rng=self._start[1],
             actions=np.array(self._actions, dtype=np.float32).reshape(-1, 2),
             generator=self.np_random.bit_generator.state,
             seed=self._np_random_seed,
@@ -162,12 +166,15 @@ width m |
         What comes after is the same bit for bit.
         """
         if snapshot.arrays is None:
-            self._begin(snapshot.start)
+            rng = np.random.default_rng()
+            rng.bit_generator.state = snapshot.rng
+            self._begin(snapshot.scenario, rng)
             for action in snapshot.actions:
                 self._act(action)
         else:
             self._episodes.restore(snapshot.arrays)
-            self._start, self._actions = snapshot.start, list(snapshot.actions)
+            self._start = snapshot.scenario, snapshot.rng
+            self._actions = list(snapshot.actions)
         self.np_random.bit_generator.state = snapshot.generator
         self._np_random_seed = snapshot.seed
         self._running = snapshot.running
@@ -198,9 +205,9 @@ width m |
         """Those that are drawn from."""
         return self._episodes.scenarios
 
-    def _begin(self, start: Start) -> None:
-        self._episodes.begin({0: start})
-        self._start, self._actions = start, []
+    def _begin(self, scenario: Scenario, rng: np.random.Generator) -> None:
+        self._start, self._actions = (scenario, rng.bit_generator.state), []
+        self._episodes.begin([scenario], [rng], np.ones(1, dtype=bool))
 
     def _act(self, action: Float[np.ndarray, " 2"]) -> Outcome:
         self._actions.append(action)

@@ -214,10 +214,11 @@ class ReplayVectorEnv(VectorEnv[Observation, Any, np.ndarray]):
         return generator
 
     def _begin(self, where: Bool[np.ndarray, " n"], options: Sequence[dict[str, Any]]) -> None:
-        chosen = np.flatnonzero(where).tolist()
-        self._episodes.begin(
-            {b: self._episodes.draw(self._generator(b), options[b]) for b in chosen}
-        )
+        world = self._episodes.simulation.world
+        scenarios, rngs = list(world.scenarios), list(world.rngs)
+        for b in np.flatnonzero(where).tolist():
+            scenarios[b], rngs[b] = self._episodes.draw(self._generator(b), options[b])
+        self._episodes.begin(scenarios, rngs, where)
         self._begun |= where
         self._over &= ~where
 
