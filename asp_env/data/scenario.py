@@ -39,8 +39,9 @@ class Scenario:
 
     @property
     def name(self) -> str:
-        """A readable name, unique within the source."""
-        return f"{self.recording_name}-{self.ego_id}-{self.start_tick}"
+        """A readable name, unique within the source, which may be a file's."""
+        place = self.recording_name.replace("/", "_")
+        return f"{place}-{self.ego_id}-{self.start_tick}"
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

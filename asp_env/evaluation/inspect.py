@@ -50,7 +50,7 @@ class Inspect:
     """Show recordings, tracks, classes, maps, snippet counts, drift floor, and every fault."""
 
     data: Annotated[tyro.conf.Positional[str], tyro.conf.arg(metavar="DATA")]
-    """A folder in the inD/rounD layout, `sample:SITE` or `synthetic:SITE`."""
+    """A folder in the inD/rounD or INTERACTION layout, `sample:SITE` or `synthetic:SITE`."""
     dt: float = DEFAULT_DT_S
     """Time step in seconds; it must divide the recordings' frame rate."""
 
