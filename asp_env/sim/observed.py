@@ -168,7 +168,7 @@ def _field_bounds(names: tuple[str, ...]) -> tuple[np.ndarray, np.ndarray]:
     """Of the fields of agents or lines; all but some lie between 0 and 1."""
     wide = {"x": FARTHEST_M, "y": FARTHEST_M, "cos": 1.0, "sin": 1.0, "speed": FASTEST_MPS}
     sizes = {"length": STATE_FIELDS["length_m"][1], "width": STATE_FIELDS["width_m"][1]}
-    low = [-wide.get(name, 0.0) for name in names]
+    low = [-wide[name] if name in wide else 0.0 for name in names]
     return np.array(low), np.array([wide.get(name, sizes.get(name, 1.0)) for name in names])
 
 
@@ -203,8 +203,8 @@ def _clip(rows, low, high):
         row = rows[t]
         for i in range(len(low)):
             value, least, most = row[i], low[i], high[i]
-            value = value if value > least else least
-            row[i] = value if value < most else most
+            value = value if value >= least else least
+            row[i] = value if value <= most else most
 
 
 @njit(cache=True)
