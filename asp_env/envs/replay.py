@@ -1,5 +1,6 @@
 """`asp_env/Replay-v0`: drive one vehicle of a recording."""
 
+from collections.abc import Mapping
 from dataclasses import dataclass, fields
 from functools import partial
 from typing import Any
@@ -29,11 +30,11 @@ class EnvSnapshot:
     """
 
     scenario: Scenario
-    rng: dict[str, Any]
+    rng: Mapping[str, Any]
     """State of the episode's own generator at its start."""
     actions: Float[np.ndarray, "steps 2"]
     """Since the start, in [-1, 1]."""
-    generator: dict[str, Any]
+    generator: Mapping[str, Any]
     """State of `np_random`."""
     seed: int | None
     running: bool
@@ -58,8 +59,8 @@ class ReplayEnv(gymnasium.Env[dict[str, Any], Any]):
 
     | name | parts and spaces | what it is |
     |---|---|---|
-    | `raster` | `raster`: `Box(0, 255, (12, H, W), uint8)` | the picture that `view` draws, heading \
-up, see `asp_env.views` |
+    | `raster` | `raster`: `Box(0, 255, (12, H, W), uint8)` | the picture that `view` draws, \
+heading up, see `asp_env.views` |
     | `chauffeurnet`, `mtp`, … | a part of that name | the picture of that view in its usual size, \
 beside or instead of `raster` |
     | `vectors` | `agents`: `Box(…, (16, 16, 12), float32)` | the ego and its nearest neighbours \
@@ -123,7 +124,7 @@ way, in its frame, m; beyond the end of the way straight on |
         self.observation_space = self._episodes.observer.space
         self.action_space = self._episodes.action_space
         self._running = False
-        self._start: tuple[Scenario, dict[str, Any]] | None = None
+        self._start: tuple[Scenario, Mapping[str, Any]] | None = None
         """The scenario, and the state of its generator when it began."""
         self._actions: list[Float[np.ndarray, " 2"]] = []
 
