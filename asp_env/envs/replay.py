@@ -97,7 +97,7 @@ way, in its frame, m; beyond the end of the way straight on |
     `asp_env.envs.episodes.ReplayOptions`: `observations`, `view` and `raster_px` (height, width;
     by default the view's own) of the raster, `traffic` (`log`, `log-actions`, `idm`, … or a table
     of them), `dt_s` (length of a tick), `reward_weights` by name, where they differ from the
-    defaults, and `scenarios` (tags that all must have, or a set of scenarios).
+    defaults, and `scenarios` (a set of them, or a filter such as `left,length>=8`).
 
     ## Going back
     `snapshot()` and `restore()` on `env.unwrapped` bring back the whole state bit for bit, that of
