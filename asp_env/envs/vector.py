@@ -59,6 +59,8 @@ class ReplayVectorEnv(VectorEnv[Observation, Any, np.ndarray]):
         """
         if num_envs < 1:
             raise AspEnvError(f"num_envs {num_envs}: expected at least 1")
+        if render_mode not in (None, "rgb_array"):
+            raise AspEnvError(f"render mode {render_mode!r}: expected rgb_array or None")
         self.num_envs = num_envs
         self._mode = _autoreset_mode(autoreset_mode)
         self.metadata = {**self.metadata, "autoreset_mode": self._mode}
@@ -197,14 +199,16 @@ class ReplayVectorEnv(VectorEnv[Observation, Any, np.ndarray]):
         return self._episodes.scenarios
 
     @property
-    def np_random(self) -> tuple[np.random.Generator, ...]:
-        """The generator of each environment."""
+    def np_random(self) -> tuple[np.random.Generator, ...]:  # pyright: ignore[reportIncompatibleMethodOverride]
+        """The generator of each environment, as of `SyncVectorEnv`."""
         return tuple(self._generator(b) for b in range(self.num_envs))
 
     @property
-    def np_random_seed(self) -> tuple[int | None, ...]:
-        """The seed of each environment's generator."""
-        return tuple(self._seeds[b] for b in range(self.num_envs) if self._generator(b))
+    def np_random_seed(self) -> tuple[int | None, ...]:  # pyright: ignore[reportIncompatibleMethodOverride]
+        """The seed of each environment's generator, as of `SyncVectorEnv`."""
+        for b in range(self.num_envs):
+            self._generator(b)
+        return tuple(self._seeds)
 
     def _generator(self, b: int) -> np.random.Generator:
         generator = self._generators[b]
