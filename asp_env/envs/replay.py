@@ -7,18 +7,19 @@ from typing import Any
 
 import gymnasium
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Float, Shaped
 
+from asp_env.data.forecast import Forecast
+from asp_env.data.recording import Background
 from asp_env.data.scenario import Scenario, ScenarioSet
 from asp_env.data.scene import Scene
 from asp_env.data.source import Recordings
 from asp_env.envs.episodes import Outcome, ReplayEpisodes, as_actions
-from asp_env.errors import AspEnvError
-from asp_env.render.frames import draw_frame
+from asp_env.render.live import MODES, Live
 from asp_env.sim.replay import ReplayWorld
 
 NOT_BEGUN = "no episode has begun: call reset first"
-METADATA = {"render_modes": ["rgb_array"], "render_fps": 5}
+METADATA = {"render_modes": [*MODES], "render_fps": 5}
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -103,6 +104,10 @@ way, in its frame, m; beyond the end of the way straight on |
     `snapshot()` and `restore()` on `env.unwrapped` bring back the whole state bit for bit, that of
     `np_random` included, for search and counterfactuals; snapshots can be pickled.
 
+    ## Rendering
+    `render_mode`: `rgb_array`, a picture from above of 80 m by 80 m, or `human`, a window that
+    keeps up with the episode (extra `render`). `show` adds a forecast and a plan.
+
     ## Version history
     v0: first.
     """
@@ -117,8 +122,6 @@ way, in its frame, m; beyond the end of the way straight on |
         Raises:
             AspEnvError: an argument is not understood, or the data hold no scenario.
         """
-        if render_mode is not None and render_mode not in self.metadata["render_modes"]:
-            raise AspEnvError(f"render mode {render_mode!r}: expected rgb_array or None")
         self.render_mode = render_mode
         self._episodes = ReplayEpisodes(data, options, 1)
         self.observation_space = self._episodes.observer.space
@@ -127,6 +130,9 @@ way, in its frame, m; beyond the end of the way straight on |
         self._start: tuple[Scenario, Mapping[str, Any]] | None = None
         """The scenario, and the state of its generator when it began."""
         self._actions: list[Float[np.ndarray, " 2"]] = []
+        dt_s = self._episodes.simulation.world.dt_s
+        self.metadata = {**METADATA, "render_fps": round(1 / dt_s, 6)}
+        self._live = Live(render_mode, title=f"asp-env: {data}", dt_s=dt_s)
 
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
@@ -144,6 +150,8 @@ way, in its frame, m; beyond the end of the way straight on |
         super().reset(seed=seed)
         self._begin(*self._episodes.draw(self.np_random, options or {}))
         self._running = True
+        self._live.forget()
+        self._keep_up()
         return self._observe(), self._info()
 
     def step(self, action: Any) -> tuple[dict[str, Any], float, bool, bool, dict[str, Any]]:
@@ -162,6 +170,7 @@ way, in its frame, m; beyond the end of the way straight on |
             "reward_terms": {name: float(value[0]) for name, value in outcome.terms.items()},
             "ending": outcome.ending[0],
         }
+        self._keep_up()
         return self._observe(), float(outcome.reward[0]), terminated, truncated, info
 
     def snapshot(self) -> EnvSnapshot:
@@ -200,6 +209,7 @@ way, in its frame, m; beyond the end of the way straight on |
         self.np_random.bit_generator.state = snapshot.generator
         self._np_random_seed = snapshot.seed
         self._running = snapshot.running
+        self._live.forget()
 
     def scene(self) -> Scene:
         """All that may be known now, for a predictor in anybody's loop; the ego is slot 0.
@@ -209,13 +219,44 @@ way, in its frame, m; beyond the end of the way straight on |
         """
         return self._world().scene()
 
+    def show(
+        self, *, forecast: Forecast | None = None, plan: Shaped[np.ndarray, "..."] | None = None
+    ) -> None:
+        """Hands over what to draw besides, until the next time; `reset` forgets it.
+
+        Args:
+            forecast: of `scene()`. Later pictures show what is still to come of it.
+            plan: the ego's positions at the next ticks, metres, in the first two columns.
+
+        Raises:
+            gymnasium.error.ResetNeeded: no episode has begun.
+            AspEnvError: it is not of this scene, or not finite.
+        """
+        self._live.tell(self.scene(), forecast, plan)
+        if self.render_mode == "human":
+            self.render()
+
     def render(self) -> Any:
-        """An RGB picture uint8 (H, W, 3) from above in mode `rgb_array`, else None."""
+        """A picture from above: RGB uint8 (H, W, 3) in mode `rgb_array`, on screen in `human`.
+
+        Raises:
+            gymnasium.error.ResetNeeded: no episode has begun.
+            AspEnvError: there is no screen.
+        """
         if self.render_mode is None:
             return None
-        scene = self.scene()
-        recording = self.recordings[int(self._world().episodes.recording[0])]
-        return draw_frame(scene, background=recording.background)
+        return self._live.render(self.scene(), self._background())
+
+    def close(self) -> None:
+        """Closes the window, if there is one."""
+        self._live.close()
+
+    def _keep_up(self) -> None:
+        if self.render_mode == "human":
+            self._live.keep_up(self.scene(), self._background())
+
+    def _background(self) -> Background | None:
+        return self.recordings[int(self._world().episodes.recording[0])].background
 
     @property
     def recordings(self) -> Recordings:

@@ -1,4 +1,4 @@
-"""Oriented boxes against each other, compiled: contacts of the ego and time to collision."""
+"""Oriented boxes against each other, compiled: contacts of the ego, and of forecasts."""
 
 import math
 from enum import IntEnum
@@ -17,9 +17,6 @@ STANDING_MPS = 0.05
 BEHIND_RAD = math.radians(150.0)
 """Beyond this angle to the ego's heading, seen from its rear axle, somebody is behind it."""
 
-TTC_STEP_S = 0.1
-TTC_HORIZON_S = 3.0
-
 
 class Contact(IntEnum):
     """How the ego's box meets another one; of several that hold, the first, as in nuPlan.
@@ -37,8 +34,8 @@ class Contact(IntEnum):
 
 
 AT_FAULT = (Contact.OTHER_STANDS, Contact.FRONT, Contact.SIDE)
-"""Contacts the ego answers for. nuPlan counts a side contact only while the ego is in several
-lanes; here it always counts, which is stricter."""
+"""Contacts the ego may answer for. By nuPlan's rule a side contact is its fault only while it is in
+several lanes or off the road; that is for a preset to say."""
 
 TOWING = (
     *(AgentClass.CAR, AgentClass.VAN, AgentClass.TRUCK),
@@ -161,55 +158,6 @@ def touching_trailers(
     """Trailers whose box overlaps that of the ego (slot 0), if the ego's class may tow one."""
     trailers = (classes == AgentClass.TRAILER) & np.isin(classes[:, :1], TOWING)
     return trailers & (ego_contacts(states, sizes, valid) > 0)
-
-
-@njit(cache=True)
-@no_type_check
-def _ttc(states, sizes, valid, touching, out):
-    steps = round(TTC_HORIZON_S / TTC_STEP_S)
-    for b in range(states.shape[0]):
-        out[b] = np.inf
-        if not valid[b, 0] or abs(states[b, 0, 3]) <= STANDING_MPS:
-            continue
-        ego, size = states[b, 0], sizes[b, 0]
-        vx, vy = ego[3] * math.cos(ego[2]), ego[3] * math.sin(ego[2])
-        for a in range(1, states.shape[1]):
-            if not valid[b, a] or touching[b, a]:
-                continue
-            other, size_o = states[b, a], sizes[b, a]
-            dx, dy = other[0] - ego[0], other[1] - ego[1]
-            if dx * math.cos(ego[2]) + dy * math.sin(ego[2]) < -0.5 * size[0]:
-                continue
-            vxo, vyo = other[3] * math.cos(other[2]), other[3] * math.sin(other[2])
-            for k in range(1, steps + 1):
-                t = k * TTC_STEP_S
-                if t >= out[b]:
-                    break
-                if overlaps(
-                    ego[0] + t * vx, ego[1] + t * vy, ego[2], size[0], size[1],
-                    other[0] + t * vxo, other[1] + t * vyo, other[2], size_o[0], size_o[1],
-                ):  # fmt: skip
-                    out[b] = t
-                    break
-
-
-def time_to_collision(
-    states: Float[np.ndarray, "b a 4"],
-    sizes: Float[np.ndarray, "b a 2"],
-    valid: Bool[np.ndarray, "b a"],
-    touching: Bool[np.ndarray, "b a"],
-) -> Float[np.ndarray, " b"]:
-    """Seconds until the ego (slot 0) meets anybody if all keep heading and speed; else infinity.
-
-    nuPlan's rule: steps of 0.1 s up to 3 s; a standing ego has no time to collision. Agents that
-    the ego touches now, and those whose centre is behind its rear bumper, are left out; everybody
-    else counts. That is stricter than nuPlan, where only those within 30° ahead count everywhere,
-    those beside only at intersections or while the ego is between lanes, and who has ever touched
-    the ego not at all.
-    """
-    out = np.zeros(len(states), dtype=np.float64)
-    _ttc(states, sizes, valid, touching, out)
-    return out
 
 
 @njit(cache=True, nogil=True)

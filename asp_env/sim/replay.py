@@ -188,7 +188,13 @@ class ReplayWorld:
         data = self.episodes
         return Events(
             contacts=data.contacts.copy(),
-            off_road_m=outside_now_m(*self.maps(), self.ego_states(), data.sizes[:, EGO]),
+            off_road_m=outside_now_m(
+                *self.maps(),
+                self.ego_states(),
+                data.sizes[:, EGO],
+                data.on_route,
+                data.log_off_road_m,
+            ),
             route_m=data.on_route[:, 0].copy(),
             route_offset_m=data.on_route[:, 1].copy(),
             route_heading_rad=data.on_route[:, 2].copy(),
