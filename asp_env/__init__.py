@@ -11,4 +11,8 @@ from asp_env.errors import AspEnvError
 
 __all__ = ["AspEnvError", "FlatParts", "load"]
 
-gymnasium.register(id="asp_env/Replay-v0", entry_point="asp_env.envs.replay:ReplayEnv")
+gymnasium.register(
+    id="asp_env/Replay-v0",
+    entry_point="asp_env.envs.replay:ReplayEnv",
+    vector_entry_point="asp_env.envs.vector:ReplayVectorEnv",
+)

@@ -19,7 +19,7 @@ import numpy as np
 
 from asp_env.errors import DataError
 
-FORMAT = 3
+FORMAT = 4
 """Raise whenever a reader makes something else of the same files."""
 
 _MAGIC = b"asp-env\0"

@@ -1,10 +1,10 @@
 """What the road looks like at one place, in its recording's metric frame."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from enum import IntEnum
 
 import numpy as np
-from jaxtyping import Float, Int
+from jaxtyping import Bool, Float, Int
 
 from asp_env.errors import DataError
 
@@ -51,7 +51,7 @@ class Ragged:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class RoadMap:
-    """Boundary and lane lines, drivable area, and lane centre lines with their successors."""
+    """Boundary and lane lines, drivable area, and lanes with their successors."""
 
     name: str
     lines: Ragged
@@ -64,6 +64,14 @@ class RoadMap:
     """Centre lines of the lanes for vehicles, in the direction of travel."""
     successors: Int[np.ndarray, "edges 2"]
     """(lane, next lane) as indices into `lanes`."""
+    areas: Ragged = field(default_factory=lambda: Ragged.pack([]))
+    """Ring, not closed, of what each lane covers; none at all where only centre lines are known."""
+    two_way: Bool[np.ndarray, " areas"] = field(default_factory=lambda: np.zeros(0, dtype=bool))
+    """Lanes that may be driven in both directions."""
+    limits_mps: Float[np.ndarray, " areas"] = field(default_factory=lambda: np.zeros(0))
+    """Speed limit of each lane, where `limited`."""
+    limited: Bool[np.ndarray, " areas"] = field(default_factory=lambda: np.zeros(0, dtype=bool))
+    """Lanes whose speed limit the map tells."""
     repairs: tuple[str, ...] = ()
     """What the reader had to mend, one line each."""
 
@@ -81,6 +89,12 @@ class RoadMap:
             raise DataError(
                 f"map {self.name}: a successor names lane {self.successors.max()} "
                 f"of {len(self.lanes)}"
+            )
+        told = {len(self.areas), len(self.two_way), len(self.limits_mps), len(self.limited)}
+        if told not in ({0}, {len(self.lanes)}):
+            raise DataError(
+                f"map {self.name}: {sorted(told)} areas, directions and limits of lanes; expected "
+                f"one of each for all {len(self.lanes)} lanes, or none"
             )
 
     @property

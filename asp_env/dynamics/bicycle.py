@@ -27,8 +27,12 @@ _MAX_SIN_SLIP = math.sin(math.atan(0.5 * math.tan(MAX_STEERING_RAD)))
 
 
 def wrap_angle(angle_rad: Any) -> Any:
-    """The same angle in [-π, π); π itself only where rounding says so."""
-    return (angle_rad + math.pi) % (2 * math.pi) - math.pi
+    """The same angle in [-π, π); π itself only where rounding says so.
+
+    One that lies there already stays as it is, bit for bit.
+    """
+    turns = namespace(angle_rad).floor((angle_rad + math.pi) / (2 * math.pi))
+    return angle_rad - 2 * math.pi * turns
 
 
 def forward(
@@ -83,16 +87,16 @@ def _integrate(
     rear_m = (AXLE_SHARE_OF_LENGTH * lengths_m)[..., None]
     slip = xp.arctan(0.5 * xp.tan(actions[..., 1]))
     speed_0 = states[..., 3:4]
-    speed_after = speed_0 + xp.cumsum(actions[..., 0] * dt_s, axis=-1)
+    speed_after = speed_0 + _running_sum(actions[..., 0] * dt_s)
     if not reverse:
         speed_after = speed_after - xp.clip(_running_minimum(speed_after), None, 0.0)
-    speed_before = xp.concatenate([speed_0, speed_after[..., :-1]], axis=-1)
+    speed_before = _before(speed_0, speed_after)
 
     turn = xp.sin(slip) / rear_m * dt_s  # heading change per unit of speed
     mean = speed_before if integrator == "euler" else 0.5 * (speed_before + speed_after)
     heading_0 = states[..., 2:3]
-    heading_after = heading_0 + xp.cumsum(mean * turn, axis=-1)
-    heading_before = xp.concatenate([heading_0, heading_after[..., :-1]], axis=-1)
+    heading_after = heading_0 + _running_sum(mean * turn)
+    heading_before = _before(heading_0, heading_after)
 
     course = heading_before + slip
     step_x = speed_before * xp.cos(course)
@@ -101,12 +105,26 @@ def _integrate(
         end_course = course + speed_before * turn
         step_x = 0.5 * (step_x + speed_after * xp.cos(end_course))
         step_y = 0.5 * (step_y + speed_after * xp.sin(end_course))
-    x = states[..., 0:1] + xp.cumsum(step_x * dt_s, axis=-1)
-    y = states[..., 1:2] + xp.cumsum(step_y * dt_s, axis=-1)
+    x = states[..., 0:1] + _running_sum(step_x * dt_s)
+    y = states[..., 1:2] + _running_sum(step_y * dt_s)
     return xp.stack([x, y, wrap_angle(heading_after), speed_after], axis=-1)
 
 
+def _before(first: Any, after: Any) -> Any:
+    """The values at the beginning of each step."""
+    if after.shape[-1] == 1:
+        return first
+    return namespace(first).concatenate([first, after[..., :-1]], axis=-1)
+
+
+def _running_sum(values: Any) -> Any:
+    """Sums over the steps; a single step, which is most calls, needs none."""
+    return values if values.shape[-1] == 1 else namespace(values).cumsum(values, axis=-1)
+
+
 def _running_minimum(values: Any) -> Any:
+    if values.shape[-1] == 1:
+        return values
     xp = namespace(values)
     if xp is np:
         return np.minimum.accumulate(values, axis=-1)

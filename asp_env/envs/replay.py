@@ -1,30 +1,29 @@
 """`asp_env/Replay-v0`: drive one vehicle of a recording."""
 
-from collections.abc import Sequence
+from dataclasses import dataclass
 from typing import Any
 
 import gymnasium
 import numpy as np
-from gymnasium import spaces
-from jaxtyping import Shaped
 
-from asp_env.data.clock import DEFAULT_DT_S, ticks
-from asp_env.data.scenario import find_scenarios
 from asp_env.data.scene import Scene
-from asp_env.data.snippets import HISTORY_S
-from asp_env.data.source import open_data
-from asp_env.dynamics import MAX_ACCELERATION_MPS2, MAX_STEERING_RAD
+from asp_env.envs.episodes import ReplayEpisodes, as_actions
 from asp_env.errors import AspEnvError
 from asp_env.render.frames import draw_frame
-from asp_env.sim.drivers import make_driver
-from asp_env.sim.observation import Observer
-from asp_env.sim.reward import reward_terms, weighted_sum, weights_from
-from asp_env.sim.simulation import Simulation, ending
-from asp_env.sim.world import Ending
-from asp_env.views import make_picture_view
+from asp_env.sim.replay import ReplayWorld
 
 METADATA = {"render_modes": ["rgb_array"], "render_fps": 5}
-FAILURES = (Ending.COLLISION, Ending.OFF_ROAD)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class EnvSnapshot:
+    """The whole state of an environment: small, picklable, without recordings and pictures."""
+
+    episodes: Any
+    generator: dict[str, Any]
+    """State of `np_random`."""
+    seed: int | None
+    running: bool
 
 
 class ReplayEnv(gymnasium.Env[dict[str, Any], Any]):
@@ -70,16 +69,7 @@ width m |
     metadata = METADATA
 
     def __init__(
-        self,
-        data: str = "sample:intersection",
-        *,
-        observations: Sequence[str] = ("raster", "actions", "state"),
-        view: str = "chauffeurnet",
-        raster_px: tuple[int, int] = (360, 240),
-        traffic: str = "log",
-        dt_s: float = DEFAULT_DT_S,
-        reward_weights: dict[str, float] | None = None,
-        render_mode: str | None = None,
+        self, data: str = "sample:intersection", *, render_mode: str | None = None, **options: Any
     ) -> None:
         """See the class documentation for the arguments.
 
@@ -89,47 +79,31 @@ width m |
         if render_mode is not None and render_mode not in self.metadata["render_modes"]:
             raise AspEnvError(f"render mode {render_mode!r}: expected rgb_array or None")
         self.render_mode = render_mode
-        history = ticks(HISTORY_S, dt_s)
-        self.recordings = open_data(data)
-        self.scenarios = find_scenarios(self.recordings, source=data, dt_s=dt_s, history=history)
-        if not len(self.scenarios):
-            raise AspEnvError(
-                f"{data}: no vehicle covers 10 m in 4 s after 3 s of history; use other recordings"
-            )
-        self._observer = Observer(observations, make_picture_view(view, pixels=raster_px), history)
-        self._simulation = Simulation(
-            self.recordings, make_driver(traffic), num_episodes=1, dt_s=dt_s, history=history
-        )
-        self._weights = weights_from(reward_weights or {})
+        self._episodes = ReplayEpisodes(data, options, 1)
+        self.recordings = self._episodes.recordings
+        self.scenarios = self._episodes.scenarios
+        self.observation_space = self._episodes.observer.space
+        self.action_space = self._episodes.action_space
         self._running = False
-        self.observation_space = self._observer.space
-        self.action_space = spaces.Box(-1.0, 1.0, (2,), dtype=np.float32)
 
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
     ) -> tuple[dict[str, Any], dict[str, Any]]:
-        """Starts a scenario: the one of `options["scenario"]`, or one drawn with the seed.
+        """Starts the scenario that the options ask for, or one drawn with the seed.
+
+        Args:
+            seed: of `np_random`; never the number of a scenario.
+            options: `scenario` (number or name), `ego` (track id of any vehicle, in the recording
+                of the scenario) and `start_tick` (of the first observation).
 
         Raises:
-            AspEnvError: an option is unknown or out of range.
+            AspEnvError: an option is unknown, or what it asks for does not exist.
         """
         super().reset(seed=seed)
-        unknown = set(options or {}) - {"scenario"}
-        if unknown:
-            raise AspEnvError(f"reset option {sorted(unknown)[0]!r}: expected 'scenario'")
-        drawn = int(self.np_random.integers(len(self.scenarios)))
-        number = (options or {}).get("scenario", drawn)
-        whole = isinstance(number, int | np.integer)
-        if not (whole and 0 <= number < len(self.scenarios)):
-            raise AspEnvError(
-                f"scenario {number}: expected 0 to {len(self.scenarios) - 1} for this data"
-            )
-        rng = np.random.default_rng(self.np_random.integers(2**63))
-        self._simulation.reset([self.scenarios[int(number)]], [rng])
+        scenario, rng = self._episodes.draw(self.np_random, options or {})
+        self._episodes.begin([scenario], [rng], np.ones(1, dtype=bool))
         self._running = True
-        self._events = self._simulation.world.events()
-        scene = self.scene()
-        return self._observe(scene), self._info()
+        return self._observe(), self._info()
 
     def step(self, action: Any) -> tuple[dict[str, Any], float, bool, bool, dict[str, Any]]:
         """One tick; the action is moved to the nearest one in the space.
@@ -140,23 +114,38 @@ width m |
         """
         if not self._running:
             raise gymnasium.error.ResetNeeded("the episode is over: call reset before step")
-        given = _two_numbers(action)
-        limits = np.array([MAX_ACCELERATION_MPS2, MAX_STEERING_RAD], dtype=np.float32)
-        world = self._simulation.world
-        states_before, before = world.ego_states(), self._events
-        self._simulation.step(np.clip(given, -1, 1)[None] * limits, np.ones(1, dtype=bool))
-        self._events = world.events()
-        terms = reward_terms(before, self._events, states_before, world.ego_states(), world.dt_s)
-        why = Ending(int(ending(self._events)[0]))
-        terminated = why in (*FAILURES, Ending.GOAL)
-        truncated = why is Ending.OUT_OF_DATA
+        outcome = self._episodes.step(as_actions(action, (2,))[None])
+        terminated, truncated = bool(outcome.terminated[0]), bool(outcome.truncated[0])
         self._running = not (terminated or truncated)
         info = self._info() | {
-            "reward_terms": {name: float(value[0]) for name, value in terms.items()},
-            "ending": why.name,
+            "reward_terms": {name: float(value[0]) for name, value in outcome.terms.items()},
+            "ending": outcome.ending[0],
         }
-        reward = float(weighted_sum(terms, self._weights)[0])
-        return self._observe(self.scene()), reward, terminated, truncated, info
+        return self._observe(), float(outcome.reward[0]), terminated, truncated, info
+
+    def snapshot(self) -> EnvSnapshot:
+        """The whole state with that of `np_random`, to be handed to `restore`.
+
+        Raises:
+            gymnasium.error.ResetNeeded: no episode has begun.
+        """
+        self._world()
+        return EnvSnapshot(
+            episodes=self._episodes.snapshot(),
+            generator=self.np_random.bit_generator.state,
+            seed=self._np_random_seed,
+            running=self._running,
+        )
+
+    def restore(self, snapshot: EnvSnapshot) -> None:
+        """Goes back to a snapshot of this environment or of one made with the same arguments.
+
+        What comes after is the same bit for bit.
+        """
+        self._episodes.restore(snapshot.episodes)
+        self.np_random.bit_generator.state = snapshot.generator
+        self._np_random_seed = snapshot.seed
+        self._running = snapshot.running
 
     def scene(self) -> Scene:
         """All that may be known now, for a predictor in anybody's loop; the ego is slot 0.
@@ -164,44 +153,24 @@ width m |
         Raises:
             gymnasium.error.ResetNeeded: no episode has begun.
         """
-        if self._simulation.world.scenarios[0] is None:
-            raise gymnasium.error.ResetNeeded("no episode has begun: call reset first")
-        return self._simulation.world.scene()
+        return self._world().scene()
 
     def render(self) -> Any:
         """An RGB picture uint8 (H, W, 3) from above in mode `rgb_array`, else None."""
         if self.render_mode is None:
             return None
         scene = self.scene()
-        recording = self.recordings[int(self._simulation.world.episodes.recording[0])]
+        recording = self.recordings[int(self._world().episodes.recording[0])]
         return draw_frame(scene, background=recording.background)
 
-    def _observe(self, scene: Scene) -> dict[str, Any]:
-        observed = self._observer.observe(scene, self._events)
-        return {name: value[0] for name, value in observed.items()}
+    def _observe(self) -> dict[str, Any]:
+        return {name: value[0] for name, value in self._episodes.observe().items()}
 
     def _info(self) -> dict[str, Any]:
-        scenario = self._simulation.world.scenarios[0]
-        assert scenario is not None
-        events = self._events
-        return {
-            "scenario": scenario.name,
-            "tags": scenario.tags,
-            "tick": int(events.elapsed[0]),
-            "progress": float(events.route_m[0] / max(float(events.goal_m[0]), 1.0)),
-            "collision": bool(events.collision[0]),
-            "at_fault": bool(events.at_fault[0]),
-            "off_road_m": float(events.off_road_m[0]),
-        }
+        return {name: value.tolist()[0] for name, value in self._episodes.info().items()}
 
-
-def _two_numbers(action: Any) -> Shaped[np.ndarray, " 2"]:
-    try:
-        given = np.asarray(action, dtype=np.float32)
-    except (TypeError, ValueError):
-        raise AspEnvError("action: expected two finite numbers in [-1, 1]") from None
-    if given.shape != (2,):
-        raise AspEnvError(f"action of shape {given.shape}: expected two numbers in [-1, 1]")
-    if not np.isfinite(given).all():
-        raise AspEnvError(f"action {given.tolist()}: expected finite numbers in [-1, 1]")
-    return given
+    def _world(self) -> ReplayWorld:
+        world = self._episodes.simulation.world
+        if world.scenarios[0] is None:
+            raise gymnasium.error.ResetNeeded("no episode has begun: call reset first")
+        return world

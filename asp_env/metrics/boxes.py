@@ -89,42 +89,58 @@ def is_behind(x, y, heading, length, x_o, y_o):
 
 @njit(cache=True)
 @no_type_check
-def _contact(ego, size, other, other_size):
-    x, y, heading, speed = ego[0], ego[1], ego[2], ego[3]
-    xo, yo, ho, lo, wo = other[0], other[1], other[2], other_size[0], other_size[1]
-    if not overlaps(x, y, heading, size[0], size[1], xo, yo, ho, lo, wo):
+def _contact(x, y, heading, speed, length, width, x_o, y_o, heading_o, speed_o, length_o, width_o):
+    if not overlaps(x, y, heading, length, width, x_o, y_o, heading_o, length_o, width_o):
         return Contact.NONE.value
     if abs(speed) <= STANDING_MPS:
         return Contact.EGO_STANDS.value
-    if abs(other[3]) <= STANDING_MPS:
+    if abs(speed_o) <= STANDING_MPS:
         return Contact.OTHER_STANDS.value
-    if is_behind(x, y, heading, size[0], xo, yo):
+    if is_behind(x, y, heading, length, x_o, y_o):
         return Contact.REAR.value
-    dx, dy = 0.5 * size[0] * math.cos(heading), 0.5 * size[0] * math.sin(heading)
+    x_f, y_f = x + 0.5 * length * math.cos(heading), y + 0.5 * length * math.sin(heading)
     # a bumper is a box without depth
-    if overlaps(x + dx, y + dy, heading, 0.0, size[1], xo, yo, ho, lo, wo):
+    if overlaps(x_f, y_f, heading, 0.0, width, x_o, y_o, heading_o, length_o, width_o):
         return Contact.FRONT.value
     return Contact.SIDE.value
 
 
 @njit(cache=True)
 @no_type_check
-def _contacts(states, sizes, valid, out):
+def _contacts(states, sizes, valid, before, out):
     for b in range(states.shape[0]):
-        for a in range(1, states.shape[1]):
+        x, y, heading, speed = states[b, 0, 0], states[b, 0, 1], states[b, 0, 2], states[b, 0, 3]
+        length, width = sizes[b, 0, 0], sizes[b, 0, 1]
+        for a in range(states.shape[1]):
             out[b, a] = 0
-            if valid[b, 0] and valid[b, a]:
-                out[b, a] = _contact(states[b, 0], sizes[b, 0], states[b, a], sizes[b, a])
+            if a == 0 or not (valid[b, 0] and valid[b, a]):
+                continue
+            dx, dy = states[b, a, 0] - x, states[b, a, 1] - y
+            # no root for the many far away: two boxes reach no further than half their sides' sum
+            reach = 0.5 * (length + width + sizes[b, a, 0] + sizes[b, a, 1])
+            if dx * dx + dy * dy >= reach * reach:
+                continue
+            found = _contact(
+                x, y, heading, speed, length, width,
+                states[b, a, 0], states[b, a, 1], states[b, a, 2], states[b, a, 3],
+                sizes[b, a, 0], sizes[b, a, 1],
+            )  # fmt: skip
+            out[b, a] = before[b, a] if found > 0 and before[b, a] > 0 else found
 
 
 def ego_contacts(
     states: Float[np.ndarray, "b a 4"],
     sizes: Float[np.ndarray, "b a 2"],
     valid: Bool[np.ndarray, "b a"],
+    before: Int[np.ndarray, "b a"] | None = None,
 ) -> Int[np.ndarray, "b a"]:
-    """`Contact` of the ego (slot 0) with every other agent; nuPlan's collision classes."""
+    """`Contact` of the ego (slot 0) with every other agent; nuPlan's collision classes.
+
+    One that lasts keeps the class that it had `before`, a tick ago: as in nuPlan, whose fault it is
+    shows when it begins. Without `before` all begin now.
+    """
     out = np.zeros(valid.shape, dtype=np.int8)
-    _contacts(states, sizes, valid, out)
+    _contacts(states, sizes, valid, out if before is None else before, out)
     return out
 
 

@@ -1,25 +1,23 @@
 """How far outside the drivable area a point lies: a distance field drawn once per map."""
 
 import math
-from collections import OrderedDict
 from dataclasses import dataclass
 from typing import no_type_check
 
 import cv2
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 from numba import njit
 
-from asp_env.data.geometry import box_corners
 from asp_env.data.road_map import RoadMap
 from asp_env.errors import DataError
+from asp_env.metrics.per_map import PerMap
 
 CELL_M = 0.1
 MARGIN_M = 5.0
 OFF_ROAD_M = 0.3
 """nuPlan's tolerance: a corner further outside than this is off the road."""
 
-_KEPT = 32
 _SUBPIXEL_BITS = 8
 
 
@@ -39,35 +37,53 @@ class DrivableField:
         _look_up(self.outside_m, self.origin_m[0], self.origin_m[1], flat, out)
         return out.reshape(points.shape[:-1])
 
+    def corners_m(
+        self,
+        states: Float[np.ndarray, "n 4"],
+        sizes: Float[np.ndarray, "n 2"],
+        chosen: Bool[np.ndarray, " n"],
+        out: Float[np.ndarray, " n"],
+    ) -> None:
+        """Writes how far the outermost corner of each chosen box lies outside, metres."""
+        _outermost(self.outside_m, self.origin_m[0], self.origin_m[1], states, sizes, chosen, out)
+
+
+@njit(cache=True, inline="always")
+@no_type_check
+def _at(grid, x_0, y_0, x, y):
+    column = math.floor((x - x_0) / CELL_M + 0.5)
+    row = math.floor((y - y_0) / CELL_M + 0.5)
+    if 0 <= row < grid.shape[0] and 0 <= column < grid.shape[1]:
+        return grid[row, column]
+    return np.float32(MARGIN_M)
+
 
 @njit(cache=True)
 @no_type_check
 def _look_up(grid, x_0, y_0, points, out):
     for i in range(len(points)):
-        column = math.floor((points[i, 0] - x_0) / CELL_M + 0.5)
-        row = math.floor((points[i, 1] - y_0) / CELL_M + 0.5)
-        if 0 <= row < grid.shape[0] and 0 <= column < grid.shape[1]:
-            out[i] = grid[row, column]
-        else:
-            out[i] = MARGIN_M
+        out[i] = _at(grid, x_0, y_0, points[i, 0], points[i, 1])
 
 
-_fields: OrderedDict[int, tuple[RoadMap, DrivableField]] = OrderedDict()
-
-
-def drivable_field(road_map: RoadMap) -> DrivableField:
-    """The field of a map; the latest maps' fields are kept.
-
-    Raises:
-        DataError: the map has no drivable area.
-    """
-    key = id(road_map)
-    if key not in _fields:
-        _fields[key] = (road_map, _draw(road_map))
-        while len(_fields) > _KEPT:
-            _fields.popitem(last=False)
-    _fields.move_to_end(key)
-    return _fields[key][1]
+@njit(cache=True)
+@no_type_check
+def _outermost(grid, x_0, y_0, states, sizes, chosen, out):
+    for i in range(len(states)):
+        if not chosen[i]:
+            continue
+        x, y = states[i, 0], states[i, 1]
+        cos, sin = 0.5 * math.cos(states[i, 2]), 0.5 * math.sin(states[i, 2])
+        ahead_x, ahead_y = cos * sizes[i, 0], sin * sizes[i, 0]
+        left_x, left_y = -sin * sizes[i, 1], cos * sizes[i, 1]
+        front = max(
+            _at(grid, x_0, y_0, x + ahead_x + left_x, y + ahead_y + left_y),
+            _at(grid, x_0, y_0, x + ahead_x - left_x, y + ahead_y - left_y),
+        )
+        rear = max(
+            _at(grid, x_0, y_0, x - ahead_x + left_x, y - ahead_y + left_y),
+            _at(grid, x_0, y_0, x - ahead_x - left_x, y - ahead_y - left_y),
+        )
+        out[i] = max(front, rear)
 
 
 def _draw(road_map: RoadMap) -> DrivableField:
@@ -87,10 +103,26 @@ def _draw(road_map: RoadMap) -> DrivableField:
     )
 
 
+_fields = PerMap(_draw)
+
+
+def drivable_field(road_map: RoadMap) -> DrivableField:
+    """The field of a map; the latest maps' fields are kept.
+
+    Raises:
+        DataError: the map has no drivable area.
+    """
+    return _fields(road_map)
+
+
 def off_road_m(
     road_map: RoadMap,
     states: Float[np.ndarray, "*batch 4"],
     sizes: Float[np.ndarray, "*batch 2"],
 ) -> Float[np.ndarray, "*batch"]:
     """How far the outermost corner of each box lies outside the drivable area, metres."""
-    return drivable_field(road_map).distance_m(box_corners(states, sizes)).max(axis=-1)
+    flat = np.ascontiguousarray(states.reshape(-1, 4))
+    out = np.empty(len(flat), dtype=np.float32)
+    everybody = np.ones(len(flat), dtype=bool)
+    drivable_field(road_map).corners_m(flat, sizes.reshape(-1, 2), everybody, out)
+    return out.reshape(states.shape[:-1])

@@ -25,25 +25,26 @@ def project(route, count, x, y, near_m, reach_m):
     if near_m >= 0.0:
         first = min(max(0, int(near_m - reach_m)), count - 2)
         last = min(count - 1, max(first + 1, int(near_m + reach_m) + 1))
-    best, arc, offset, heading = np.inf, 0.0, 0.0, 0.0
+    nearest, arc, offset_x, offset_y, nearest_x, nearest_y = np.inf, 0.0, 0.0, 0.0, 1.0, 0.0
     for i in range(first, last):
         ax, ay = route[i, 0], route[i, 1]
         sx, sy = route[i + 1, 0] - ax, route[i + 1, 1] - ay
-        length = math.hypot(sx, sy)
-        if length < 1e-6:
+        square = sx * sx + sy * sy
+        if square < 1e-12:
             continue
-        along = ((x - ax) * sx + (y - ay) * sy) / length
-        low = -np.inf if i == 0 else 0.0  # both ends go on straight
-        high = np.inf if i == count - 2 else length
-        along = min(max(along, low), high)
-        dx, dy = x - ax - along * sx / length, y - ay - along * sy / length
-        distance = math.hypot(dx, dy)
-        if distance < best:
-            best = distance
-            arc = i + along / length
-            offset = math.copysign(distance, sx * dy - sy * dx)
-            heading = math.atan2(sy, sx)
-    return arc, offset, heading
+        share = ((x - ax) * sx + (y - ay) * sy) / square
+        if i > 0:  # both ends go on straight
+            share = max(share, 0.0)
+        if i < count - 2:
+            share = min(share, 1.0)
+        dx, dy = x - ax - share * sx, y - ay - share * sy
+        distance = dx * dx + dy * dy
+        if distance < nearest:
+            nearest, arc = distance, i + share
+            offset_x, offset_y, nearest_x, nearest_y = dx, dy, sx, sy
+    side = nearest_x * offset_y - nearest_y * offset_x
+    offset = math.copysign(math.hypot(offset_x, offset_y), side)
+    return arc, offset, math.atan2(nearest_y, nearest_x)
 
 
 @njit(cache=True)

@@ -13,8 +13,9 @@ from asp_env.data.geometry import route_along
 from asp_env.data.scenario import STANDING_MPS
 from asp_env.dynamics import inverse
 from asp_env.errors import unknown_name
+from asp_env.sim.beginning import BEYOND_M
 from asp_env.sim.idm import IDM, follow_paths, speed_limits
-from asp_env.sim.replay import BEYOND_M, ReplayWorld
+from asp_env.sim.replay import ReplayWorld
 from asp_env.sim.world import EGO
 
 MIN_DESIRED_MPS = 3.0

@@ -10,8 +10,8 @@ from typing import Any, NamedTuple, Protocol, runtime_checkable
 
 import numpy as np
 
-from asp_env.data.scene import Scene
 from asp_env.errors import AspEnvError, unknown_name
+from asp_env.views.drawable import Drawable
 
 _NOTHING: Mapping[str, Any] = MappingProxyType({})
 
@@ -61,7 +61,7 @@ class SceneView(Protocol):
         """Everything that decides the drawing, ready for JSON; `name` among it."""
         ...
 
-    def draw(self, scene: Scene) -> Any:
+    def draw(self, scene: Drawable) -> Any:
         """One drawing per target, in the order of the scene's targets."""
         ...
 
@@ -80,7 +80,7 @@ class PictureView(SceneView, Protocol):
         """Of one picture: channels, height, width."""
         ...
 
-    def draw(self, scene: Scene, out: np.ndarray | None = None) -> np.ndarray:
+    def draw(self, scene: Drawable, out: np.ndarray | None = None) -> np.ndarray:
         """One uint8 picture (targets, *shape) per target, into `out` if given."""
         ...
 
@@ -89,7 +89,7 @@ class PictureView(SceneView, Protocol):
 class BinaryView(PictureView, Protocol):
     """A view whose pictures hold 0 and 255 alone, and can be had as bits."""
 
-    def draw_packed(self, scene: Scene) -> np.ndarray:
+    def draw_packed(self, scene: Drawable) -> np.ndarray:
         """The pictures of `draw` as `packing.pack_bits` packs them."""
         ...
 

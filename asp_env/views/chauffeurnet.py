@@ -28,10 +28,10 @@ from typing import Any, ClassVar, final
 import numpy as np
 from jaxtyping import UInt8
 
-from asp_env.data.scene import Scene
 from asp_env.errors import AspEnvError
 from asp_env.views.boundaries import BOUNDARY_WIDTH_M, MapCache, boundary_pieces
 from asp_env.views.draw import draw_agents, draw_boundaries
+from asp_env.views.drawable import Drawable
 from asp_env.views.placed import memory, place
 from asp_env.views.view import View
 
@@ -119,7 +119,7 @@ class ChauffeurNet:
             )
         return cls(View.from_config(fields), name == NAMES[True])
 
-    def draw(self, scene: Scene, out: np.ndarray | None = None) -> UInt8[np.ndarray, "t 12 h w"]:
+    def draw(self, scene: Drawable, out: np.ndarray | None = None) -> UInt8[np.ndarray, "t 12 h w"]:
         """One picture per target, in the order of `scene.targets`.
 
         Args:
@@ -137,7 +137,7 @@ class ChauffeurNet:
         self._draw(scene, np.empty((0, 0), dtype=np.uint8), out)
         return out
 
-    def draw_packed(self, scene: Scene) -> UInt8[np.ndarray, "t 12 h bytes"]:
+    def draw_packed(self, scene: Drawable) -> UInt8[np.ndarray, "t 12 h bytes"]:
         """What `draw` gives, packed to bits as `asp_env.views.packing` does, and sooner.
 
         Raises:
@@ -148,7 +148,7 @@ class ChauffeurNet:
         self._draw(scene, np.empty((height_px, width_px), dtype=np.uint8), out)
         return out
 
-    def _draw(self, scene: Scene, plane: np.ndarray, out: np.ndarray) -> None:
+    def _draw(self, scene: Drawable, plane: np.ndarray, out: np.ndarray) -> None:
         """Into `out`, by way of `plane` if that is not empty."""
         placed = place(scene, self.view, history=self.history, who=self.name)
         half_width = self.view.half_line_px(BOUNDARY_WIDTH_M)

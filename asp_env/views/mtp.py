@@ -39,11 +39,11 @@ from numba import njit
 
 from asp_env.data.classes import VULNERABLE, AgentClass
 from asp_env.data.road_map import LineType, RoadMap
-from asp_env.data.scene import Scene
 from asp_env.errors import AspEnvError
 from asp_env.views.area import Rings, drivable_rings, fill_rings
 from asp_env.views.boundaries import BOUNDARY_WIDTH_M, MapCache, boundary_pieces
 from asp_env.views.draw import draw_coloured_agents, draw_coloured_lines
+from asp_env.views.drawable import Drawable
 from asp_env.views.placed import memory, place
 from asp_env.views.view import View
 
@@ -193,7 +193,7 @@ class MTP:
             raise AspEnvError(f"configuration of the view {name!r}, expected {cls.name!r}")
         return cls(View.from_config(fields))
 
-    def draw(self, scene: Scene, out: np.ndarray | None = None) -> UInt8[np.ndarray, "t 3 h w"]:
+    def draw(self, scene: Drawable, out: np.ndarray | None = None) -> UInt8[np.ndarray, "t 3 h w"]:
         """One picture per target, in the order of `scene.targets`.
 
         Args:

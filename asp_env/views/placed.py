@@ -5,8 +5,8 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Bool, Float, Float32, Int64, UInt8
 
-from asp_env.data.scene import Scene
 from asp_env.errors import AspEnvError
+from asp_env.views.drawable import Drawable
 from asp_env.views.view import View
 
 
@@ -26,7 +26,7 @@ class Placed(NamedTuple):
     """(column, row) of the target's centre in its picture."""
 
 
-def place(scene: Scene, view: View, *, history: int, who: str) -> Placed:
+def place(scene: Drawable, view: View, *, history: int, who: str) -> Placed:
     """What is drawn of a scene.
 
     Args:

@@ -22,9 +22,9 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 from asp_env.data.classes import AgentClass
-from asp_env.data.scene import Scene
 from asp_env.errors import AspEnvError
 from asp_env.views.boundaries import MapCache
+from asp_env.views.drawable import Drawable
 from asp_env.views.lane_pieces import KINDS, POINTS, LanePieces, lane_pieces
 from asp_env.views.neighbourhood import place_agents, place_lines
 
@@ -162,25 +162,26 @@ class VectorView:
             raise AspEnvError(f"configuration of the view {name!r}, expected {view.name!r}")
         return view
 
-    def draw(self, scene: Scene) -> Vectors:
+    def draw(self, scene: Drawable, out: Vectors | None = None) -> Vectors:
         """What each target sees, in the order of `scene.targets`.
 
         Args:
             scene: with at least 15 past ticks.
+            out: memory to write into, whose former content does not matter; fresh memory where it
+                is not given.
 
         Raises:
-            AspEnvError: the history is too short.
+            AspEnvError: the history is too short, or `out` does not fit.
         """
         if scene.history < self.history:
             raise AspEnvError(
                 f"view {self.name!r} needs {self.history} past ticks, the scene has "
                 f"{scene.history}: take a longer history"
             )
-        shape, count = self.shape, len(scene.targets)
-        agents = np.zeros((count, shape.agents, shape.ticks, shape.agent_fields), dtype=np.float32)
-        agents_valid = np.zeros((count, shape.agents, shape.ticks), dtype=bool)
-        lines = np.zeros((count, shape.lines, shape.points, shape.line_fields), dtype=np.float32)
-        lines_valid = np.zeros((count, shape.lines, shape.points), dtype=bool)
+        shape = self.shape
+        out = self._memory(len(scene.targets), out)
+        for part in out:
+            part.fill(0)
         states = np.ascontiguousarray(scene.states[:, :, -shape.ticks :], dtype=np.float32)
         valid = np.ascontiguousarray(scene.valid[:, :, -shape.ticks :])
         targets = np.ascontiguousarray(scene.targets, dtype=np.int64)
@@ -201,14 +202,34 @@ class VectorView:
             targets,
             frames,
             self.own_past,
-            agents,
-            agents_valid,
+            out.agents,
+            out.agents_valid,
         )
         map_of_target = np.where(known, scene.map_index[situation], -1)
         for index, road_map in enumerate(scene.maps):
             pieces = self._pieces(road_map)
             rows = np.flatnonzero(map_of_target == index)
             place_lines(
-                pieces.middles, pieces.points, pieces.kinds, rows, frames, lines, lines_valid
+                pieces.middles,
+                pieces.points,
+                pieces.kinds,
+                rows,
+                frames,
+                out.lines,
+                out.lines_valid,
             )
-        return Vectors(agents, agents_valid, lines, lines_valid)
+        return out
+
+    def _memory(self, count: int, out: Vectors | None) -> Vectors:
+        """`out`, or fresh memory where there is none."""
+        shape = self.shape
+        agents = (count, shape.agents, shape.ticks)
+        lines = (count, shape.lines, shape.points)
+        shapes = ((*agents, shape.agent_fields), agents, (*lines, shape.line_fields), lines)
+        if out is None:
+            kinds = (np.float32, np.bool_, np.float32, np.bool_)
+            return Vectors(*(np.empty(*each) for each in zip(shapes, kinds, strict=True)))
+        found = tuple(part.shape for part in out)
+        if found != shapes or not all(part.flags.c_contiguous for part in out):
+            raise AspEnvError(f"cannot draw into {found}: give C-contiguous arrays {shapes}")
+        return out

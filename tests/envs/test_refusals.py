@@ -42,11 +42,11 @@ def test_data_that_is_not_there_is_refused(tmp_path):
 @pytest.mark.parametrize(
     ("options", "what"),
     [
-        ({"scenari": 3}, "reset option 'scenari': expected 'scenario'"),
+        ({"scenari": 3}, r"unknown reset option 'scenari' \(did you mean 'scenario'"),
         ({"scenario": 6}, "scenario 6: expected 0 to 5"),
         ({"scenario": -1}, "scenario -1: expected 0 to 5"),
         ({"scenario": 1.5}, "scenario 1.5: expected 0 to 5"),
-        ({"scenario": "first"}, "scenario first: expected 0 to 5"),
+        ({"scenario": "first"}, "unknown scenario 'first'"),
     ],
 )
 def test_a_wrong_reset_option_is_refused(crossing, options, what):
@@ -58,8 +58,8 @@ def test_a_wrong_reset_option_is_refused(crossing, options, what):
 @pytest.mark.parametrize(
     ("action", "what"),
     [
-        (np.array([np.nan, 0.0]), "expected finite numbers"),
-        (np.array([0.0, np.inf]), "expected finite numbers"),
+        (np.array([np.nan, 0.0]), "expected two finite numbers"),
+        (np.array([0.0, np.inf]), "expected two finite numbers"),
         (np.zeros(3), r"shape \(3,\): expected two"),
         (np.zeros((100, 100)), r"shape \(100, 100\): expected two"),
         (0.5, r"shape \(\): expected two"),

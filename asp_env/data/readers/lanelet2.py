@@ -15,7 +15,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 from pyproj import Transformer
 
-from asp_env.data.readers.osm import Osm, Relation, Way, read_osm, shorten
+from asp_env.data.readers.osm import Osm, Relation, Way, read_osm, shorten, speed_mps
 from asp_env.data.road_map import LineType, Ragged, RoadMap
 from asp_env.errors import DataError
 
@@ -65,6 +65,8 @@ class _Lanelet:
     right: Float[np.ndarray, "m 2"]
     centre: Float[np.ndarray, "k 2"] | None
     way_ids: tuple[str, ...]
+    two_way: bool
+    limit_mps: float | None
 
     def turn_around(self) -> None:
         """Exchanges left and right, and with them the direction."""
@@ -102,7 +104,8 @@ def read_lanelet2(path: Path, origin: Origin) -> RoadMap:
     `lines` are the boundaries of what vehicles drive on or over, and whatever else is typed as a
     curb or barrier. A boundary without a type is dashed if two vehicle lanelets share it, since
     both are the road's, and virtual otherwise. `drivable` are vehicle lanelets, crosswalks, and
-    the outer rings of freespace and parking; holes in these are not cut out.
+    the outer rings of freespace and parking; holes in these are not cut out. Lanes may be
+    two-way, and have the limit of their tag `speed_limit` (Lanelet2) or `maxspeed` (OSM).
 
     Raises:
         DataError: the file is no map, or a map without lanelets.
@@ -133,6 +136,10 @@ def read_lanelet2(path: Path, origin: Origin) -> RoadMap:
         drivable=Ragged.pack(rings),
         lanes=Ragged.pack([_centre_line(lanelet) for lanelet in vehicle]),
         successors=_successors(vehicle),
+        areas=Ragged.pack([lanelet.ring for lanelet in vehicle]),
+        two_way=np.array([lanelet.two_way for lanelet in vehicle]),
+        limits_mps=np.array([lanelet.limit_mps or 0.0 for lanelet in vehicle]),
+        limited=np.array([lanelet.limit_mps is not None for lanelet in vehicle]),
         repairs=tuple(repairs),
     )
 
@@ -209,6 +216,8 @@ def _lanelet(
         right=right,
         centre=centre,
         way_ids=tuple(way.id for role in ("left", "right") for way in sides[role]),
+        two_way="no" in (relation.tags.get("one_way"), relation.tags.get("oneway")),
+        limit_mps=speed_mps(relation.tags.get("speed_limit", relation.tags.get("maxspeed", ""))),
     )
 
 

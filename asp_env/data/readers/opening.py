@@ -28,7 +28,8 @@ Entry = tuple[dict[str, Any], dict[str, np.ndarray]]
 """Facts and arrays, as the cache keeps them."""
 
 _TRACK_COLUMNS = ("track_ids", "classes", "sizes", "first_frames", "starts", "states")
-_MAP_PARTS = ("lines", "drivable", "lanes")
+_MAP_PARTS = ("lines", "drivable", "lanes", "areas")
+_MAP_COLUMNS = ("line_types", "successors", "two_way", "limits_mps", "limited")
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -132,16 +133,15 @@ def _road_map(path: Path, origin: Origin) -> RoadMap:
     }
     return RoadMap(
         name=path.stem,
-        line_types=arrays["line_types"],
-        successors=arrays["successors"],
         repairs=tuple(facts["repairs"]),
+        **{name: arrays[name] for name in _MAP_COLUMNS},
         **parts,
     )
 
 
 def _map_entry(path: Path, origin: Origin) -> Entry:
     road_map = read_lanelet2(path, origin)
-    arrays = {"line_types": road_map.line_types, "successors": road_map.successors}
+    arrays = {name: getattr(road_map, name) for name in _MAP_COLUMNS}
     for name in _MAP_PARTS:
         ragged = getattr(road_map, name)
         arrays |= {f"{name}_points": ragged.points, f"{name}_starts": ragged.starts}

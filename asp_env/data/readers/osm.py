@@ -1,11 +1,15 @@
 """OSM XML as it comes: nodes, ways and relations, with whatever had to be overlooked."""
 
+import re
 import xml.etree.ElementTree as ElementTree
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
 from asp_env.errors import DataError
+
+SPEED_UNITS = {"": 1 / 3.6, "km/h": 1 / 3.6, "kmh": 1 / 3.6, "m/s": 1.0, "mph": 0.44704}
+"""In m/s; a number without a unit is in km/h, in Lanelet2 as in OSM."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -109,6 +113,14 @@ def _relation(number: str, element: ElementTree.Element) -> Relation:
         if member.get("type", "way") == "way"
     )
     return Relation(id=number, members=members, tags=_tags(element))
+
+
+def speed_mps(text: str) -> float | None:
+    """A speed as a tag tells it, such as `50 km/h` or `30 mph`; None if it tells none."""
+    match = re.fullmatch(r"(\d+(?:\.\d+)?)\s*([a-z/]*)", text.strip().lower())
+    if match is None or match[2] not in SPEED_UNITS:
+        return None
+    return float(match[1]) * SPEED_UNITS[match[2]]
 
 
 def _complete(

@@ -1,0 +1,92 @@
+"""The compiled inner loops of a replay world: writing a tick, and reading the last few."""
+
+from typing import no_type_check
+
+import numpy as np
+from jaxtyping import Bool, Float, Int
+from numba import njit
+
+from asp_env.sim.episodes import Episodes
+
+
+@njit(cache=True)
+@no_type_check
+def _write_tick(
+    states, valid, log_states, log_valid, gone, rows, now, driven, obeys, moved, everybody
+):
+    at = 0
+    for i in range(len(rows)):
+        b, k = rows[i], now[i] + 1
+        for a in range(valid.shape[2]):
+            mine = obeys[i, a]
+            if mine or everybody:
+                at += 1
+            there = mine or (log_valid[b, k, a] and not driven[i, a])
+            if gone[b, a] or not there:
+                valid[b, k, a] = False
+                states[b, k, a, :] = 0.0
+                continue
+            valid[b, k, a] = True
+            if mine:
+                for field in range(4):
+                    states[b, k, a, field] = moved[at - 1, field]
+            else:
+                for field in range(4):
+                    states[b, k, a, field] = log_states[b, k, a, field]
+
+
+def write_tick(
+    data: Episodes,
+    rows: Int[np.ndarray, " r"],
+    now: Int[np.ndarray, " r"],
+    driven: Bool[np.ndarray, "r a"],
+    obeys: Bool[np.ndarray, "r a"],
+    moved: Float[np.ndarray, "n 4"],
+) -> None:
+    """Writes the tick after `now` of some episodes.
+
+    Args:
+        data: the episodes.
+        rows: which of them.
+        now: the present tick of each.
+        driven: who is not replayed.
+        obeys: which of those are there to be moved.
+        moved: where to, row by row: of everybody, or only of those that obey.
+    """
+    everybody = len(moved) == obeys.size
+    _write_tick(
+        *(data.states, data.valid, data.log_states, data.log_valid, data.gone),
+        *(rows, now, driven, obeys, moved, everybody),
+    )
+
+
+@njit(cache=True)
+@no_type_check
+def _read_window(states, valid, actions, now, out_states, out_valid, out_actions):
+    ticks = out_valid.shape[2]
+    for b in range(len(now)):
+        first = now[b] - ticks + 1
+        for a in range(out_valid.shape[1]):
+            for k in range(ticks):
+                out_valid[b, a, k] = valid[b, first + k, a]
+                for field in range(4):
+                    out_states[b, a, k, field] = states[b, first + k, a, field]
+            for k in range(ticks - 1):
+                out_actions[b, a, k, 0] = actions[b, first + k, a, 0]
+                out_actions[b, a, k, 1] = actions[b, first + k, a, 1]
+
+
+def read_window(
+    data: Episodes, now: Int[np.ndarray, " b"], history: int
+) -> tuple[
+    Float[np.ndarray, "b a ticks 4"],
+    Bool[np.ndarray, "b a ticks"],
+    Float[np.ndarray, "b a ticks-1 2"],
+]:
+    """States, presence and actions of the last `history` ticks and now, agent by agent."""
+    shape = (*data.ids.shape, history + 1)
+    states = np.empty((*shape, 4), dtype=np.float32)
+    valid = np.empty(shape, dtype=bool)
+    actions = np.empty((*shape[:2], history, 2), dtype=np.float32)
+    _read_window(data.states, data.valid, data.actions, now, states, valid, actions)
+    return states, valid, actions

@@ -1,0 +1,60 @@
+"""`ReplayVectorEnv` against Gymnasium's own vector environments over single ones."""
+
+from typing import Any
+
+import gymnasium
+import numpy as np
+import pytest
+from gymnasium.vector import AutoresetMode, SyncVectorEnv, VectorEnv
+
+from tests.envs.same import same
+
+ALL = ("raster", "vectors", "actions", "state", "route")
+COUNT = 5
+
+
+def _batched(data: str, **options: Any) -> VectorEnv:
+    return gymnasium.make_vec(
+        "asp_env/Replay-v0",
+        num_envs=COUNT,
+        vectorization_mode="vector_entry_point",
+        data=data,
+        **{"raster_px": (45, 30), **options},
+    )
+
+
+def _singles(data: str, mode: AutoresetMode, **options: Any) -> SyncVectorEnv:
+    envs = gymnasium.make_vec(
+        "asp_env/Replay-v0",
+        num_envs=COUNT,
+        vectorization_mode="sync",
+        vector_kwargs={"autoreset_mode": mode},
+        data=data,
+        **{"raster_px": (45, 30), **options},
+    )
+    assert isinstance(envs, SyncVectorEnv)
+    return envs
+
+
+def _actions(rng: np.random.Generator) -> np.ndarray:
+    """Full throttle and wild steering, so that all kinds of endings come up."""
+    return rng.uniform((0.0, -0.5), (1.0, 0.5), size=(COUNT, 2)).astype(np.float32)
+
+
+@pytest.mark.parametrize("mode", list(AutoresetMode), ids=lambda mode: mode.value)
+@pytest.mark.parametrize("traffic", ["log", "log-actions", "idm"])
+def test_equals_single_environments_bit_for_bit(crossing, traffic, mode):
+    """Observations, rewards, endings and infos through many autoresets, in every mode."""
+    one = _batched(crossing, traffic=traffic, observations=ALL, autoreset_mode=mode)
+    other = _singles(crossing, mode, traffic=traffic, observations=ALL)
+    same(one.reset(seed=3), other.reset(seed=3))
+    rng, ends = np.random.default_rng(0), 0
+    for _ in range(150):
+        actions = _actions(rng)
+        told = one.step(actions)
+        same(told, other.step(actions))
+        over = told[2] | told[3]
+        ends += int(over.sum())
+        if mode is AutoresetMode.DISABLED and over.any():
+            same(*(envs.reset(options={"reset_mask": over.copy()}) for envs in (one, other)))
+    assert ends > 2 * COUNT
