@@ -1,7 +1,7 @@
 """Recorded traffic in which the vehicles are agents, for PettingZoo."""
 
 from collections.abc import Mapping, Sequence
-from typing import Any
+from typing import Any, ClassVar
 
 import gymnasium
 import numpy as np
@@ -52,7 +52,7 @@ class ParallelReplayEnv(ParallelEnv[str, dict[str, np.ndarray], Any]):
     Those of `ReplayEnv`; others are passed over, since PettingZoo's own test gives one.
     """
 
-    metadata = {**METADATA, "name": "asp_env/ParallelReplay-v0"}
+    metadata: ClassVar[dict[str, Any]] = {**METADATA, "name": "asp_env/ParallelReplay-v0"}
 
     def __init__(
         self,
@@ -245,4 +245,3 @@ class ParallelReplayEnv(ParallelEnv[str, dict[str, np.ndarray], Any]):
         """One plain value for each agent that is there."""
         plain = values.tolist()
         return {name: plain[self._numbers[name]] for name in self.agents}
-

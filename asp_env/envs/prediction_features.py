@@ -9,7 +9,7 @@ from gymnasium import spaces
 from gymnasium.utils import RecordConstructorArgs
 from gymnasium.vector import VectorEnv, VectorObservationWrapper
 from gymnasium.vector.utils import batch_space
-from jaxtyping import Float, Int
+from jaxtyping import Int
 
 from asp_env.data.clock import ticks
 from asp_env.data.forecast import fill_missing
@@ -24,6 +24,8 @@ MAX_AWAY_M = 100.0
 """Forecast positions further ahead, behind or aside than this are shown as this."""
 
 AT_S = (1.0, 2.0, 3.0)
+
+PARTS = ("forecast", "forecast_probabilities", "forecast_valid")
 
 
 @runtime_checkable
@@ -94,9 +96,7 @@ class ForecastParts:
         there = np.zeros((count, agents), dtype=np.float32)
         if len(targets):
             predictor = self.predictor
-            future = (
-                env.recorded_future(scene, predictor.horizon) if predictor.privileged else None
-            )
+            future = env.recorded_future(scene, predictor.horizon) if predictor.privileged else None
             forecast = fill_missing(predictor.predict(scene, future), scene)
             # a stable order, so that equally probable modes stay as the predictor has them
             order = np.argsort(-forecast.log_probs, axis=1, kind="stable")[:, :modes]
@@ -111,9 +111,6 @@ class ForecastParts:
         return {
             name: part.reshape(count, -1) for name, part in zip(self._names, parts, strict=True)
         }
-
-
-PARTS = ("forecast", "forecast_probabilities", "forecast_valid")
 
 
 def nearest_agents(
@@ -229,7 +226,11 @@ class VectorPredictionFeatures(VectorObservationWrapper):
         return observations | self._parts.observe(_scenic(self.env.unwrapped))
 
 
-def _check(predictor: Predictor, horizon: int, dt_s: float, privileged: bool) -> None:
+def _check(predictor: Any, horizon: int, dt_s: float, privileged: bool) -> None:
+    if not isinstance(predictor, Predictor):
+        raise AspEnvError(
+            f"predictor {predictor!r}: expected a name such as 'constant-velocity' or a predictor"
+        )
     if predictor.privileged and not privileged:
         raise AspEnvError(
             f"predictor {predictor.name} is told the recorded future, which no driver knows: "

@@ -7,9 +7,11 @@ import gymnasium
 import numpy as np
 
 from asp_env.data.scene import Scene
+from asp_env.data.snippets import Future
 from asp_env.envs.episodes import ReplayEpisodes, as_actions
 from asp_env.errors import AspEnvError
 from asp_env.render.frames import draw_frame
+from asp_env.sim.recorded import recorded_future
 from asp_env.sim.replay import ReplayWorld
 
 METADATA = {"render_modes": ["rgb_array"], "render_fps": 5}
@@ -154,6 +156,19 @@ width m |
             gymnasium.error.ResetNeeded: no episode has begun.
         """
         return self._world().scene()
+
+    def recorded_future(self, scene: Scene, horizon: int) -> Future:
+        """What the targets of a scene of now went on to do, for privileged predictors alone.
+
+        Raises:
+            gymnasium.error.ResetNeeded: no episode has begun.
+        """
+        return recorded_future(self._world(), scene, horizon)
+
+    @property
+    def dt_s(self) -> float:
+        """Length of a tick."""
+        return self._episodes.simulation.world.dt_s
 
     def render(self) -> Any:
         """An RGB picture uint8 (H, W, 3) from above in mode `rgb_array`, else None."""

@@ -74,9 +74,7 @@ class ReplayVecEnv(VecEnv):
         self.envs = envs
         self._members = [Member(envs, number) for number in range(envs.num_envs)]
         self._actions = np.zeros((envs.num_envs, 2), dtype=np.float32)
-        super().__init__(
-            envs.num_envs, envs.single_observation_space, envs.single_action_space
-        )
+        super().__init__(envs.num_envs, envs.single_observation_space, envs.single_action_space)
 
     def reset(self) -> Observations:
         """Starts all episodes with the seeds and options that were set, which are then used up."""
@@ -104,9 +102,7 @@ class ReplayVecEnv(VecEnv):
             info["TimeLimit.truncated"] = limit
         return observations, rewards.astype(np.float32), over, infos
 
-    def _restart(
-        self, observations: Observations, over: np.ndarray, infos: Infos
-    ) -> Observations:
+    def _restart(self, observations: Observations, over: np.ndarray, infos: Infos) -> Observations:
         """Puts last observations and infos where they belong; returns what is seen next."""
         rows = np.flatnonzero(over).tolist()
         if self._mode is AutoresetMode.SAME_STEP:
@@ -157,7 +153,11 @@ class ReplayVecEnv(VecEnv):
         setattr(self.envs.unwrapped, attr_name, value)
 
     def env_method(
-        self, method_name: str, *method_args: Any, indices: VecEnvIndices = None, **method_kwargs: Any
+        self,
+        method_name: str,
+        *method_args: Any,
+        indices: VecEnvIndices = None,
+        **method_kwargs: Any,
     ) -> list[Any]:
         """Calls a method of each environment: `scene` or `render`.
 

@@ -12,10 +12,12 @@ from gymnasium.vector.utils import batch_space
 from jaxtyping import Bool, Shaped
 
 from asp_env.data.scene import Scene
+from asp_env.data.snippets import Future
 from asp_env.envs.buffers import Buffers
 from asp_env.envs.episodes import Outcome, ReplayEpisodes, as_actions
 from asp_env.errors import AspEnvError
 from asp_env.sim.observation import Observation
+from asp_env.sim.recorded import recorded_future
 
 Infos = dict[str, Any]
 
@@ -162,6 +164,20 @@ class ReplayVectorEnv(VectorEnv[Observation, Any, np.ndarray]):
         """
         self._need_begun()
         return self._episodes.simulation.world.scene()
+
+    def recorded_future(self, scene: Scene, horizon: int) -> Future:
+        """What the targets of a scene of now went on to do, for privileged predictors alone.
+
+        Raises:
+            gymnasium.error.ResetNeeded: no episode has begun.
+        """
+        self._need_begun()
+        return recorded_future(self._episodes.simulation.world, scene, horizon)
+
+    @property
+    def dt_s(self) -> float:
+        """Length of a tick."""
+        return self._episodes.simulation.world.dt_s
 
     def snapshot(self) -> VectorSnapshot:
         """The whole state with those of `np_random`, to be handed to `restore`.
