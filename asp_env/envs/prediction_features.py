@@ -77,12 +77,10 @@ class ForecastParts:
         sizes = (agents * modes * len(at) * 2, agents * modes, agents)
         lows = (-MAX_AWAY_M, 0.0, 0.0)
         highs = (MAX_AWAY_M, 1.0, 1.0)
-        self.space = spaces.Dict(
-            {
-                name: spaces.Box(low, high, (size,), dtype=np.float32)
-                for name, low, high, size in zip(self._names, lows, highs, sizes, strict=True)
-            }
-        )
+        self.spaces: dict[str, spaces.Space[Any]] = {
+            name: spaces.Box(low, high, (size,), dtype=np.float32)
+            for name, low, high, size in zip(self._names, lows, highs, sizes, strict=True)
+        }
 
     def observe(self, env: Scenic) -> dict[str, np.ndarray]:
         """One array (B, …) per part; one call of the predictor for all situations."""
@@ -183,7 +181,7 @@ by it, the most probable first |
             dt_s=_scenic(env.unwrapped).dt_s,
             privileged=privileged,
         )
-        self.observation_space = _joined(env.observation_space, self._parts.space)
+        self.observation_space = _joined(env.observation_space, self._parts.spaces)
 
     def observation(self, observation: dict[str, Any]) -> dict[str, Any]:
         """The observation and what is forecast now."""
@@ -218,7 +216,7 @@ class VectorPredictionFeatures(VectorObservationWrapper):
             dt_s=_scenic(env.unwrapped).dt_s,
             privileged=privileged,
         )
-        self.single_observation_space = _joined(env.single_observation_space, self._parts.space)
+        self.single_observation_space = _joined(env.single_observation_space, self._parts.spaces)
         self.observation_space = batch_space(self.single_observation_space, env.num_envs)
 
     def observations(self, observations: dict[str, Any]) -> dict[str, Any]:
@@ -226,11 +224,7 @@ class VectorPredictionFeatures(VectorObservationWrapper):
         return observations | self._parts.observe(_scenic(self.env.unwrapped))
 
 
-def _check(predictor: Any, horizon: int, dt_s: float, privileged: bool) -> None:
-    if not isinstance(predictor, Predictor):
-        raise AspEnvError(
-            f"predictor {predictor!r}: expected a name such as 'constant-velocity' or a predictor"
-        )
+def _check(predictor: Predictor, horizon: int, dt_s: float, privileged: bool) -> None:
     if predictor.privileged and not privileged:
         raise AspEnvError(
             f"predictor {predictor.name} is told the recorded future, which no driver knows: "
@@ -256,9 +250,9 @@ def _scenic(env: Any) -> Scenic:
     return env
 
 
-def _joined(space: spaces.Space[Any], more: spaces.Dict) -> spaces.Dict:
+def _joined(space: spaces.Space[Any], more: dict[str, spaces.Space[Any]]) -> spaces.Space[Any]:
     if not isinstance(space, spaces.Dict):
         raise AspEnvError(f"observation space {space}: expected a Dict")
-    if taken := sorted(set(space.keys()) & set(more.keys())):
+    if taken := sorted(set(space.keys()) & set(more)):
         raise AspEnvError(f"the observation has a part {taken[0]!r} already")
-    return spaces.Dict({**space.spaces, **more.spaces})
+    return spaces.Dict({**space.spaces, **more})
