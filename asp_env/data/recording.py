@@ -102,6 +102,14 @@ class Recording:
         return np.isin(self.classes, [int(kind) for kind in PREDICTED]) & ~self.parked
 
     @cached_property
+    def extent_m(self) -> tuple[float, float, float, float]:
+        """Smallest x, smallest y, largest x, largest y of all recorded positions."""
+        if not len(self.states):
+            return (0.0, 0.0, 1.0, 1.0)
+        low, high = self.states[:, :2].min(axis=0), self.states[:, :2].max(axis=0)
+        return (float(low[0]), float(low[1]), float(high[0]), float(high[1]))
+
+    @cached_property
     def frame_index(self) -> tuple[Int[np.ndarray, " bounds"], Int[np.ndarray, " rows"]]:
         """(starts, tracks): frame f shows `tracks[starts[f]:starts[f + 1]]`, in file order."""
         lengths = np.diff(self.starts)

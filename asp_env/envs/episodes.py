@@ -17,11 +17,11 @@ from asp_env.data.source import open_data
 from asp_env.dynamics import MAX_ACCELERATION_MPS2, MAX_STEERING_RAD
 from asp_env.envs.start import Starts, choose
 from asp_env.errors import AspEnvError, unknown_name
-from asp_env.sim.drivers import make_driver
 from asp_env.sim.observation import Observation, Observer
 from asp_env.sim.reward import reward_terms, weighted_sum, weights_from
 from asp_env.sim.sight import ego_sight
 from asp_env.sim.simulation import Simulation, ending
+from asp_env.sim.traffic import TrafficSpec, make_traffic
 from asp_env.sim.world import Ending, Events
 from asp_env.views import make_picture_view
 
@@ -40,7 +40,7 @@ class ReplayOptions:
     """What the raster shows."""
     raster_px: tuple[int, int] | None = None
     """Height and width of the raster; by default the view's own."""
-    traffic: str = "log"
+    traffic: TrafficSpec = "log"
     """Who moves the others."""
     dt_s: float = DEFAULT_DT_S
     """Length of a tick."""
@@ -93,7 +93,7 @@ class ReplayEpisodes:
         self.observer = Observer(chosen.observations, raster, history)
         self.simulation = Simulation(
             self.recordings,
-            make_driver(chosen.traffic),
+            make_traffic(chosen.traffic, dt_s=chosen.dt_s),
             num_episodes=num_episodes,
             dt_s=chosen.dt_s,
             history=history,

@@ -29,7 +29,7 @@ from asp_env.evaluation.unseen import PartChoice, nothing_left, ticks_to_judge
 from asp_env.metrics.driving import driving_metrics
 from asp_env.metrics.masked import Masked
 from asp_env.planning.planner import Planner, load_planner
-from asp_env.sim.drivers import make_driver
+from asp_env.sim.traffic import make_traffic
 from asp_env.sim.world import Ending
 
 EPISODES_AT_ONCE = 64
@@ -57,7 +57,8 @@ class Drive:
     )
     """Predictors by name, each in a run of its own."""
     traffic: str = "log"
-    """Who drives everybody else: log, log-actions or idm."""
+    """Who drives everybody else: a driver such as log, log-actions, idm, hybrid or predictor:NAME,
+    or a table such as default=idm,truck=log,17=predictor:constant-velocity."""
     scenarios: int | None = None
     """At most so many, spread evenly over those there are."""
     horizon: float = 3.0
@@ -108,7 +109,7 @@ class ClosedLoop:
 
 def drive(config: Drive) -> ClosedLoop:
     """Drives with every predictor, the expert first."""
-    make_driver(config.traffic)  # an unknown name is refused before anything is computed
+    make_traffic(config.traffic, dt_s=config.dt)  # refused before anything is computed
     recordings = open_data(config.data)
     horizon, history = ticks(config.horizon, config.dt), ticks(HISTORY_S, config.dt)
     predictors = load_predictors(config.predictors, horizon=horizon, dt_s=config.dt)

@@ -7,21 +7,20 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
-from asp_env.data.clock import frames_per_tick
 from asp_env.data.forecast import Forecast, fill_missing
 from asp_env.data.predictor import Predictor
 from asp_env.data.rollout import Rollout
 from asp_env.data.scenario import Scenario
 from asp_env.data.scene import Scene
-from asp_env.data.snippets import Future, gather_window
 from asp_env.data.source import Recordings
 from asp_env.metrics.boxes import time_to_collision
 from asp_env.metrics.drivable import OFF_ROAD_M
 from asp_env.metrics.driving import MIN_TTC_S, Drives
 from asp_env.planning.planner import Plan, Planner
-from asp_env.sim.drivers import make_driver
+from asp_env.sim.recorded import recorded_future
 from asp_env.sim.replay import ReplayWorld
 from asp_env.sim.simulation import Simulation, ending
+from asp_env.sim.traffic import TrafficSpec, make_traffic
 from asp_env.sim.world import EGO, Ending, Events
 
 FORECAST_WITHIN_M = 60.0
@@ -54,7 +53,7 @@ def drive_episodes(
     planner: Planner,
     predictor: Predictor,
     *,
-    traffic: str,
+    traffic: TrafficSpec,
     horizon: int,
     history: int,
     dt_s: float,
@@ -63,8 +62,9 @@ def drive_episodes(
 
     A planner that is privileged is the logged driver: the world replays its ego.
     """
+    driver = make_traffic(traffic, dt_s=dt_s)
     simulation = Simulation(
-        recordings, make_driver(traffic), num_episodes=len(scenarios), dt_s=dt_s, history=history
+        recordings, driver, num_episodes=len(scenarios), dt_s=dt_s, history=history
     )
     world = simulation.world
     generators = [np.random.default_rng(scenario.seed) for scenario in scenarios]
@@ -97,7 +97,7 @@ def _decide(
 ) -> Said:
     scene = world.scene()
     scene = scene.with_targets(_near(scene, running))
-    future = _recorded_future(world, scene, horizon) if predictor.privileged else None
+    future = recorded_future(world, scene, horizon) if predictor.privileged else None
     forecast = predictor.predict(scene, future)
     forecast = dataclasses.replace(  # all plan equally far, whatever their predictor can
         forecast,
@@ -113,23 +113,6 @@ def _near(scene: Scene, running: Bool[np.ndarray, " b"]) -> Int[np.ndarray, "t 2
     egos = scene.states[situation, EGO, -1, :2]
     away = np.linalg.norm(scene.states[situation, slot, -1, :2] - egos, axis=-1)
     return scene.targets[(away <= FORECAST_WITHIN_M) & running[situation]]
-
-
-def _recorded_future(world: ReplayWorld, scene: Scene, horizon: int) -> Future:
-    episodes = world.episodes
-    states = np.zeros((len(scene.targets), horizon, 4), dtype=np.float32)
-    valid = np.zeros((len(scene.targets), horizon), dtype=bool)
-    for row, (b, a) in enumerate(scene.targets.tolist()):
-        recording = world.recordings[int(episodes.recording[b])]
-        found, present = gather_window(
-            recording,
-            episodes.tracks[b, a : a + 1],
-            first_tick=int(scene.tick[b]) + 1,
-            num_ticks=horizon,
-            stride=frames_per_tick(recording.frame_rate_hz, world.dt_s),
-        )
-        states[row], valid[row] = found[0], present[0]
-    return Future(states=states, valid=valid)
 
 
 def _ttc(world: ReplayWorld, events: Events) -> Float[np.ndarray, " b"]:

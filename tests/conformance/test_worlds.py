@@ -6,12 +6,11 @@ import numpy as np
 import pytest
 
 from asp_env.data.scenario import find_scenarios
-from asp_env.sim.drivers import DRIVERS
 from asp_env.sim.replay import ReplayWorld
 from asp_env.sim.simulation import Simulation
 from asp_env.sim.world import World
 from tests.builders import make_recording
-from tests.sim.worlds import DT_S, HISTORY, scenario, simulate
+from tests.sim.worlds import DT_S, HISTORY, TRAFFICS, scenario, simulate
 
 RECORDINGS = [
     make_recording(),
@@ -66,7 +65,7 @@ def test_replay_world_is_a_world():
     assert isinstance(world, World)
 
 
-@pytest.mark.parametrize("traffic", DRIVERS)
+@pytest.mark.parametrize("traffic", TRAFFICS)
 def test_episodes_side_by_side_equal_episodes_alone(traffic):
     """Four episodes at once are bit for bit the four on their own, over ends and padding."""
     together = simulate(RECORDINGS, SCENARIOS, traffic)
@@ -82,7 +81,7 @@ def test_episodes_side_by_side_equal_episodes_alone(traffic):
                 _step(single, actions[b : b + 1, k])
 
 
-@pytest.mark.parametrize("traffic", DRIVERS)
+@pytest.mark.parametrize("traffic", TRAFFICS)
 def test_a_reset_touches_only_the_chosen_rows(traffic):
     """Row 1 begins anew with more agents and a longer scenario; rows 0 and 2 never notice."""
     first = [SCENARIOS[2], SCENARIOS[0], SCENARIOS[1]]
@@ -108,7 +107,7 @@ def test_a_reset_touches_only_the_chosen_rows(traffic):
 
 def test_a_snapshot_brings_everything_back():
     """States, scenarios and generators after restore are those of the snapshot, bit for bit."""
-    simulation = simulate(RECORDINGS, SCENARIOS, "log-actions")
+    simulation = simulate(RECORDINGS, SCENARIOS)
     actions = np.stack([_actions(b) for b in range(len(SCENARIOS))])
     for k in range(4):
         _step(simulation, actions[:, k])
@@ -142,7 +141,7 @@ def test_a_snapshot_can_be_restored_twice():
         assert _told(simulation, 0, agents) == told
 
 
-@pytest.mark.parametrize("traffic", DRIVERS)
+@pytest.mark.parametrize("traffic", TRAFFICS)
 def test_every_found_scenario_can_be_driven_to_its_end(traffic):
     """Whatever the table of scenarios offers starts, runs its length, and stays finite."""
     found = find_scenarios(RECORDINGS, source="made-up", dt_s=DT_S, history=HISTORY)

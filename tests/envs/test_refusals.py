@@ -15,7 +15,7 @@ from asp_env.errors import AspEnvError
         ({"observations": ()}, "no observation given"),
         ({"view": "chaufeurnet"}, r"unknown view 'chaufeurnet' \(did you mean 'chauffeurnet'"),
         ({"raster_px": (90, 61)}, "square pixels"),
-        ({"traffic": "idn"}, r"unknown traffic 'idn' \(did you mean 'idm'"),
+        ({"traffic": "idn"}, r"unknown driver 'idn' \(did you mean 'idm'"),
         ({"dt_s": 0.13}, "0.13 s"),
         ({"dt_s": 0.15}, "does not divide recordings of 25 Hz"),
         ({"reward_weights": {"progres": 2.0}}, "unknown reward weight 'progres'"),

@@ -8,8 +8,6 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from asp_env.data.classes import AgentClass
-from asp_env.errors import AspEnvError
-from asp_env.sim.drivers import DRIVERS, make_driver
 from asp_env.sim.idm import IDM, idm_acceleration, pursuit_steering, speed_limits
 from tests.builders import DRIVES, Drive, make_recording
 from tests.sim.worlds import car, now, on_road, replay, scenario, simulate
@@ -22,15 +20,6 @@ def _state(simulation, track_id: int) -> np.ndarray:
     state = now(simulation, track_id)
     assert state is not None
     return state
-
-
-def test_unknown_traffic_is_one_line():
-    """The error names what was given, the nearest name, and all that are known."""
-    with pytest.raises(AspEnvError) as caught:
-        make_driver("idn")
-    assert str(caught.value) == (
-        "unknown traffic 'idn' (did you mean 'idm'?): known are idm, log, log-actions"
-    )
 
 
 def test_logged_actions_lead_along_the_log():
@@ -251,9 +240,3 @@ def test_steering_follows_a_circle():
     mirrored = path * [1, -1]
     other = pursuit_steering(0.0, 0.0, 0.0, 6.0, 4.5, mirrored, len(path), 0.0, 0.0)
     assert other == pytest.approx(-steering)
-
-
-def test_the_registry_of_drivers_is_complete():
-    """The three drivers of the contract, each by a name that makes it."""
-    assert set(DRIVERS) == {"log", "log-actions", "idm"}
-    assert all(isinstance(make_driver(name), kind) for name, kind in DRIVERS.items())

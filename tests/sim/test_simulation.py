@@ -6,10 +6,9 @@ import numpy as np
 import pytest
 
 from asp_env.metrics.boxes import Contact
-from asp_env.sim.drivers import DRIVERS
 from asp_env.sim.simulation import ending
 from asp_env.sim.world import Ending, Events
-from tests.sim.worlds import HISTORY, car, on_road, replay, scenario, simulate
+from tests.sim.worlds import HISTORY, TRAFFICS, car, on_road, replay, scenario, simulate
 
 RUNNING = Events(
     contacts=np.zeros((1, 2), dtype=np.int8),
@@ -52,7 +51,7 @@ def test_the_first_of_the_enumeration_wins(kind):
     assert ending(dataclasses.replace(RUNNING, **all_later)).tolist() == [kind]
 
 
-@pytest.mark.parametrize("traffic", sorted(DRIVERS))
+@pytest.mark.parametrize("traffic", TRAFFICS)
 def test_a_snapshot_brings_back_the_drivers_memory(traffic):
     """After a restore the same 10 steps lead to the same bits, whatever happened in between."""
     recording = on_road(car(-60.0, 6.0), car(-40.0, 9.0, (3.0, -2.0, 0.0)), car(-90.0, 10.0))

@@ -7,12 +7,19 @@ import numpy as np
 from asp_env.data.classes import AgentClass
 from asp_env.data.recording import Recording
 from asp_env.data.scenario import Scenario
-from asp_env.sim.drivers import make_driver
 from asp_env.sim.simulation import Simulation
+from asp_env.sim.traffic import TrafficSpec, make_traffic
 from tests.builders import Drive, make_recording
 
 DT_S = 0.2
 HISTORY = 15
+
+TRAFFICS = (
+    *("log", "log-actions", "idm", "policy"),
+    *("predictor:constant-turn-rate", "predictor:every=3:mode=sampled:oracle"),
+    "default=idm,truck=log-actions,4=policy,6=predictor:constant-velocity",
+)
+"""Every driver that runs no network, and a table of several."""
 
 EGO = Drive(kind=AgentClass.CAR, start=(1.75, -95.0, np.pi / 2, 5.0))
 """Drives north, away from what happens on the road along x."""
@@ -48,13 +55,13 @@ def scenario(
 def simulate(
     recordings: Sequence[Recording] | Recording,
     scenarios: Sequence[Scenario] | Scenario,
-    traffic: str = "log",
+    traffic: TrafficSpec = "log",
 ) -> Simulation:
     """Episodes that have just begun."""
     recordings = [recordings] if isinstance(recordings, Recording) else recordings
     scenarios = [scenarios] if isinstance(scenarios, Scenario) else scenarios
     simulation = Simulation(
-        recordings, make_driver(traffic), num_episodes=len(scenarios), dt_s=DT_S, history=HISTORY
+        recordings, make_traffic(traffic), num_episodes=len(scenarios), dt_s=DT_S, history=HISTORY
     )
     simulation.reset(scenarios, [np.random.default_rng(each.seed) for each in scenarios])
     return simulation

@@ -1,102 +1,23 @@
-"""Who moves the agents that the caller does not: a table agent → driver, merged by mask."""
+"""Vehicles that follow their logged path and react to whoever is on it."""
 
 import math
-from dataclasses import dataclass
-from typing import Protocol, runtime_checkable
 
 import numpy as np
-from jaxtyping import Bool, Float
+from jaxtyping import Bool
 
-from asp_env.data.classes import PREDICTED, AgentClass
 from asp_env.data.clock import frames_per_tick
 from asp_env.data.geometry import route_along
 from asp_env.data.scenario import STANDING_MPS
-from asp_env.dynamics import inverse
-from asp_env.errors import unknown_name
 from asp_env.sim.beginning import BEYOND_M
+from asp_env.sim.drivers.driver import Control, refuse_argument, vehicles
 from asp_env.sim.idm import IDM, follow_paths, speed_limits
 from asp_env.sim.replay import ReplayWorld
-from asp_env.sim.world import EGO
 
 MIN_DESIRED_MPS = 3.0
 """Nobody wants to stand: a vehicle that the log shows waiting wants at least this speed."""
 
 HALTED_M = 1.0
 """A vehicle that is to halt has done so within this distance of the place."""
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Control:
-    """What a driver wants its agents to do in the coming tick."""
-
-    actions: Float[np.ndarray, "b a 2"]
-    driven: Bool[np.ndarray, "b a"]
-    leaving: Bool[np.ndarray, "b a"]
-
-
-@runtime_checkable
-class Driver(Protocol):
-    """Moves some agents of a world. It may keep arrays between ticks, made anew by `reset`."""
-
-    def reset(self, world: ReplayWorld, where: Bool[np.ndarray, " b"]) -> None:
-        """The episodes at `where` have just begun; sizes of the world's arrays may have grown."""
-        ...
-
-    def control(self, world: ReplayWorld) -> Control:
-        """What its agents do from now to the next tick."""
-        ...
-
-
-def _vehicles(world: ReplayWorld) -> Bool[np.ndarray, "b a"]:
-    kinds = [int(kind) for kind in PREDICTED | {AgentClass.BICYCLE}]
-    episodes = world.episodes
-    vehicles = np.isin(episodes.classes, kinds) & ~episodes.parked & (episodes.ids >= 0)
-    vehicles[:, EGO] = False
-    return vehicles
-
-
-class LogDriver:
-    """Everybody moves exactly as recorded."""
-
-    def reset(self, world: ReplayWorld, where: Bool[np.ndarray, " b"]) -> None:
-        """Nothing to prepare."""
-
-    def control(self, world: ReplayWorld) -> Control:
-        """Nobody is driven: the world replays."""
-        shape = world.episodes.ids.shape
-        nobody = np.zeros(shape, dtype=bool)
-        return Control(
-            actions=np.zeros((*shape, 2), dtype=np.float32), driven=nobody, leaving=nobody
-        )
-
-
-class LogActionsDriver:
-    """Vehicles carry out the actions inferred from their log, whatever comes of it.
-
-    Others replay. A vehicle leaves when its log ends.
-    """
-
-    def reset(self, world: ReplayWorld, where: Bool[np.ndarray, " b"]) -> None:
-        """Nothing to prepare."""
-
-    def control(self, world: ReplayWorld) -> Control:
-        """The logged actions of this tick."""
-        episodes = world.episodes
-        rows, now = np.arange(len(world)), world.now
-        after = np.minimum(now + 1, episodes.log_valid.shape[1] - 1)
-        lasts = episodes.log_valid[rows, now] & episodes.log_valid[rows, after]
-        vehicles = _vehicles(world)
-        actions = inverse(
-            episodes.log_states[rows, now],
-            episodes.log_states[rows, after],
-            np.maximum(episodes.sizes[..., 0], 0.1),
-            world.dt_s,
-        )
-        return Control(
-            actions=np.where(lasts[..., None], actions, 0).astype(np.float32),
-            driven=vehicles & lasts,
-            leaving=vehicles & ~lasts & episodes.valid[rows, now],
-        )
 
 
 class IDMDriver:
@@ -109,6 +30,7 @@ class IDMDriver:
     def __init__(self, idm: IDM | None = None) -> None:
         """A driver with the given parameters, or the default ones."""
         self.idm = idm or IDM()
+        self._mine = np.zeros((0, 0), dtype=bool)
         self._paths = np.zeros((0, 0, 0, 2), dtype=np.float32)
         self._limits = np.zeros((0, 0, 0), dtype=np.float32)
         self._counts = np.zeros((0, 0), dtype=np.int64)
@@ -116,14 +38,30 @@ class IDMDriver:
         self._ends = np.zeros((0, 0), dtype=np.float64)
         self._arcs = np.zeros((0, 0), dtype=np.float64)
 
-    def reset(self, world: ReplayWorld, where: Bool[np.ndarray, " b"]) -> None:
+    @classmethod
+    def from_name(cls, argument: str, *, dt_s: float) -> "IDMDriver":
+        """The driver; it takes no argument.
+
+        Raises:
+            AspEnvError: there is one.
+        """
+        del dt_s
+        refuse_argument("idm", argument)
+        return cls()
+
+    def reset(
+        self,
+        world: ReplayWorld,
+        where: Bool[np.ndarray, " b"],
+        mine: Bool[np.ndarray, "b a"] | None = None,
+    ) -> None:
         """Takes the paths of the new episodes' vehicles from their recordings."""
         found: dict[tuple[int, int], tuple[np.ndarray, float, bool]] = {}
-        vehicles = _vehicles(world)
-        for b, a in np.argwhere(vehicles & where[:, None]).tolist():
+        self._mine = vehicles(world) if mine is None else mine
+        for b, a in np.argwhere(self._mine & where[:, None]).tolist():
             found[b, a] = self._path(world, b, a)
         points = max([self._paths.shape[2], *(len(path) for path, _, _ in found.values())])
-        self._grow(vehicles.shape[0], vehicles.shape[1], points)
+        self._grow(*self._mine.shape, points)
         self._counts[where] = 0
         self._arcs[where] = 0.0
         for (b, a), (path, desired_mps, halts) in found.items():
@@ -140,7 +78,7 @@ class IDMDriver:
         rows = np.arange(len(world))
         states = np.ascontiguousarray(episodes.states[rows, world.now])
         valid = np.ascontiguousarray(episodes.valid[rows, world.now])
-        driven = _vehicles(world) & valid
+        driven = self._mine & valid
         actions = follow_paths(
             states,
             episodes.sizes,
@@ -178,22 +116,3 @@ class IDMDriver:
             new = np.zeros((episodes, agents, points, 2)[: old.ndim], dtype=old.dtype)
             new[tuple(map(slice, old.shape))] = old
             setattr(self, name, new)
-
-
-DRIVERS: dict[str, type[LogDriver] | type[LogActionsDriver] | type[IDMDriver]] = {
-    "log": LogDriver,
-    "log-actions": LogActionsDriver,
-    "idm": IDMDriver,
-}
-"""Drivers of the traffic around the ego, by name."""
-
-
-def make_driver(name: str) -> Driver:
-    """The driver of a name.
-
-    Raises:
-        AspEnvError: the name is unknown.
-    """
-    if name not in DRIVERS:
-        raise unknown_name("traffic", name, DRIVERS)
-    return DRIVERS[name]()

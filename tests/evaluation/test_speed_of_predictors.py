@@ -8,8 +8,8 @@ import pytest
 from asp_env.cli import main
 from asp_env.data.source import Recordings
 from asp_env.errors import AspEnvError
-from asp_env.evaluation import bench, latency
-from asp_env.evaluation.latency import busiest_scene, durations_s, measure_latencies
+from asp_env.evaluation.speed import latency, timing
+from asp_env.evaluation.speed.latency import busiest_scene, durations_s, measure_latencies
 
 
 @pytest.fixture
@@ -72,12 +72,10 @@ def test_bench_prints_them_where_asked(
     crossings: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """`--predictors` adds a table; a wrong name is refused before anything is measured."""
-    monkeypatch.setattr(bench, "COPY_BYTES", 2**20)
-    monkeypatch.setattr(bench, "SIZES_PX", ())
-    monkeypatch.setattr(bench, "DRIVERS", ())
-    assert main(["bench", str(crossings), "--episodes", "2"]) == 0
+    monkeypatch.setattr(timing, "COPY_BYTES", 2**20)
+    assert main(["bench", str(crossings), "--sections"]) == 0
     assert "predict" not in capsys.readouterr().out
-    args = ["bench", str(crossings), "--episodes", "2", "--predictors"]
+    args = ["bench", str(crossings), "--sections", "--predictors"]
     assert main([*args, "constant-turn-rate"]) == 0
     told = capsys.readouterr().out
     assert "one call of predict" in told

@@ -1,0 +1,1 @@
+"""What `asp-env bench` measures: copying, drawing, stepping, environments, predictors."""
