@@ -13,6 +13,7 @@ from asp_env.data.recording import Recording
 from asp_env.data.scenario import MIN_DISTANCE_M, Scenario
 from asp_env.errors import AspEnvError, unknown_name
 from asp_env.sim.drivers import Control, Driver
+from asp_env.sim.drivers.driver import vehicles
 from asp_env.sim.replay import ReplayWorld
 from asp_env.sim.world import EGO
 
@@ -96,36 +97,45 @@ def viewpoints(
 class TogetherDriver:
     """Moves all but the ego in rows that show one episode, each to another of its agents.
 
-    Row v has agent v in the slot of the ego. In each row the agents do what was given for them in
-    `actions`, and the traffic does what its own driver says in row 0.
+    Row v has agent v in the slot of the ego. In every row the agents do what is given for them in
+    `actions`, and the others what the traffic's driver says in row 0.
     """
 
     def __init__(self, traffic: Driver) -> None:
         """Agents among a traffic that has this driver."""
         self._traffic = traffic
         self.actions = np.zeros((0, 2), dtype=np.float32)
+        """[acceleration m/s², steering rad] of each agent in the coming tick."""
         self._agents = np.zeros((0, 0), dtype=np.int64)
         self._slots = np.zeros((0, 0), dtype=np.int64)
 
-    def reset(self, world: ReplayWorld, where: Bool[np.ndarray, " b"]) -> None:
+    def reset(
+        self,
+        world: ReplayWorld,
+        where: Bool[np.ndarray, " b"],
+        mine: Bool[np.ndarray, "b a"] | None = None,
+    ) -> None:
         """Learns who is who in the rows at `where`; the others take no part."""
-        self._traffic.reset(world, where)
         tracks = world.episodes.tracks
-        mine = np.where(where[:, None] & (tracks >= 0), tracks, -2)
-        self._agents = _positions(mine, mine[:, EGO])
-        self._slots = _positions(mine, mine[EGO])
+        here = np.where(where[:, None] & (tracks >= 0), tracks, -1)
+        self._agents = _positions(here, here[:, EGO])
+        self._slots = _positions(here, here[0])
         self.actions = np.zeros((len(tracks), 2), dtype=np.float32)
+        traffic = (vehicles(world) if mine is None else mine) & (self._agents < 0)
+        traffic[1:] = False
+        self._traffic.reset(world, where, traffic)
 
     def control(self, world: ReplayWorld) -> Control:
         """What everybody but the ego does in each row."""
         said = self._traffic.control(world)
-        traffic, agent = self._slots >= 0, self._agents >= 0
-        driven = said.driven[EGO, self._slots] & traffic
-        leaving = said.leaving[EGO, self._slots] & traffic & ~agent
-        actions = np.where(
-            agent[..., None], self.actions[self._agents], said.actions[EGO, self._slots]
+        known, agent = self._slots >= 0, self._agents >= 0
+        return Control(
+            actions=np.where(
+                agent[..., None], self.actions[self._agents], said.actions[0, self._slots]
+            ),
+            driven=agent | (said.driven[0, self._slots] & known),
+            leaving=~agent & said.leaving[0, self._slots] & known,
         )
-        return Control(actions=actions, driven=driven | agent, leaving=leaving)
 
     def slots_of(self, agents: Bool[np.ndarray, " b"]) -> Bool[np.ndarray, "b a"]:
         """Where in each row some agents are."""

@@ -41,17 +41,19 @@ def _envs(crossing: str, count: int, **options: Any) -> VectorEnv:
 
 
 class Fan:
-    """Knows vehicles alone; in mode m all go m metres to the left per tick. Counts its calls."""
+    """Knows vehicles alone: in mode m all go from the ego m metres to its left per tick."""
 
     name, privileged, dt_s, history, horizon = "fan", False, 0.2, 0, 20
     trained_on = None
 
     def __init__(self, probabilities: tuple[float, ...]) -> None:
+        """Of as many modes; counts its calls."""
         self.log_probs = np.log(probabilities)
         self.calls = 0
         self.about: dict[str, str] = {}
 
     def predict(self, scene: Scene, future: Future | None = None) -> Forecast:
+        """All modes of all targets."""
         assert future is None
         self.calls += 1
         modes, count = len(self.log_probs), len(scene.targets)
@@ -217,7 +219,7 @@ def test_one_call_for_all_environments(crossing):
 def test_an_oracle_is_named_one(crossing):
     """Only when it is allowed, and then the parts say so; it shows what will be."""
     with pytest.raises(
-        asp_env.AspEnvError, match="oracle is told the recorded future.*privileged=T"
+        asp_env.AspEnvError, match=r"oracle is told the recorded future.*privileged=T"
     ):
         PredictionFeatures(_env(crossing), "oracle")
     env = PredictionFeatures(_env(crossing), "oracle", privileged=True, agents=2, at_s=(1.0,))
@@ -273,7 +275,7 @@ def test_refuses_environments_that_do_not_fit(crossing):
     """One without scenes, one of another time step, and forecasts twice."""
     with pytest.raises(asp_env.AspEnvError, match="has no scenes to forecast"):
         PredictionFeatures(gymnasium.make("CartPole-v1"), "constant-velocity")
-    with pytest.raises(asp_env.AspEnvError, match="of 0.2 s, the environment has 0.12 s"):
+    with pytest.raises(asp_env.AspEnvError, match=r"of 0\.2 s, the environment has 0\.12 s"):
         PredictionFeatures(_env(crossing, dt_s=0.12), Fan((1.0,)), at_s=(0.6,))
     env = PredictionFeatures(_env(crossing), "constant-velocity")
     with pytest.raises(asp_env.AspEnvError, match="has a part 'forecast' already"):
