@@ -11,7 +11,8 @@ from stable_baselines3.common.vec_env import VecMonitor, VecNormalize
 
 import asp_env
 
-Policy = Callable[[dict[str, np.ndarray]], np.ndarray]
+Policy = Callable[[Any], np.ndarray]
+"""From observations to actions."""
 Scores = dict[tuple[str, str], dict[str, float]]
 """Means by policy and DATA."""
 

@@ -26,7 +26,7 @@ class PictureFeatures(BaseFeaturesExtractor):
         """The first convolution looks at blocks of 4 by 4 pixels, 3.2 m by 3.2 m."""
         flat = sum(int(np.prod(space[name].shape or ())) for name in ("state", "route"))
         super().__init__(space, flat + width)
-        channels, height, width_px = space["raster"].shape or ()
+        channels, height, width_px = space["raster"].shape or (0, 0, 0)
         cells = -(-(height // 4) // 4) * -(-(width_px // 4) // 4)
         self.picture = torch.nn.Sequential(
             torch.nn.Conv2d(channels, 16, 4, stride=4),

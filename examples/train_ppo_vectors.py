@@ -28,7 +28,7 @@ class VectorFeatures(BaseFeaturesExtractor):
         """Agents are shown as they are now and were 0.6 s ago."""
         flat = sum(int(np.prod(space[name].shape or ())) for name in ("state", "route"))
         super().__init__(space, flat + width)
-        self.register_buffer("scale", torch.tensor(AGENT_SCALE))
+        self.scale = torch.nn.Parameter(torch.tensor(AGENT_SCALE), requires_grad=False)
         self.each = torch.nn.Sequential(
             torch.nn.Linear(2 * len(AGENT_SCALE), width),
             torch.nn.ReLU(),

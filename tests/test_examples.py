@@ -61,7 +61,7 @@ def test_scores_are_means_over_evenly_chosen_scenarios() -> None:
     rewards, infos = np.zeros(3), []
     for row, scenario in enumerate((0, 35, 71)):
         env.reset(options={"scenario": scenario})
-        over = False
+        over, info = False, {}
         while not over:
             _, reward, terminated, truncated, info = env.step(np.array([0.1, 0.0]))
             rewards[row] += reward

@@ -1,7 +1,7 @@
 """Recorded traffic in which the vehicles are agents, for PettingZoo."""
 
 from collections.abc import Mapping, Sequence
-from typing import Any, ClassVar
+from typing import Any
 
 import gymnasium
 import numpy as np
@@ -33,10 +33,10 @@ class ParallelReplayEnv(ParallelEnv[str, dict[str, np.ndarray], Any]):
 
     ## Agents
     `vehicle_0` is the vehicle of the scenario. The others are those that were there for the whole
-    history when it begins and cover at least 10 m until it, or their own track, ends: whoever
-    could be the ego of `ReplayEnv` at that tick. All that come later are traffic. The list
-    `agents` therefore only shrinks. `possible_agents` are those of the episode; before the first
-    `reset`, those of the scenario that has most.
+    history when it begins and get on by at least 1 m until it, or their own track, ends. Whoever
+    stands all the while or comes later is traffic. The list `agents` therefore only shrinks.
+    `possible_agents` are those of the episode; before the first `reset`, as many as any scenario
+    can have.
 
     ## End of an agent
     As in `ReplayEnv`: terminated by `COLLISION` (one that it answers for), `OFF_ROAD` or `GOAL`,
@@ -51,8 +51,6 @@ class ParallelReplayEnv(ParallelEnv[str, dict[str, np.ndarray], Any]):
     ## Options of `reset`
     Those of `ReplayEnv`; others are passed over, since PettingZoo's own test gives one.
     """
-
-    metadata: ClassVar[dict[str, Any]] = {**METADATA, "name": "asp_env/ParallelReplay-v0"}
 
     def __init__(
         self,
@@ -73,6 +71,7 @@ class ParallelReplayEnv(ParallelEnv[str, dict[str, np.ndarray], Any]):
             raise AspEnvError(f"render mode {render_mode!r}: expected rgb_array or None")
         if max_agents is not None and max_agents < 1:
             raise AspEnvError(f"max_agents {max_agents}: expected at least 1")
+        self.metadata = {**METADATA, "name": "asp_env/ParallelReplay-v0"}
         self.render_mode = render_mode
         self._episodes = ReplayEpisodes(data, options, 1)
         self.recordings = self._episodes.recordings
@@ -85,8 +84,9 @@ class ParallelReplayEnv(ParallelEnv[str, dict[str, np.ndarray], Any]):
         self.possible_agents = [f"vehicle_{number}" for number in range(self._most)]
         self.agents: list[str] = []
         self._numbers = {name: number for number, name in enumerate(self.possible_agents)}
-        self.observation_spaces = dict.fromkeys(self._numbers, self._episodes.observer.space)
-        self.action_spaces = {
+        space: spaces.Space[Any] = self._episodes.observer.space
+        self.observation_spaces: dict[str, Any] = dict.fromkeys(self._numbers, space)
+        self.action_spaces: dict[str, spaces.Space[Any]] = {
             name: spaces.Box(-1.0, 1.0, (2,), dtype=np.float32) for name in self._numbers
         }
         self.state_space = spaces.Box(-np.inf, np.inf, (self._most, 7), dtype=np.float32)

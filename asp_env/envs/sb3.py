@@ -132,7 +132,8 @@ class ReplayVecEnv(VecEnv):
                 stacklevel=2,
             )
             return [None] * self.num_envs
-        return list(self.envs.render() or ())
+        pictures: Any = self.envs.render()
+        return list(pictures)
 
     def get_attr(self, attr_name: str, indices: VecEnvIndices = None) -> list[Any]:
         """An attribute of each environment.

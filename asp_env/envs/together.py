@@ -10,11 +10,12 @@ from asp_env.data.classes import PREDICTED, AgentClass
 from asp_env.data.clock import frames_per_tick
 from asp_env.data.geometry import path_length
 from asp_env.data.recording import Recording
-from asp_env.data.scenario import MIN_DISTANCE_M, Scenario
+from asp_env.data.scenario import Scenario
 from asp_env.errors import AspEnvError, unknown_name
 from asp_env.sim.drivers import Control, Driver
 from asp_env.sim.drivers.driver import vehicles
 from asp_env.sim.replay import ReplayWorld
+from asp_env.sim.reward import MIN_GOAL_M
 from asp_env.sim.world import EGO
 
 
@@ -73,7 +74,7 @@ def viewpoints(
     """The scenario from the view of each of its agents, that of its own ego first.
 
     Agents are the ego and the wanted vehicles that could be one: there for the whole history, with
-    at least 10 m to go until the scenario ends or their track does. Of more than `most` those that
+    at least 1 m to go until the scenario ends or their track does. Of more than `most` those that
     start nearest to the ego are taken. They are in the order of slots.
     """
     stride, start = frames_per_tick(recording.frame_rate_hz, dt_s), scenario.start_tick
@@ -86,7 +87,7 @@ def viewpoints(
         first, last = int(recording.first_frames[track]), int(recording.last_frames[track])
         length = min(scenario.length, last // stride - start)
         way = recording.track(track)[(start + np.arange(length + 1)) * stride - first, :2]
-        if path_length(way) >= MIN_DISTANCE_M:
+        if path_length(way) >= MIN_GOAL_M:
             number = int(recording.track_ids[track])
             view = dataclasses.replace(scenario, ego_id=number, length=length, tags=())
             found.append((float(np.hypot(*(way[0] - here))), first, number, view))

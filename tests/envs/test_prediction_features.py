@@ -19,6 +19,7 @@ from asp_env.data.predictor import load_predictor
 from asp_env.data.scene import Scene
 from asp_env.data.snippets import Future
 from asp_env.envs.prediction_features import PredictionFeatures, nearest_agents
+from asp_env.envs.replay import ReplayEnv
 from tests.conformance.predictor_cases import Case
 from tests.envs.same import same
 
@@ -38,6 +39,12 @@ def _envs(crossing: str, count: int, **options: Any) -> VectorEnv:
         observations=("state",),
         **options,
     )
+
+
+def _scene(env: gymnasium.Env[Any, Any]) -> Scene:
+    inner = env.unwrapped
+    assert isinstance(inner, ReplayEnv)
+    return inner.scene()
 
 
 class Fan:
@@ -88,9 +95,7 @@ def test_the_modes_by_hand(crossing):
     fan = Fan((0.2, 0.4, 0.3, 0.1))
     env = PredictionFeatures(_env(crossing), fan, agents=3, modes=2, at_s=(0.4, 2.0))
     seen, _ = env.reset(options={"scenario": 0})
-    inner = env.unwrapped
-    assert isinstance(inner, asp_env.envs.replay.ReplayEnv)
-    scene = inner.scene()
+    scene = _scene(env)
     targets, _ = nearest_agents(scene, 3)
     known = scene.with_targets(targets).predictable
     assert known.any()
@@ -112,7 +117,7 @@ def test_who_is_left_out_goes_on_straight(crossing):
     for scenario in range(5):
         seen, _ = env.reset(options={"scenario": scenario})
         other, _ = straight.reset(options={"scenario": scenario})
-        scene = env.unwrapped.scene()  # pyright: ignore[reportAttributeAccessIssue]
+        scene = _scene(env)
         targets, _ = nearest_agents(scene, 8)
         positions, expected = (
             each["forecast"].reshape(8, modes, 2) for each, modes in ((seen, 2), (other, 3))
@@ -127,7 +132,7 @@ def test_the_nearest_first_whatever_their_slots(crossing):
     """Distances grow; another order of slots and a bigger scene change nothing."""
     env = _env(crossing)
     env.reset(options={"scenario": 2})
-    scene = env.unwrapped.scene()  # pyright: ignore[reportAttributeAccessIssue]
+    scene = _scene(env)
     targets, rank = nearest_agents(scene, 100)
     assert rank.tolist() == list(range(len(targets))) == list(range(len(scene.targets)))
     away = np.hypot(*(scene.states[0, targets[:, 1], -1, :2] - scene.states[0, 0, -1, :2]).T)
@@ -145,7 +150,7 @@ def test_alone_on_the_road(crossing):
     """Nobody near: zeros, and the predictor is not asked."""
     env = _env(crossing)
     env.reset(seed=0)
-    scene = env.unwrapped.scene()  # pyright: ignore[reportAttributeAccessIssue]
+    scene = _scene(env)
     lonely = scene.valid.copy()
     lonely[:, 1:] = False
     fan = Fan((1.0,))
@@ -164,7 +169,7 @@ def test_a_trained_predictor_in_the_loop(crossing, tmp_path):
     seen, _ = env.reset(options={"scenario": 1})
     for _ in range(3):
         assert seen in env.observation_space
-        scene = env.unwrapped.scene()  # pyright: ignore[reportAttributeAccessIssue]
+        scene = _scene(env)
         targets, _ = nearest_agents(scene, 4)
         scene = scene.with_targets(targets)
         forecast = predictor.predict(scene)
@@ -230,7 +235,7 @@ def test_an_oracle_is_named_one(crossing):
     ego, ids = _nearest(env)
     for _ in range(5):
         env.step(np.zeros(2))
-    scene = env.unwrapped.scene()  # pyright: ignore[reportAttributeAccessIssue]
+    scene = _scene(env)
     slots = [int(np.flatnonzero(scene.ids[0] == number)[0]) for number in ids]
     expected = to_frame(scene.states[0, slots, -1, :2], ego)
     shown = seen["oracle_forecast"].reshape(2, 3, 1, 2)[:, 0, 0]
@@ -238,7 +243,7 @@ def test_an_oracle_is_named_one(crossing):
 
 
 def _nearest(env: PredictionFeatures) -> tuple[np.ndarray, list[int]]:
-    scene = env.unwrapped.scene()  # pyright: ignore[reportAttributeAccessIssue]
+    scene = _scene(env)
     targets, _ = nearest_agents(scene, 2)
     return scene.states[0, 0, -1], scene.ids[0, targets[:, 1]].tolist()
 
