@@ -1,9 +1,16 @@
 """Frames, boxes and paths: the only definitions, for arrays with any leading axes."""
 
+import math
+from typing import no_type_check
+
 import numpy as np
 from jaxtyping import Float, Shaped
+from numba import njit
 
 from asp_env.dynamics import wrap_angle
+
+MIN_STEP_M = 0.5
+"""A way takes no point nearer to its last one than this."""
 
 
 def to_frame(
@@ -66,14 +73,26 @@ def route_along(states: Float[np.ndarray, "n 4"], *, beyond_m: float) -> Float[n
 
     Points are taken only where the vehicle got on, so that standing and jitter leave no trace.
     """
-    kept = [states[0, :2]]
-    for point in states[1:, :2]:
-        if np.hypot(*(point - kept[-1])) >= 0.5:
-            kept.append(point)
-    end = kept[-1]
-    if len(kept) > 1:
-        direction = (kept[-1] - kept[-2]) / np.hypot(*(kept[-1] - kept[-2]))
+    kept = np.empty((len(states) + 1, 2), dtype=states.dtype)
+    count = _moved_on(np.ascontiguousarray(states[:, :2]), MIN_STEP_M, kept)
+    end = kept[count - 1]
+    if count > 1:
+        direction = (end - kept[count - 2]) / np.hypot(*(end - kept[count - 2]))
     else:
         direction = np.array([np.cos(states[-1, 2]), np.sin(states[-1, 2])])
-    kept.append(end + (beyond_m * direction).astype(states.dtype))
-    return resample(np.stack(kept), 1.0)
+    kept[count] = end + (beyond_m * direction).astype(states.dtype)
+    return resample(kept[: count + 1], 1.0)
+
+
+@njit(cache=True)
+@no_type_check
+def _moved_on(points, step_m, out):
+    """Writes the first point and each that is a step away from the last one; how many there are."""
+    out[0] = points[0]
+    count = 1
+    for i in range(1, len(points)):
+        dx, dy = points[i, 0] - out[count - 1, 0], points[i, 1] - out[count - 1, 1]
+        if math.hypot(dx, dy) >= step_m:
+            out[count] = points[i]
+            count += 1
+    return count

@@ -89,7 +89,7 @@ def _integrate(
     speed_0 = states[..., 3:4]
     speed_after = speed_0 + _running_sum(actions[..., 0] * dt_s)
     if not reverse:
-        speed_after = speed_after - xp.clip(_running_minimum(speed_after), None, 0.0)
+        speed_after = speed_after - _lowest_below_zero(speed_after)
     speed_before = _before(speed_0, speed_after)
 
     turn = xp.sin(slip) / rear_m * dt_s  # heading change per unit of speed
@@ -122,13 +122,12 @@ def _running_sum(values: Any) -> Any:
     return values if values.shape[-1] == 1 else namespace(values).cumsum(values, axis=-1)
 
 
-def _running_minimum(values: Any) -> Any:
-    if values.shape[-1] == 1:
-        return values
+def _lowest_below_zero(values: Any) -> Any:
+    """The least of each value and those before it, or 0 if none is negative."""
     xp = namespace(values)
     if xp is np:
-        return np.minimum.accumulate(values, axis=-1)
-    return xp.cummin(values, dim=-1).values
+        return np.minimum(np.minimum.accumulate(values, axis=-1), 0.0)
+    return xp.clamp(xp.cummin(values, dim=-1).values, max=0.0)
 
 
 def inverse(

@@ -232,11 +232,11 @@ def as_actions(
         raise AspEnvError(f"action of shape {actions.shape}: expected {expected}")
     if ignored is not None:
         actions = np.where(ignored[:, None], 0.0, actions)
-    finite = np.isfinite(actions)
-    if not finite.all():
-        wrong = actions if actions.ndim == 1 else actions[~finite.all(axis=1)][0]
+    if not np.isfinite(actions).all():
+        rows = actions.reshape(-1, 2)
+        wrong = rows[~np.isfinite(rows).all(axis=1)][0]
         raise AspEnvError(f"action {wrong.tolist()}: expected {expected}")
-    return np.clip(actions, -1.0, 1.0).astype(np.float32)
+    return np.minimum(np.maximum(actions, -1.0), 1.0).astype(np.float32)
 
 
 def _options(given: Mapping[str, Any]) -> ReplayOptions:

@@ -64,6 +64,17 @@ def _separated(
 
 @njit(cache=True)
 @no_type_check
+def turned_overlaps(x, y, cos, sin, length, width, x_o, y_o, cos_o, sin_o, length_o, width_o):
+    """`overlaps` of boxes whose headings are given by cosine and sine."""
+    dx, dy = x_o - x, y_o - y
+    half, wide, half_o, wide_o = 0.5 * length, 0.5 * width, 0.5 * length_o, 0.5 * width_o
+    if _separated(dx, dy, cos, sin, half, wide, cos_o, sin_o, half_o, wide_o):
+        return False
+    return not _separated(-dx, -dy, cos_o, sin_o, half_o, wide_o, cos, sin, half, wide)
+
+
+@njit(cache=True)
+@no_type_check
 def overlaps(x, y, heading, length, width, x_o, y_o, heading_o, length_o, width_o):
     """Whether two oriented boxes intersect (separating axis theorem); touching is no overlap."""
     dx, dy = x_o - x, y_o - y
@@ -71,10 +82,7 @@ def overlaps(x, y, heading, length, width, x_o, y_o, heading_o, length_o, width_
     if dx * dx + dy * dy >= reach * reach:
         return False
     c, s, co, so = math.cos(heading), math.sin(heading), math.cos(heading_o), math.sin(heading_o)
-    half, wide, half_o, wide_o = 0.5 * length, 0.5 * width, 0.5 * length_o, 0.5 * width_o
-    if _separated(dx, dy, c, s, half, wide, co, so, half_o, wide_o):
-        return False
-    return not _separated(-dx, -dy, co, so, half_o, wide_o, c, s, half, wide)
+    return turned_overlaps(x, y, c, s, length, width, x_o, y_o, co, so, length_o, width_o)
 
 
 @njit(cache=True)

@@ -1,14 +1,18 @@
-"""How an episode begins: what a recording holds of a scenario."""
+"""How episodes begin: what recordings hold of their scenarios."""
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import no_type_check
 
 import numpy as np
-from jaxtyping import Int
+from jaxtyping import Float, Int
+from numba import njit
 
 from asp_env.data.clock import frames_per_tick
-from asp_env.data.geometry import path_length, route_along
+from asp_env.data.geometry import route_along
 from asp_env.data.recording import Recording
 from asp_env.data.scenario import Scenario
-from asp_env.data.scene import infer_actions
-from asp_env.data.snippets import gather_window
 from asp_env.errors import AspEnvError
 from asp_env.metrics.boxes import ego_contacts, touching_trailers
 from asp_env.metrics.route import route_coordinates
@@ -19,76 +23,37 @@ BEYOND_M = 60.0
 """How far a route goes on straight behind the last recorded position."""
 
 
-def begin(recording: Recording, scenario: Scenario, *, dt_s: float, history: int) -> Episodes:
-    """A single episode at its first tick.
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Cast:
+    """Who takes part in an episode, where and when."""
+
+    scenario: Scenario
+    recording: Recording
+    tracks: Int[np.ndarray, " a"]
+    """The ego's first, the others' by first appearance, then id."""
+    first_frame: int
+    """Of the history."""
+    stride: int
+    """Frames in a tick."""
+    ticks: int
+    """Of the history, the present, and the scenario."""
+    route: Float[np.ndarray, "p 2"]
+
+
+def cast(recording: Recording, scenario: Scenario, *, dt_s: float, history: int) -> Cast:
+    """Everybody seen in a scenario or its history.
 
     Raises:
         AspEnvError: the scenario does not fit the recording.
     """
     stride = frames_per_tick(recording.frame_rate_hz, dt_s)
-    first_tick = scenario.start_tick - history
-    tracks = _tracks(recording, scenario, first_tick, stride)
-    ego = tracks[0]
-    states, valid = gather_window(
-        recording,
-        tracks,
-        first_tick=first_tick,
-        num_ticks=history + 1 + scenario.length,
-        stride=stride,
-    )
-    past = infer_actions(
-        states[:, : history + 1], valid[:, : history + 1], recording.sizes[tracks, 0], dt_s
-    )
-    states, valid = states.swapaxes(0, 1)[None], valid.swapaxes(0, 1)[None]
-    actions = np.zeros((*valid.shape, 2), dtype=np.float32)
-    actions[0, :history] = past.swapaxes(0, 1)
-    start_row = scenario.start_tick * stride - recording.first_frames[ego]
-    route = route_along(recording.track(int(ego))[start_row::stride], beyond_m=BEYOND_M)[None]
-    route_valid = np.ones(route.shape[:2], dtype=bool)
-    first = np.ascontiguousarray(states[:, history])
-    sizes = recording.sizes[tracks][None]
-    classes = recording.classes[tracks][None].astype(np.int32)
-    own_trailer = touching_trailers(first, sizes, classes, valid[:, history])
-    driven_m = np.full(1, path_length(states[0, history:, EGO, :2]))
-    goal = route_coordinates(route, route_valid, states[:, -1, EGO], driven_m)[:, 0]
-    simulated, present = states.copy(), valid.copy()
-    simulated[:, history + 1 :], present[:, history + 1 :] = 0, False
-    return Episodes(
-        states=simulated,
-        valid=present,
-        actions=actions,
-        inferred=np.full(1, history),
-        log_states=states,
-        log_valid=valid,
-        gone=np.zeros((1, len(tracks)), dtype=bool),
-        sizes=sizes,
-        classes=classes,
-        ids=recording.track_ids[tracks][None].astype(np.int64),
-        parked=recording.parked[tracks][None],
-        tracks=tracks[None],
-        route=route,
-        route_valid=route_valid,
-        on_route=route_coordinates(route, route_valid, first[:, EGO], np.zeros(1)),
-        contacts=ego_contacts(first, sizes, valid[:, history] & ~own_trailer),
-        own_trailer=own_trailer,
-        goal_m=goal,
-        recording=np.full(1, scenario.recording),
-        start_tick=np.full(1, scenario.start_tick),
-        elapsed=np.zeros(1, dtype=np.int64),
-        length=np.full(1, scenario.length),
-    )
-
-
-def _tracks(
-    recording: Recording, scenario: Scenario, first_tick: int, stride: int
-) -> Int[np.ndarray, " a"]:
-    """Everybody seen in the scenario or its history, the ego first."""
     found = np.flatnonzero(recording.track_ids == scenario.ego_id)
     if not len(found):
         raise AspEnvError(
             f"scenario {scenario.name}: recording {recording.name} has no track {scenario.ego_id}"
         )
     ego = int(found[0])
+    first_tick = scenario.start_tick - history
     last_tick = scenario.start_tick + scenario.length
     if (
         scenario.length < 1
@@ -101,4 +66,82 @@ def _tracks(
             f"{int(recording.last_frames[ego]) // stride}"
         )
     seen = recording.tracks_between(first_tick * stride, last_tick * stride)
-    return np.concatenate([[ego], seen[seen != ego]])
+    start = scenario.start_tick * stride - recording.first_frames[ego]
+    return Cast(
+        scenario=scenario,
+        recording=recording,
+        tracks=np.concatenate([[ego], seen[seen != ego]]),
+        first_frame=first_tick * stride,
+        stride=stride,
+        ticks=history + 1 + scenario.length,
+        route=route_along(recording.track(ego)[start::stride], beyond_m=BEYOND_M),
+    )
+
+
+def place(data: Episodes, rows: Int[np.ndarray, " n"], casts: Sequence[Cast], history: int) -> None:
+    """Writes episodes at their first tick into arrays that have room for them."""
+    driven_m = np.array(
+        [_place(data, b, each, history) for b, each in zip(rows.tolist(), casts, strict=True)]
+    )
+    first, there = data.states[rows, history], data.valid[rows, history]
+    last = data.log_states[rows, history + data.length[rows], EGO]
+    sizes, route, route_valid = data.sizes[rows], data.route[rows], data.route_valid[rows]
+    own_trailer = touching_trailers(first, sizes, data.classes[rows], there)
+    data.own_trailer[rows] = own_trailer
+    data.contacts[rows] = ego_contacts(first, sizes, there & ~own_trailer)
+    start = np.zeros(len(rows))
+    data.on_route[rows] = route_coordinates(route, route_valid, first[:, EGO], start)
+    data.goal_m[rows] = route_coordinates(route, route_valid, last, driven_m)[:, 0]
+
+
+def _place(data: Episodes, b: int, cast: Cast, history: int) -> float:
+    """Writes one episode; returns how far the logged ego drives, metres."""
+    data.clear(b)
+    recording, tracks = cast.recording, cast.tracks
+    agents, points = len(tracks), len(cast.route)
+    data.sizes[b, :agents] = recording.sizes[tracks]
+    data.classes[b, :agents] = recording.classes[tracks]
+    data.ids[b, :agents] = recording.track_ids[tracks]
+    data.parked[b, :agents] = recording.parked[tracks]
+    data.tracks[b, :agents] = tracks
+    data.route[b, :points] = cast.route
+    data.route_valid[b, :points] = True
+    data.recording[b] = cast.scenario.recording
+    data.start_tick[b], data.length[b] = cast.scenario.start_tick, cast.scenario.length
+    return _copy_tracks(
+        recording.states,
+        recording.starts[tracks],
+        recording.first_frames[tracks].astype(np.int64),
+        recording.last_frames[tracks].astype(np.int64),
+        *(cast.first_frame, cast.stride, cast.ticks, history),
+        *(data.log_states[b], data.log_valid[b], data.states[b], data.valid[b]),
+    )
+
+
+@njit(cache=True)
+@no_type_check
+def _copy_tracks(
+    rows, starts, first, last, first_frame, stride, ticks, history,
+    log_states, log_valid, states, valid,
+):  # fmt: skip
+    """Copies tracks into cleared arrays, time by time; the length of the ego's way after now."""
+    for a in range(len(starts)):
+        for k in range(ticks):
+            frame = first_frame + k * stride
+            if not first[a] <= frame <= last[a]:
+                continue
+            row = starts[a] + frame - first[a]
+            log_valid[k, a] = True
+            for field in range(4):
+                log_states[k, a, field] = rows[row, field]
+            if k <= history:
+                valid[k, a] = True
+                for field in range(4):
+                    states[k, a, field] = rows[row, field]
+    way = 0.0
+    for k in range(history, ticks - 1):
+        way += math.hypot(
+            log_states[k + 1, 0, 0] - log_states[k, 0, 0],
+            log_states[k + 1, 0, 1] - log_states[k, 0, 1],
+        )
+    return way

@@ -51,13 +51,10 @@ class Episodes:
         """A deep copy."""
         return Episodes(**{name: getattr(self, name).copy() for name in _NAMES})
 
-    def put(self, row: int, source: "Episodes", source_row: int = 0) -> None:
-        """Copies one episode; what its arrays lack of the room here is filled with padding."""
+    def clear(self, row: int) -> None:
+        """Makes one episode all padding."""
         for name in _NAMES:
-            target = getattr(self, name)
-            value = getattr(source, name)[source_row]
-            target[row] = _FILL.get(name, 0)
-            target[(row, *map(slice, value.shape))] = value
+            getattr(self, name)[row] = _FILL.get(name, 0)
 
     def with_room(self, *, ticks: int, agents: int, points: int) -> "Episodes":
         """These episodes, or a larger copy where the given sizes ask for more."""

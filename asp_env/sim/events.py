@@ -7,8 +7,11 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 
 from asp_env.data.road_map import RoadMap
-from asp_env.metrics.boxes import AT_FAULT
+from asp_env.metrics.boxes import AT_FAULT, Contact
 from asp_env.metrics.drivable import drivable_field
+
+_AT_FAULT = np.array([kind in AT_FAULT for kind in Contact])
+"""By the number of the contact."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -43,7 +46,7 @@ class Events:
     @property
     def at_fault(self) -> Bool[np.ndarray, " b"]:
         """Whether the ego touches somebody in a way that it answers for."""
-        return np.asarray(np.isin(self.contacts, [int(kind) for kind in AT_FAULT]).any(axis=1))
+        return np.asarray(_AT_FAULT[self.contacts].any(axis=1))
 
 
 def outside_now_m(

@@ -14,7 +14,7 @@ from numba import njit
 
 from asp_env.dynamics import MAX_ACCELERATION_MPS2, MAX_STEERING_RAD
 from asp_env.dynamics.bicycle import AXLE_SHARE_OF_LENGTH
-from asp_env.metrics.boxes import overlaps
+from asp_env.metrics.boxes import turned_overlaps
 from asp_env.metrics.route import project
 
 
@@ -44,6 +44,28 @@ class IDM:
         )
 
 
+@njit(cache=True)
+@no_type_check
+def limit_speeds(path, desired, stop_m, lateral, braking, limits):
+    """Fills in `speed_limits` of one path."""
+    count = len(path)
+    turn = 0.0
+    for i in range(count):
+        limits[i] = desired
+        # the turn from the 4 m before to the 4 m behind is that of 2 m: steps of 4 m, 1 m apart
+        at = min(max(i - 2, 0), count - 5)
+        if count >= 6:
+            before, after = max(at - 1, 0), min(at + 1, count - 5)
+            x, y = path[before + 4, 0] - path[before, 0], path[before + 4, 1] - path[before, 1]
+            u, v = path[after + 4, 0] - path[after, 0], path[after + 4, 1] - path[after, 1]
+            turn = abs(math.atan2(x * v - y * u, x * u + y * v)) / (after - before)
+            limits[i] = min(desired, math.sqrt(lateral / max(turn, 1e-4)))
+        if i >= stop_m:
+            limits[i] = 0.0
+    for i in range(count - 2, -1, -1):
+        limits[i] = min(limits[i], math.sqrt(limits[i + 1] ** 2 + 2.0 * braking))
+
+
 def speed_limits(
     path: Float[np.ndarray, "p 2"], desired_mps: float, idm: IDM, *, stop_m: float = math.inf
 ) -> Float[np.ndarray, " p"]:
@@ -51,43 +73,54 @@ def speed_limits(
 
     From `stop_m` metres on it is 0.
     """
-    if len(path) < 5:
-        return np.full(len(path), desired_mps, dtype=np.float32)
-    step = path[4:] - path[:-4]
-    heading = np.unwrap(np.arctan2(step[:, 1], step[:, 0]))
-    curvature = np.abs(np.gradient(heading)) if len(heading) > 1 else np.zeros(len(heading))
-    curvature = np.pad(curvature, 2, mode="edge")
-    lateral = np.sqrt(idm.max_lateral_acceleration_mps2 / np.maximum(curvature, 1e-4))
-    limit = np.minimum(desired_mps, lateral)
-    limit[np.arange(len(limit)) >= stop_m] = 0.0
-    for i in range(len(limit) - 2, -1, -1):
-        limit[i] = min(limit[i], math.sqrt(limit[i + 1] ** 2 + 2 * idm.comfortable_braking_mps2))
-    return limit.astype(np.float32)
+    limits = np.zeros(len(path), dtype=np.float32)
+    lateral, braking = idm.max_lateral_acceleration_mps2, idm.comfortable_braking_mps2
+    limit_speeds(path, desired_mps, stop_m, lateral, braking, limits)
+    return limits
 
 
 @njit(cache=True)
 @no_type_check
-def _gap(states, sizes, valid, me, path, count, arc, reach_m):
-    """(free metres ahead, speed along the path of what ends them); infinite if nothing does."""
+def free_ahead(states, sizes, counts_for, me, path, count, arc, reach_m):
+    """(free metres ahead, speed along the path of what ends them); infinite if nothing does.
+
+    A path's points are [x, y, cosine, sine of the box's heading]. Whoever `counts_for` something and whose centre is not behind ends it where the own box, swept
+    along the path with 15 cm to either side, would touch theirs.
+    """
+    length, width = sizes[me, 0], sizes[me, 1] + 0.3
+    x, y = states[me, 0], states[me, 1]
+    cos_me, sin_me = math.cos(states[me, 2]), math.sin(states[me, 2])
     first = int(arc) + 1
     last = min(count - 1, int(arc + reach_m) + 1)
-    for j in range(first, last):
-        heading = math.atan2(path[j + 1, 1] - path[j, 1], path[j + 1, 0] - path[j, 0])
-        for o in range(states.shape[0]):
-            if o == me or not valid[o]:
+    leader_speed, hit = 0.0, last
+    for o in range(states.shape[0]):
+        if o == me or not counts_for[o]:
+            continue
+        xo, yo = states[o, 0], states[o, 1]
+        dx, dy = xo - x, yo - y
+        touch = 0.5 * (math.hypot(length, width) + math.hypot(sizes[o, 0], sizes[o, 1]))
+        within = hit - arc + touch + 5.0  # the path may lie beside the vehicle
+        if dx * dx + dy * dy > within * within or dx * cos_me + dy * sin_me < 0.0:
+            continue
+        cos_o, sin_o = math.cos(states[o, 2]), math.sin(states[o, 2])
+        j = first
+        while j < hit:
+            px, py = path[j, 0], path[j, 1]
+            away = math.hypot(xo - px, yo - py) - touch
+            if away >= 1.0:  # points are 1 m apart: the next ones cannot touch either
+                j += int(away)
                 continue
-            if overlaps(
-                path[j, 0], path[j, 1], heading, sizes[me, 0], sizes[me, 1] + 0.3,
-                states[o, 0], states[o, 1], states[o, 2], sizes[o, 0], sizes[o, 1],
-            ):  # fmt: skip
-                behind = (states[o, 0] - states[me, 0]) * math.cos(states[me, 2]) + (
-                    states[o, 1] - states[me, 1]
-                ) * math.sin(states[me, 2])
-                if behind < 0.0:
-                    continue
-                speed = states[o, 3] * math.cos(states[o, 2] - heading)
-                return max(j - arc - 1.0, 0.0), max(speed, 0.0)
-    return np.inf, 0.0
+            ux, uy = path[j, 2], path[j, 3]
+            if turned_overlaps(
+                px, py, ux, uy, length, width, xo, yo, cos_o, sin_o, sizes[o, 0], sizes[o, 1]
+            ):
+                hit = j
+                leader_speed = max(states[o, 3] * (cos_o * ux + sin_o * uy), 0.0)
+                break
+            j += 1
+    if hit == last:
+        return np.inf, 0.0
+    return max(hit - arc - 1.0, 0.0), leader_speed
 
 
 @njit(cache=True)
@@ -112,7 +145,7 @@ def pursuit_steering(x, y, heading, speed, length, path, count, arc, offset_m):
 
     `offset_m` moves the followed line to the left of the path.
     """
-    ahead = max(3.0, 0.7 * abs(speed))
+    ahead = max(2.0, 0.45 * abs(speed))
     at = min(arc + ahead, count - 1.000001)
     i = max(0, min(int(at), count - 2))
     dx, dy = path[i + 1, 0] - path[i, 0], path[i + 1, 1] - path[i, 1]
@@ -140,7 +173,7 @@ def _follow(states, sizes, valid, driven, paths, counts, limits, arcs, law, acti
             arc, _, _ = project(path, count, x, y, max(arcs[b, a], 0.0), 15.0)
             arcs[b, a] = arc
             reach = max(law[5], law[4] * speed)
-            gap, leader = _gap(states[b], sizes[b], valid[b], a, path, count, arc, reach)
+            gap, leader = free_ahead(states[b], sizes[b], valid[b], a, path, count, arc, reach)
             wanted = limits[b, a, min(max(int(arc + 0.5), 0), count - 1)]
             actions[b, a, 0] = idm_acceleration(speed, wanted, gap, leader, law)
             actions[b, a, 1] = pursuit_steering(
@@ -161,5 +194,18 @@ def follow_paths(
 ) -> Float[np.ndarray, "b a 2"]:
     """Actions of the driven agents along their paths; `arcs` (metres gone) is brought up to now."""
     actions = np.zeros((*valid.shape, 2), dtype=np.float32)
-    _follow(states, sizes, valid, driven, paths, counts, limits, arcs, idm.as_row(), actions)
+    step = np.diff(paths, axis=2, append=paths[:, :, -1:])
+    norm = np.maximum(np.linalg.norm(step, axis=-1, keepdims=True), 1e-6)
+    _follow(
+        states,
+        sizes,
+        valid,
+        driven,
+        np.concatenate([paths, step / norm], axis=-1),
+        counts,
+        limits,
+        arcs,
+        idm.as_row(),
+        actions,
+    )
     return actions

@@ -32,6 +32,7 @@ class Part(Protocol):
         """Past ticks that it needs."""
         ...
 
+    @property
     def spaces(self) -> dict[str, spaces.Box]:
         """The space of each part, for one target."""
         ...
@@ -72,16 +73,15 @@ class Observer:
             self._parts.append(part)
         if len(set(names)) < len(names):
             raise AspEnvError(f"observations {', '.join(names)}: name each once")
-        self.space = spaces.Dict(
-            {name: box for part in self._parts for name, box in part.spaces().items()}
-        )
+        boxes = {name: box for part in self._parts for name, box in part.spaces.items()}
+        self.space = spaces.Dict(boxes)
+        self._shapes = {name: (box.shape, box.dtype) for name, box in boxes.items()}
 
     def memory(self, count: int) -> Observation:
         """Fresh memory for what `count` targets see."""
         return {
-            name: np.empty((count, *box.shape), dtype=box.dtype)
-            for part in self._parts
-            for name, box in part.spaces().items()
+            name: np.empty((count, *shape), dtype=dtype)
+            for name, (shape, dtype) in self._shapes.items()
         }
 
     def observe(self, sight: Sight, events: Events, out: Observation | None = None) -> Observation:

@@ -13,7 +13,7 @@ from asp_env.data.scene import Scene, infer_actions
 from asp_env.dynamics import forward
 from asp_env.metrics.boxes import ego_contacts
 from asp_env.metrics.route import route_coordinates
-from asp_env.sim.beginning import begin
+from asp_env.sim.beginning import cast, place
 from asp_env.sim.episodes import Episodes, no_episodes
 from asp_env.sim.events import Events, outside_now_m
 from asp_env.sim.kernels import read_window, write_tick
@@ -37,6 +37,7 @@ class ReplayWorld:
         self.episodes = no_episodes(num_episodes, ticks=history + 2, agents=1, points=2)
         self._maps: tuple[RoadMap, ...] = ()
         self._map_index = np.zeros(num_episodes, dtype=np.int64)
+        self._rows = np.arange(num_episodes)
 
     def __len__(self) -> int:
         """How many episodes run side by side."""
@@ -59,22 +60,26 @@ class ReplayWorld:
             AspEnvError: a scenario does not fit its recording.
         """
         chosen = np.flatnonzero(np.ones(len(self), dtype=bool) if where is None else where)
-        begun = {b: self._begin(scenarios[b]) for b in chosen.tolist()}
-        if not begun:
+        if not len(chosen):
             return
+        casts = [
+            cast(
+                self.recordings[scenarios[b].recording],
+                scenarios[b],
+                dt_s=self.dt_s,
+                history=self.history,
+            )
+            for b in chosen.tolist()
+        ]
         self.episodes = self.episodes.with_room(
-            ticks=max(each.valid.shape[1] for each in begun.values()),
-            agents=max(each.valid.shape[2] for each in begun.values()),
-            points=max(each.route.shape[1] for each in begun.values()),
+            ticks=max(each.ticks for each in casts),
+            agents=max(len(each.tracks) for each in casts),
+            points=max(len(each.route) for each in casts),
         )
-        for b, each in begun.items():
+        place(self.episodes, chosen, casts, self.history)
+        for b in chosen.tolist():
             self.scenarios[b], self.rngs[b] = scenarios[b], rngs[b]
-            self.episodes.put(b, each)
         self._find_maps()
-
-    def _begin(self, scenario: Scenario) -> Episodes:
-        recording = self.recordings[scenario.recording]
-        return begin(recording, scenario, dt_s=self.dt_s, history=self.history)
 
     def _find_maps(self) -> None:
         used, index = np.unique(self.episodes.recording, return_inverse=True)
@@ -129,9 +134,8 @@ class ReplayWorld:
 
     def _judge_contacts(self) -> None:
         """Brings contacts up to now."""
-        data, rows = self.episodes, np.arange(len(self))
-        states = np.ascontiguousarray(data.states[rows, self.now])
-        valid = np.ascontiguousarray(data.valid[rows, self.now])
+        data, now = self.episodes, self.now
+        states, valid = data.states[self._rows, now], data.valid[self._rows, now]
         data.contacts = ego_contacts(states, data.sizes, valid & ~data.own_trailer, data.contacts)
 
     def scene(self) -> Scene:
@@ -160,14 +164,16 @@ class ReplayWorld:
 
     def _infer_actions(self) -> None:
         """Brings the inferred actions up to now."""
-        data, now = self.episodes, self.now
-        while len(rows := np.flatnonzero(data.inferred < now)):
-            at = data.inferred[rows]
-            pair = np.stack([data.states[rows, at], data.states[rows, at + 1]], axis=2)
-            there = np.stack([data.valid[rows, at], data.valid[rows, at + 1]], axis=2)
-            found = infer_actions(pair, there, data.sizes[rows, :, 0], self.dt_s)
-            data.actions[rows, at] = found[:, :, 0]
-            data.inferred[rows] += 1
+        data = self.episodes
+        behind = self.now - data.inferred
+        for missing in np.unique(behind[behind > 0]).tolist():
+            rows = np.flatnonzero(behind == missing)
+            at = data.inferred[rows, None] + np.arange(missing + 1)
+            states = data.states[rows[:, None], at].swapaxes(1, 2)
+            valid = data.valid[rows[:, None], at].swapaxes(1, 2)
+            found = infer_actions(states, valid, data.sizes[rows, :, 0], self.dt_s)
+            data.actions[rows[:, None], at[:, :-1]] = found.swapaxes(1, 2)
+            data.inferred[rows] += missing
 
     def maps(self) -> tuple[tuple[RoadMap, ...], Int[np.ndarray, " b"]]:
         """The maps of the episodes' recordings, and which of them each episode lies on."""
@@ -175,7 +181,7 @@ class ReplayWorld:
 
     def ego_states(self) -> Float[np.ndarray, "b 4"]:
         """The egos' states now."""
-        return self.episodes.states[np.arange(len(self)), self.now, EGO]
+        return self.episodes.states[self._rows, self.now, EGO]
 
     def events(self) -> Events:
         """What holds now."""

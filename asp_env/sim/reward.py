@@ -2,10 +2,12 @@
 
 import math
 from collections.abc import Mapping
-from dataclasses import asdict, dataclass, fields
+from dataclasses import dataclass, fields
+from typing import no_type_check
 
 import numpy as np
 from jaxtyping import Float
+from numba import njit
 
 from asp_env.dynamics import MAX_ACCELERATION_MPS2
 from asp_env.errors import AspEnvError, unknown_name
@@ -52,23 +54,43 @@ def reward_terms(
     dt_s: float,
 ) -> dict[str, Float[np.ndarray, " b"]]:
     """Unweighted terms of one step, each (B,)."""
-    goal = np.maximum(after.goal_m, MIN_GOAL_M)
-    gained = np.clip(after.route_m, 0, goal) - np.clip(before.route_m, 0, goal)
-    turned = np.angle(np.exp(1j * (states_after[:, 2] - states_before[:, 2]).astype(np.float64)))
-    longitudinal = (states_after[:, 3] - states_before[:, 3]) / dt_s
-    lateral = states_after[:, 3] * turned / dt_s
-    strain = (longitudinal**2 + lateral**2) / (2 * MAX_ACCELERATION_MPS2**2)
+    progress, comfort = np.empty(len(after.goal_m)), np.empty(len(after.goal_m))
+    _gains(before.route_m, after.route_m, after.goal_m, progress)
+    _strains(states_before, states_after, dt_s, comfort)
     return {
-        "progress": gained / goal,
-        "comfort": -strain.astype(np.float64),
+        "progress": progress,
+        "comfort": comfort,
         "collision": -after.at_fault.astype(np.float64),
         "off_road": -dt_s * (after.off_road_m > OFF_ROAD_M),
     }
+
+
+@njit(cache=True)
+@no_type_check
+def _gains(before, after, goals, out):
+    """Shares of the ways to the goals that were gained; only what lies on a way counts."""
+    for b in range(len(out)):
+        goal = max(goals[b], MIN_GOAL_M)
+        out[b] = (min(max(after[b], 0.0), goal) - min(max(before[b], 0.0), goal)) / goal
+
+
+@njit(cache=True)
+@no_type_check
+def _strains(before, after, dt_s, out):
+    """Minus the mean squares of both accelerations, as shares of the limit."""
+    for b in range(len(out)):
+        turned = np.float64(after[b, 2]) - before[b, 2]
+        turned -= 2.0 * math.pi * np.rint(turned / (2.0 * math.pi))
+        longitudinal = (np.float64(after[b, 3]) - before[b, 3]) / dt_s
+        lateral = after[b, 3] * turned / dt_s
+        out[b] = -(longitudinal**2 + lateral**2) / (2.0 * MAX_ACCELERATION_MPS2**2)
 
 
 def weighted_sum(
     terms: dict[str, Float[np.ndarray, " b"]], weights: RewardWeights
 ) -> Float[np.ndarray, " b"]:
     """The reward, (B,)."""
-    by_name = asdict(weights)
-    return np.sum([by_name[name] * value for name, value in terms.items()], axis=0)
+    total = np.zeros(len(terms["progress"]))
+    for name, value in terms.items():
+        total += getattr(weights, name) * value
+    return total

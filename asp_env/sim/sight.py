@@ -48,6 +48,8 @@ def ego_sight(world: ReplayWorld, rows: Int[np.ndarray, " n"] | None = None) -> 
     rows = np.arange(len(world)) if rows is None else rows
     shape = (len(rows), data.ids.shape[1], world.history + 1)
     states, valid = np.empty((*shape, 4), dtype=np.float32), np.empty(shape, dtype=bool)
+    targets = np.full((len(rows), 2), EGO)
+    targets[:, 0] = np.arange(len(rows))
     _last_ticks(data.states, data.valid, world.now, rows, states, valid)
     sizes, classes, ids, routes, route_valid = (
         column if everyone else column[rows]
@@ -59,11 +61,11 @@ def ego_sight(world: ReplayWorld, rows: Int[np.ndarray, " n"] | None = None) -> 
         sizes=sizes,
         classes=classes,
         ids=ids,
-        targets=np.stack([np.arange(len(rows)), np.full(len(rows), EGO)], axis=-1),
+        targets=targets,
         routes=routes,
         route_valid=route_valid,
         maps=maps,
-        map_index=map_index[rows],
+        map_index=map_index if everyone else map_index[rows],
         dt_s=world.dt_s,
     )
 

@@ -49,10 +49,10 @@ class Simulation:
         self, ego_actions: Float[np.ndarray, "b 2"], ego_driven: Bool[np.ndarray, " b"]
     ) -> None:
         """One tick. Egos that are not driven replay their log."""
-        actions = np.zeros((*self.world.episodes.ids.shape, 2), dtype=np.float32)
-        driven = np.zeros(actions.shape[:2], dtype=bool)
+        control = self.driver.control(self.world)
+        actions, driven = control.actions.copy(), control.driven.copy()
         actions[:, EGO], driven[:, EGO] = ego_actions, ego_driven
-        self.step_agents(actions, driven)
+        self.world.step(actions, driven, control.leaving)
 
     def step_agents(
         self, actions: Float[np.ndarray, "b a 2"], driven: Bool[np.ndarray, "b a"]
@@ -62,11 +62,11 @@ class Simulation:
         The ego is never the traffic's: one that is not driven replays its log.
         """
         control = self.driver.control(self.world)
-        traffics = control.driven & ~driven
-        traffics[:, EGO] = False
+        theirs = control.driven & ~driven
+        theirs[:, EGO] = False
         self.world.step(
             np.where(driven[..., None], actions, control.actions),
-            driven | traffics,
+            driven | theirs,
             control.leaving & ~driven,
         )
 

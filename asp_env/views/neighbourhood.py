@@ -25,6 +25,24 @@ FIRST_KIND = 4
 
 @njit(cache=True, nogil=True)
 @no_type_check
+def target_poses(states, valid, targets, poses):
+    """Writes x, y and heading of every target now; of one that is not there, zeros.
+
+    Args:
+        states: (situations, slots, ticks, 4) float32, the last tick is now.
+        valid: (situations, slots, ticks).
+        targets: (targets, 2) situation and slot.
+        poses: (targets, 3), written.
+    """
+    for t in range(len(targets)):
+        b, ego = targets[t]
+        there = valid[b, ego, -1]
+        for field in range(3):  # what is not valid may hold anything
+            poses[t, field] = states[b, ego, -1, field] if there else 0.0
+
+
+@njit(cache=True, nogil=True)
+@no_type_check
 def place_agents(
     states, valid, sizes, classes, groups, ids, targets, frames, own_past, agents, agents_valid
 ):
@@ -40,8 +58,8 @@ def place_agents(
         targets: (targets, 2) situation and slot.
         frames: (targets, 4) x, y, cos and sin of the targets now, float64.
         own_past: whether the targets are shown before now.
-        agents: (targets, agents, ticks, fields), zeros.
-        agents_valid: (targets, agents, ticks), false.
+        agents: (targets, agents, ticks, fields), written.
+        agents_valid: (targets, agents, ticks), written.
     """
     num_ticks = states.shape[2]
     chosen = np.empty(agents.shape[1], dtype=np.int64)
@@ -49,6 +67,7 @@ def place_agents(
     for t in range(len(targets)):
         b, ego = targets[t]
         if not valid[b, ego, num_ticks - 1]:
+            agents[t], agents_valid[t] = 0.0, False
             continue
         x_0, y_0, cos_0, sin_0 = frames[t, 0], frames[t, 1], frames[t, 2], frames[t, 3]
         count = _choose_agents(
@@ -57,11 +76,14 @@ def place_agents(
         for i in range(count):
             a = chosen[i]
             group = FIRST_GROUP + groups[classes[b, a]]
-            for k in range(num_ticks - 1 if i == 0 and not own_past else 0, num_ticks):
-                if not valid[b, a, k]:
-                    continue
-                agents_valid[t, i, k] = True
+            first = num_ticks - 1 if i == 0 and not own_past else 0
+            for k in range(num_ticks):
                 row = agents[t, i, k]
+                seen = k >= first and valid[b, a, k]
+                agents_valid[t, i, k] = seen
+                if not seen:
+                    row[:] = 0.0
+                    continue
                 dx, dy = states[b, a, k, 0] - x_0, states[b, a, k, 1] - y_0
                 cos, sin = math.cos(states[b, a, k, 2]), math.sin(states[b, a, k, 2])
                 row[0] = cos_0 * dx + sin_0 * dy
@@ -71,7 +93,9 @@ def place_agents(
                 row[4] = states[b, a, k, 3]
                 row[5] = sizes[b, a, 0]
                 row[6] = sizes[b, a, 1]
+                row[FIRST_GROUP:] = 0.0
                 row[group] = 1.0
+        agents[t, count:], agents_valid[t, count:] = 0.0, False
 
 
 @njit(cache=True, nogil=True)
@@ -110,24 +134,32 @@ def _choose_agents(states, valid, ids, ego, origin, chosen, distances):
 
 @njit(cache=True, nogil=True)
 @no_type_check
-def place_lines(middles, points, kinds, rows, frames, lines, lines_valid):
-    """Writes the lines of those targets that are on one map.
+def place_lines(middles, points, kinds, valid, targets, here, frames, lines, lines_valid):
+    """Writes the lines of those targets that are on one map; of one that is not there, zeros.
 
     Args:
         middles: (2, pieces) of the map's pieces.
         points: (pieces, points, 4) x, y, cos, sin.
         kinds: (pieces,) indices into `KINDS`.
-        rows: (m,) which targets.
+        valid: (situations, slots, ticks), the last tick is now.
+        targets: (targets, 2) situation and slot.
+        here: (situations,) whether it is on this map.
         frames: (targets, 4) x, y, cos and sin of the targets now, float64.
-        lines: (targets, lines, points, fields), zeros.
-        lines_valid: (targets, lines, points), false.
+        lines: (targets, lines, points, fields); those of the targets here are written.
+        lines_valid: (targets, lines, points), the same.
     """
     chosen = np.arange(min(lines.shape[1], len(kinds)))
-    distances = np.empty(len(kinds))
-    for t in rows:
+    distances, scratch = np.empty(len(kinds)), np.empty(len(kinds))
+    for t in range(len(targets)):
+        b, ego = targets[t]
+        if not here[b]:
+            continue
+        if not valid[b, ego, -1]:
+            lines[t], lines_valid[t] = 0.0, False
+            continue
         x_0, y_0, cos_0, sin_0 = frames[t, 0], frames[t, 1], frames[t, 2], frames[t, 3]
         if len(chosen) < len(kinds):
-            _choose_pieces(middles, (x_0, y_0, cos_0, sin_0), chosen, distances)
+            _choose_pieces(middles, (x_0, y_0, cos_0, sin_0), chosen, distances, scratch)
         for i in range(len(chosen)):
             piece, kind = points[chosen[i]], FIRST_KIND + kinds[chosen[i]]
             for k in range(points.shape[1]):
@@ -137,13 +169,15 @@ def place_lines(middles, points, kinds, rows, frames, lines, lines_valid):
                 row[1] = cos_0 * dy - sin_0 * dx
                 row[2] = cos_0 * piece[k, 2] + sin_0 * piece[k, 3]
                 row[3] = cos_0 * piece[k, 3] - sin_0 * piece[k, 2]
+                row[FIRST_KIND:] = 0.0
                 row[kind] = 1.0
-                lines_valid[t, i, k] = True
+        lines[t, len(chosen) :] = 0.0
+        lines_valid[t, : len(chosen)], lines_valid[t, len(chosen) :] = True, False
 
 
 @njit(cache=True, nogil=True)
 @no_type_check
-def _choose_pieces(middles, frame, chosen, distances):
+def _choose_pieces(middles, frame, chosen, distances, scratch):
     """Writes the indices of the nearest pieces in their order; of equally near ones the first.
 
     Args:
@@ -151,6 +185,7 @@ def _choose_pieces(middles, frame, chosen, distances):
         frame: x, y, cos and sin of the target now.
         chosen: (lines,) is written; fewer than there are pieces.
         distances: (pieces,) is written, squared.
+        scratch: (pieces,) is written.
     """
     x_0, y_0, cos_0, sin_0 = frame
     most = len(chosen)
@@ -161,11 +196,43 @@ def _choose_pieces(middles, frame, chosen, distances):
         ahead = cos_0 * dx + sin_0 * dy - AHEAD_M
         left = SIDEWAYS * (cos_0 * dy - sin_0 * dx)
         distances[p] = ahead * ahead + left * left
-    limit = np.partition(distances, most - 1)[most - 1]
-    ties = most - (distances < limit).sum()
+    limit = _kth_smallest(distances, most - 1, scratch)
+    ties = most
+    for p in range(len(distances)):
+        ties -= distances[p] < limit
     i = 0
     for p in range(len(distances)):
         if distances[p] < limit or (distances[p] == limit and ties > 0):
             ties -= distances[p] == limit
             chosen[i] = p
             i += 1
+
+
+@njit(cache=True, nogil=True)
+@no_type_check
+def _kth_smallest(values, k, scratch):
+    """The value that would be at index `k` if the values were sorted (Hoare's selection).
+
+    `np.partition` gives the same and takes three times as long.
+    """
+    scratch[:] = values
+    low, high = 0, len(scratch) - 1
+    while low < high:
+        pivot = scratch[(low + high) // 2]
+        i, j = low, high
+        while i <= j:
+            while scratch[i] < pivot:
+                i += 1
+            while scratch[j] > pivot:
+                j -= 1
+            if i <= j:
+                scratch[i], scratch[j] = scratch[j], scratch[i]
+                i += 1
+                j -= 1
+        if k <= j:
+            high = j
+        elif k >= i:
+            low = i
+        else:
+            break
+    return scratch[k]

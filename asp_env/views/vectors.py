@@ -26,7 +26,7 @@ from asp_env.errors import AspEnvError
 from asp_env.views.boundaries import MapCache
 from asp_env.views.drawable import Drawable
 from asp_env.views.lane_pieces import KINDS, POINTS, LanePieces, lane_pieces
-from asp_env.views.neighbourhood import place_agents, place_lines
+from asp_env.views.neighbourhood import place_agents, place_lines, target_poses
 
 GROUPS = {
     "car": (AgentClass.CAR, AgentClass.VAN),
@@ -178,42 +178,37 @@ class VectorView:
                 f"view {self.name!r} needs {self.history} past ticks, the scene has "
                 f"{scene.history}: take a longer history"
             )
-        shape = self.shape
         out = self._memory(len(scene.targets), out)
-        for part in out:
-            part.fill(0)
-        states = np.ascontiguousarray(scene.states[:, :, -shape.ticks :], dtype=np.float32)
-        valid = np.ascontiguousarray(scene.valid[:, :, -shape.ticks :])
+        states = np.ascontiguousarray(scene.states[:, :, -self.history - 1 :], dtype=np.float32)
+        valid = np.ascontiguousarray(scene.valid[:, :, -self.history - 1 :])
         targets = np.ascontiguousarray(scene.targets, dtype=np.int64)
-        situation, slot = targets[:, 0], targets[:, 1]
-        # What is not valid may hold anything, so no pose is made of it.
-        known = valid[situation, slot, -1]
-        poses = np.where(known[:, None], states[situation, slot, -1, :3], 0).astype(np.float64)
-        frames = np.stack(
-            [poses[:, 0], poses[:, 1], np.cos(poses[:, 2]), np.sin(poses[:, 2])], axis=-1
-        )
+        poses, frames = np.empty((len(targets), 3)), np.empty((len(targets), 4))
+        target_poses(states, valid, targets, poses)
+        frames[:, :2] = poses[:, :2]
+        np.cos(poses[:, 2], out=frames[:, 2])
+        np.sin(poses[:, 2], out=frames[:, 3])
         place_agents(
             states,
             valid,
             np.ascontiguousarray(scene.sizes, dtype=np.float32),
-            np.ascontiguousarray(scene.classes, dtype=np.int64),
+            scene.classes,
             _GROUP_OF_CLASS,
-            np.ascontiguousarray(scene.ids, dtype=np.int64),
+            scene.ids,
             targets,
             frames,
             self.own_past,
             out.agents,
             out.agents_valid,
         )
-        map_of_target = np.where(known, scene.map_index[situation], -1)
         for index, road_map in enumerate(scene.maps):
             pieces = self._pieces(road_map)
-            rows = np.flatnonzero(map_of_target == index)
             place_lines(
                 pieces.middles,
                 pieces.points,
                 pieces.kinds,
-                rows,
+                valid,
+                targets,
+                scene.map_index == index,
                 frames,
                 out.lines,
                 out.lines_valid,
@@ -222,10 +217,7 @@ class VectorView:
 
     def _memory(self, count: int, out: Vectors | None) -> Vectors:
         """`out`, or fresh memory where there is none."""
-        shape = self.shape
-        agents = (count, shape.agents, shape.ticks)
-        lines = (count, shape.lines, shape.points)
-        shapes = ((*agents, shape.agent_fields), agents, (*lines, shape.line_fields), lines)
+        shapes = self._shapes(count)
         if out is None:
             kinds = (np.float32, np.bool_, np.float32, np.bool_)
             return Vectors(*(np.empty(*each) for each in zip(shapes, kinds, strict=True)))
@@ -233,3 +225,8 @@ class VectorView:
         if found != shapes or not all(part.flags.c_contiguous for part in out):
             raise AspEnvError(f"cannot draw into {found}: give C-contiguous arrays {shapes}")
         return out
+
+    def _shapes(self, count: int) -> tuple[tuple[int, ...], ...]:
+        """Of the arrays of `Vectors`."""
+        agents, lines = (count, self.agents, self.history + 1), (count, self.lines, POINTS)
+        return (*agents, len(AGENT_FIELDS)), agents, (*lines, len(LINE_FIELDS)), lines
