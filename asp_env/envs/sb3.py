@@ -39,6 +39,8 @@ class Member:
 
     def __getattr__(self, name: str) -> Any:
         """An attribute of this environment; what is one for all is shared."""
+        if name.startswith("_"):  # copies ask for such before there is anything
+            raise AttributeError(name)
         if name in _PER_MEMBER:
             return self._of_all(name)[self._number]
         found = self._of_all(f"single_{name}" if name in _SINGLE else name)

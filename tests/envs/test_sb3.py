@@ -1,5 +1,6 @@
 """The adapter for stable-baselines3 against its own `DummyVecEnv` over single environments."""
 
+import copy
 import subprocess
 import sys
 from typing import Any
@@ -160,6 +161,19 @@ def test_forecasts_for_stable_baselines3(crossing):
     assert over.any()
     assert envs.get_attr("dt_s", 0) == [0.2]
     assert len(envs.env_method("scene", indices=0)) == 1
+
+
+def test_a_copy_goes_on_in_the_same_way(crossing):
+    """Through the ends of episodes."""
+    envs = _adapter(crossing)
+    envs.seed(2)
+    envs.reset()
+    twin = copy.deepcopy(envs)
+    for _ in range(20):
+        actions = np.full((COUNT, 2), (1.0, 0.3), dtype=np.float32)
+        told = envs.step(actions)
+        same(told, twin.step(actions))
+    same(envs.get_attr("np_random_seed"), twin.get_attr("np_random_seed"))
 
 
 def test_refuses_other_autoresets(crossing):
