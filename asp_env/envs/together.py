@@ -8,7 +8,6 @@ from jaxtyping import Bool, Int
 
 from asp_env.data.classes import PREDICTED, AgentClass
 from asp_env.data.clock import frames_per_tick
-from asp_env.data.geometry import path_length
 from asp_env.data.recording import Recording
 from asp_env.data.scenario import Scenario
 from asp_env.errors import AspEnvError, unknown_name
@@ -73,8 +72,8 @@ def viewpoints(
 ) -> list[Scenario]:
     """The scenario from the view of each of its agents, that of its own ego first.
 
-    Agents are the ego and the wanted vehicles that could be one: there for the whole history, with
-    at least 1 m to go until the scenario ends or their track does. Of more than `most` those that
+    Agents are the ego and the wanted vehicles that could be one: there for the whole history, and
+    in the log once 1 m away before the scenario or their track ends. Of more than `most` those that
     start nearest to the ego are taken. They are in the order of slots.
     """
     stride, start = frames_per_tick(recording.frame_rate_hz, dt_s), scenario.start_tick
@@ -87,7 +86,8 @@ def viewpoints(
         first, last = int(recording.first_frames[track]), int(recording.last_frames[track])
         length = min(scenario.length, last // stride - start)
         way = recording.track(track)[(start + np.arange(length + 1)) * stride - first, :2]
-        if path_length(way) >= MIN_GOAL_M:
+        # not the length of the way, which jitter adds up to while a vehicle stands
+        if np.hypot(*(way - way[0]).T).max() >= MIN_GOAL_M:
             number = int(recording.track_ids[track])
             view = dataclasses.replace(scenario, ego_id=number, length=length, tags=())
             found.append((float(np.hypot(*(way[0] - here))), first, number, view))

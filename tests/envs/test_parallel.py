@@ -155,6 +155,18 @@ def test_a_crash_by_hand(queue):
     assert list(_states(env, "vehicle_1")) == [2]
 
 
+def test_who_stands_all_the_while_is_traffic(tmp_path):
+    """C stops at 2 s for good, before the scenario of A begins at 3 s."""
+    drives = (
+        Drive(kind=AgentClass.CAR, start=(-90.0, -1.75, 0.0, 8.0)),
+        Drive(kind=AgentClass.CAR, start=(30.0, 1.75, math.pi, 4.0), phases=((2.0, -2.0, 0.0),)),
+    )
+    env = _make(str(write_crossing(tmp_path, drives=(drives,))))
+    env.reset(options={"scenario": 0})
+    assert env.agents == ["vehicle_0"]
+    assert list(_states(env, "vehicle_0")) == [1, 2]
+
+
 def test_actions_move_the_agent_that_they_are_for(queue):
     """B speeds up by 5 m/s² for a second, from 4 to 9 m/s; A brakes as hard, from 8 to 3 m/s."""
     env = _make(queue)
