@@ -48,7 +48,7 @@ def main(
     train_on: str = "runs/eight-places",
     held_out: Sequence[str] = ("sample:intersection", "synthetic:intersection"),
     *,
-    steps: int = 300_000,
+    steps: int = 200_000,
     num_envs: int = 64,
     count: int = 200,
 ) -> Scores:

@@ -16,43 +16,8 @@ from asp_env.errors import AspEnvError
 Infos = list[dict[str, Any]]
 Observations = dict[str, np.ndarray]
 
-_PER_MEMBER = ("np_random", "np_random_seed")
+_OF_EACH = ("np_random", "np_random_seed")
 _SINGLE = ("observation_space", "action_space")
-
-
-class Member:
-    """One environment of a vector environment, as far as `get_attr` and `env_method` reach."""
-
-    def __init__(self, envs: VectorEnv, number: int) -> None:
-        """The environment of that number."""
-        self._envs = envs
-        self._number = number
-
-    def scene(self) -> Scene:
-        """What `ReplayEnv.scene` returns."""
-        return self._of_all("scene")().situation(self._number)
-
-    def render(self) -> Any:
-        """What `ReplayEnv.render` returns."""
-        pictures = self._envs.render()
-        return None if pictures is None else pictures[self._number]
-
-    def __getattr__(self, name: str) -> Any:
-        """An attribute of this environment; what is one for all is shared."""
-        if name.startswith("_"):  # copies ask for such before there is anything
-            raise AttributeError(name)
-        if name in _PER_MEMBER:
-            return self._of_all(name)[self._number]
-        found = self._of_all(f"single_{name}" if name in _SINGLE else name)
-        if callable(found):
-            raise AttributeError(f"{name} is a method for all environments at once, not for one")
-        return found
-
-    def _of_all(self, name: str) -> Any:
-        layer = self._envs
-        while not hasattr(layer, name) and layer is not layer.unwrapped:
-            layer = layer.env  # pyright: ignore[reportAttributeAccessIssue]
-        return getattr(layer, name)
 
 
 class ReplayVecEnv(VecEnv):
@@ -74,7 +39,6 @@ class ReplayVecEnv(VecEnv):
                 "or 'Disabled' in wrappers"
             )
         self.envs = envs
-        self._members = [Member(envs, number) for number in range(envs.num_envs)]
         self._actions = np.zeros((envs.num_envs, 2), dtype=np.float32)
         super().__init__(envs.num_envs, envs.single_observation_space, envs.single_action_space)
 
@@ -138,12 +102,19 @@ class ReplayVecEnv(VecEnv):
         return list(pictures)
 
     def get_attr(self, attr_name: str, indices: VecEnvIndices = None) -> list[Any]:
-        """An attribute of each environment.
+        """An attribute of each environment; what is one for all is shared.
 
         Raises:
-            AttributeError: they have none of that name.
+            AttributeError: they have none of that name, or it is a method.
         """
-        return [getattr(member, attr_name) for member in self._chosen(indices)]
+        chosen = self._get_indices(indices)
+        if attr_name in _OF_EACH:
+            of_each = self._of_all(attr_name)
+            return [of_each[b] for b in chosen]
+        found = self._of_all(f"single_{attr_name}" if attr_name in _SINGLE else attr_name)
+        if callable(found):
+            raise AttributeError(f"{attr_name} is a method: call it by env_method")
+        return [found for _ in chosen]
 
     def set_attr(self, attr_name: str, value: Any, indices: VecEnvIndices = None) -> None:
         """Sets an attribute of all environments, which share it.
@@ -151,7 +122,7 @@ class ReplayVecEnv(VecEnv):
         Raises:
             AspEnvError: only some environments are named.
         """
-        if len(self._chosen(indices)) < self.num_envs:
+        if len(list(self._get_indices(indices))) < self.num_envs:
             raise AspEnvError(f"attribute {attr_name}: is one for all environments, not for some")
         setattr(self.envs.unwrapped, attr_name, value)
 
@@ -162,23 +133,35 @@ class ReplayVecEnv(VecEnv):
         indices: VecEnvIndices = None,
         **method_kwargs: Any,
     ) -> list[Any]:
-        """Calls a method of each environment: `scene` or `render`.
+        """What `scene` or `render` returns of each environment.
 
         Raises:
             AttributeError: one environment alone has no such method.
         """
-        methods = [getattr(member, method_name) for member in self._chosen(indices)]
-        return [method(*method_args, **method_kwargs) for method in methods]
+        if method_name not in ("scene", "render") or method_args or method_kwargs:
+            raise AttributeError(
+                f"method {method_name}: one environment alone has scene() and render()"
+            )
+        chosen = list(self._get_indices(indices))
+        if method_name == "scene":
+            scene: Scene = self._of_all("scene")()
+            return [scene.situation(b) for b in chosen]
+        pictures: Any = self.envs.render()
+        return [None if pictures is None else pictures[b] for b in chosen]
 
     def env_is_wrapped(
         self, wrapper_class: type[gymnasium.Wrapper], indices: VecEnvIndices = None
     ) -> list[bool]:
         """Wrappers of single environments are around none."""
         del wrapper_class
-        return [False for _ in self._chosen(indices)]
+        return [False for _ in self._get_indices(indices)]
 
-    def _chosen(self, indices: VecEnvIndices) -> list[Member]:
-        return [self._members[b] for b in self._get_indices(indices)]
+    def _of_all(self, name: str) -> Any:
+        """An attribute of the vector environment or of what its wrappers wrap."""
+        layer: Any = self.envs
+        while not hasattr(layer, name) and layer is not layer.unwrapped:
+            layer = layer.env
+        return getattr(layer, name)
 
 
 def _by_member(infos: dict[str, Any], count: int) -> Infos:

@@ -103,8 +103,9 @@ def test_attributes_and_methods_of_each_environment(crossing):
         everybody = np.flatnonzero(mine.ids[0] >= 0)
         same(mine.states[:, everybody], its.states[:, np.flatnonzero(its.ids[0] >= 0)])
     assert one.env_is_wrapped(gymnasium.Wrapper) == [False] * COUNT
-    with pytest.raises(AttributeError, match="snapshot is a method for all environments at once"):
-        one.env_method("snapshot", indices=0)
+    for call in (lambda: one.env_method("snapshot", indices=0), lambda: one.get_attr("scene")):
+        with pytest.raises(AttributeError, match=r"one environment alone|scene is a method"):
+            call()
     one.set_attr("label", "mine")
     assert one.get_attr("label") == ["mine"] * COUNT
     with pytest.raises(asp_env.AspEnvError, match="is one for all environments"):
