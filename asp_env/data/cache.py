@@ -2,8 +2,8 @@
 
 A cache file is a magic word, the length of a JSON header, the header, and the arrays one after the
 other at multiples of 64 bytes. The header holds the stamp of the files that it was made from.
-A file is written aside and renamed, so that nobody reads half of one; one that is damaged or of
-another stamp counts as absent.
+A file is written aside and renamed, so that nobody reads half of one, however many processes fill
+the cache at once; one that is damaged or of another stamp counts as absent.
 """
 
 import contextlib
@@ -19,8 +19,11 @@ import numpy as np
 
 from asp_env.errors import DataError
 
-FORMAT = 4
+FORMAT = 5
 """Raise whenever a reader makes something else of the same files."""
+
+STALE_S = 3_600.0
+"""What a process that was killed left half written is removed when it is as old as this."""
 
 _MAGIC = b"asp-env\0"
 _ALIGNMENT = 64
@@ -123,10 +126,20 @@ def save(
                 file.write(array.data if array.size else b"")
             file.truncate(start + at)
         os.replace(aside, path)
+        _sweep(path)
     except BaseException:
         with contextlib.suppress(OSError):
             os.unlink(aside)
         raise
+
+
+def _sweep(path: Path) -> None:
+    """Removes what killed writers of a cache file left beside it, but of none that may live."""
+    now = path.stat().st_mtime
+    for left in path.parent.glob(f".{path.name}-*"):
+        with contextlib.suppress(OSError):
+            if now - left.stat().st_mtime > STALE_S:
+                left.unlink()
 
 
 def digest(path: Path) -> str:

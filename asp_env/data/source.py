@@ -8,8 +8,8 @@ from pathlib import Path
 from typing import Any, SupportsIndex, overload
 
 from asp_env import registry
-from asp_env.data.readers.levelx import RecordingFiles, find_recordings
-from asp_env.data.readers.opening import Opened, content_hash, open_recording
+from asp_env.data.readers import interaction, levelx
+from asp_env.data.readers.opening import Opened, RecordingFiles, content_hash, open_recording
 from asp_env.data.recording import Recording
 from asp_env.errors import DataError, unknown_name
 
@@ -91,8 +91,9 @@ def open_data(data: str | Path) -> Recordings:
     """The recordings of DATA.
 
     Args:
-        data: a folder in the inD/rounD layout, `sample:intersection`, `sample:roundabout`, or
-            `scheme:argument` of a source that a package registers.
+        data: a folder with recordings in the inD/rounD or the INTERACTION layout, or both;
+            `sample:intersection`, `sample:roundabout`, or `scheme:argument` of a source that a
+            package registers.
 
     Raises:
         AspEnvError: no such source.
@@ -103,16 +104,18 @@ def open_data(data: str | Path) -> Recordings:
     if not folder.is_dir():
         what = "is a file" if folder.exists() else "does not exist"
         raise DataError(f"data {source!r}: {folder} {what}; expected a folder with recordings")
-    files = find_recordings(folder)
+    files = (*levelx.find_recordings(folder), *interaction.find_recordings(folder))
     if not files:
-        if next(folder.rglob("vehicle_tracks_*.csv"), None):
-            raise DataError(
-                f"data {source!r}: is in the INTERACTION layout, expected the inD/rounD layout "
-                "(XX_recordingMeta.csv, XX_tracksMeta.csv, XX_tracks.csv): convert it first"
-            )
         raise DataError(
             f"data {source!r}: no recordings found; expected XX_recordingMeta.csv, "
-            "XX_tracksMeta.csv and XX_tracks.csv in the folder or below"
+            "XX_tracksMeta.csv and XX_tracks.csv, or LOCATION/vehicle_tracks_NNN.csv, "
+            "in the folder or below"
+        )
+    names = [each.name for each in files]
+    if double := next((name for name in names if names.count(name) > 1), None):
+        raise DataError(
+            f"data {source!r}: two recordings are called {double}, expected names of their own; "
+            "put the layouts in folders of their own"
         )
     return Recordings(source, files)
 
@@ -125,7 +128,8 @@ def load(path: str | Path) -> Recordings:
 def _resolve(source: str) -> Path:
     match = _SCHEME.match(source)
     if match is None or Path(source).exists():
-        return Path(source).expanduser().absolute()
+        path = Path(source).expanduser().absolute()
+        return path.resolve() if ".." in path.parts else path  # folders' names are places' names
     scheme, argument = match.groups()
     if scheme == "sample":
         return _sample(argument)

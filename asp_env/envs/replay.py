@@ -59,10 +59,11 @@ width m |
     Truncated: the recording has no more (`OUT_OF_DATA`). `info["ending"]` names it.
 
     ## Arguments
-    `data`: a folder in the inD/rounD layout, `sample:intersection`, `sample:roundabout` or
-    `synthetic:…`. `observations`: which parts. `view` and `raster_px` (height, width): what the
-    raster shows, always 72 m by 48 m. `traffic`: `log`, `log-actions` or `idm`. `dt_s`: length of
-    a tick. `reward_weights`: weights by name, where they differ from the defaults.
+    `data`: a folder in the inD/rounD or INTERACTION layout, `sample:intersection`,
+    `sample:roundabout` or `synthetic:…`. `observations`: which parts. `view` and `raster_px`
+    (height, width): what the raster shows, always 72 m by 48 m. `traffic`: `log`, `log-actions` or
+    `idm`. `dt_s`: length of a tick. `reward_weights`: weights by name, where they differ from the
+    defaults.
 
     ## Version history
     v0: first.

@@ -3,6 +3,7 @@
 from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
+from itertools import product
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -15,10 +16,12 @@ from asp_env.data.clock import DEFAULT_DT_S, ticks
 from asp_env.data.predictor import Predictor
 from asp_env.data.road_map import RoadMap
 from asp_env.data.rollout import Rollout
-from asp_env.data.scenario import Scenario, ScenarioSet, find_scenarios
+from asp_env.data.scenario import Scenario, ScenarioSet
+from asp_env.data.scenario_choice import choose_scenarios
+from asp_env.data.scenario_file import save_scenarios
+from asp_env.data.scenario_tags import TAGS
 from asp_env.data.snippets import HISTORY_S
 from asp_env.data.source import Recordings, open_data
-from asp_env.errors import AspEnvError
 from asp_env.evaluation import intervals
 from asp_env.evaluation.entrants import load_predictors, short_names
 from asp_env.evaluation.episodes import drive_episodes
@@ -47,7 +50,7 @@ class Drive:
     """Drive in closed loop: does the predictor make the planner drive better?"""
 
     data: Annotated[tyro.conf.Positional[str], tyro.conf.arg(metavar="DATA")]
-    """A folder in the inD/rounD layout, `sample:…` or `synthetic:…`."""
+    """A folder in the inD/rounD or INTERACTION layout, `sample:…` or `synthetic:…`."""
     out: Path
     """Folder to write; must not exist."""
     planner: str = "sampling"
@@ -59,7 +62,9 @@ class Drive:
     traffic: str = "log"
     """Who drives everybody else: a driver such as log, log-actions, idm, hybrid or predictor:NAME,
     or a table such as default=idm,truck=log,17=predictor:constant-velocity."""
-    scenarios: int | None = None
+    scenarios: Annotated[str, tyro.conf.arg(metavar="FILTER|FILE")] = ""
+    """Which: tags and comparisons, such as 'left,!stopping,length>=8', or a scenarios.json."""
+    most: int | None = None
     """At most so many, spread evenly over those there are."""
     horizon: float = 3.0
     """Seconds to forecast and to plan."""
@@ -75,6 +80,7 @@ class Drive:
             result = drive(self)
             write_metrics(folder, result.rows)
             write_manifest(folder, "drive", **result.manifest)
+            save_scenarios(folder / "scenarios.json", result.scenarios, result.recordings)
             save_rollouts(folder, result)
             write_report(folder, title=f"Driving on {Path(self.data).name}", maps=result.maps)
         console = Console()
@@ -105,6 +111,9 @@ class ClosedLoop:
     """By driver, of the same scenarios."""
     maps: dict[str, RoadMap]
     """By the names of the rollouts' recordings."""
+    scenarios: ScenarioSet
+    """All that were driven."""
+    recordings: Recordings
 
 
 def drive(config: Drive) -> ClosedLoop:
@@ -114,12 +123,13 @@ def drive(config: Drive) -> ClosedLoop:
     horizon, history = ticks(config.horizon, config.dt), ticks(HISTORY_S, config.dt)
     predictors = load_predictors(config.predictors, horizon=horizon, dt_s=config.dt)
     allowed, part = ticks_to_judge(recordings, predictors, config.part, dt_s=config.dt)
-    found = find_scenarios(
-        recordings, source=config.data, dt_s=config.dt, history=history, allowed=allowed
+    found = choose_scenarios(
+        recordings, config.scenarios, dt_s=config.dt, history=history, allowed=allowed
     )
     if not len(found):
         raise nothing_left("scenario")
-    scenarios = _spread(found, config.scenarios)
+    chosen = found if config.most is None else found.spread(config.most)
+    scenarios = list(chosen)
     entrants: list[tuple[Planner, str, Predictor]] = [(load_planner(EXPERT), "", predictors[0])]
     planner = load_planner(config.planner)
     if planner.uses_forecasts:
@@ -140,7 +150,7 @@ def drive(config: Drive) -> ClosedLoop:
         ]  # fmt: skip
     reference = next((run for run in runs if run.predictor == REFERENCE), None)
     named = dict(zip(config.predictors, predictors, strict=True))
-    rows = [row for run in runs for row in _rows(config, run, reference, scenarios)]
+    rows = [row for run in runs for row in _rows(config, run, reference, chosen)]
     short = short_names(config.predictors)
     drivers = {
         f"{run.planner} + {short[run.predictor]}" if run.predictor else run.planner: run
@@ -162,7 +172,7 @@ def drive(config: Drive) -> ClosedLoop:
             "horizon_s": config.horizon,
             "dt_s": config.dt,
             "part": part,
-            "most scenarios": config.scenarios,
+            "asked for": {"scenarios": config.scenarios, "most": config.most},
             "scenarios": {scenario.name: {"seed": scenario.seed} for scenario in scenarios},
             "endings": {
                 driver: dict(Counter(kind.name for kind in run.endings))
@@ -174,15 +184,9 @@ def drive(config: Drive) -> ClosedLoop:
         maps={
             scenarios[i].recording_name: recordings[scenarios[i].recording].road_map for i in kept
         },
+        scenarios=chosen,
+        recordings=recordings,
     )
-
-
-def _spread(scenarios: ScenarioSet, most: int | None) -> list[Scenario]:
-    if most is not None and most < 1:
-        raise AspEnvError(f"--scenarios {most}: expected at least 1")
-    count = len(scenarios) if most is None else min(most, len(scenarios))
-    at = np.linspace(0, len(scenarios) - 1, count).round().astype(int)
-    return [scenarios[i] for i in at.tolist()]
 
 
 def _drive_all(
@@ -233,19 +237,20 @@ def _drive_all(
     )
 
 
-def _rows(
-    config: Drive, run: _Run, reference: _Run | None, scenarios: Sequence[Scenario]
-) -> list[Row]:
-    groups = np.array([scenario.recording for scenario in scenarios])
+def _rows(config: Drive, run: _Run, reference: _Run | None, scenarios: ScenarioSet) -> list[Row]:
+    """Of all scenarios, and of those with each tag."""
     values = dict(run.metrics)
     if reference is not None and run is not reference:
         gain = run.metrics["score"].value - reference.metrics["score"].value
         values[f"score - {REFERENCE}"] = Masked(value=gain, valid=run.metrics["score"].valid)
+    subsets = {"all": np.ones(len(scenarios), dtype=bool)}
+    subsets |= {tag: scenarios.has(tag) for tag in TAGS}
     rows = []
-    for metric, found in values.items():
-        if not found.valid.any():
+    for (subset, member), (metric, found) in product(subsets.items(), values.items()):
+        counts = found.valid & member
+        if not counts.any():
             continue
-        estimate = intervals.mean(found.value[found.valid], groups[found.valid])
+        estimate = intervals.mean(found.value[counts], scenarios.recording[counts])
         rows.append(
             Row(
                 data=config.data,
@@ -257,6 +262,7 @@ def _rows(
                 traffic=config.traffic,
                 latency_ticks=0,
                 horizon_s=config.horizon,
+                subset=subset,
                 metric=metric,
                 value=estimate.value,
                 low=estimate.low,

@@ -81,7 +81,7 @@ class Demo:
                 data=str(held_out),
                 out=self.out,
                 predictors=("oracle", "constant-velocity", trained),
-                scenarios=SCENARIOS,
+                most=SCENARIOS,
             )
         )
         with _replacing(self.out) as folder:

@@ -15,6 +15,8 @@ from asp_env.data.classes import AgentClass
 from asp_env.data.clock import DEFAULT_DT_S, frames_per_tick, ticks
 from asp_env.data.recording import Recording
 from asp_env.data.road_map import RoadMap
+from asp_env.data.scenario import ScenarioSet, find_scenarios
+from asp_env.data.scenario_tags import COLUMNS, TAGS
 from asp_env.data.snippets import EVERY_S, HISTORY_S, find_snippets
 from asp_env.data.source import Recordings, open_data
 from asp_env.errors import DataError
@@ -43,14 +45,15 @@ class Findings:
     on_road: float
     """Share of the vehicles' positions inside the drivable area."""
     drifts: Drifts
+    scenarios: ScenarioSet
 
 
 @dataclass(frozen=True, kw_only=True)
 class Inspect:
-    """Show recordings, tracks, classes, maps, snippet counts, drift floor, and every fault."""
+    """Show recordings, classes, maps, counts of snippets and scenarios, drift, and every fault."""
 
     data: Annotated[tyro.conf.Positional[str], tyro.conf.arg(metavar="DATA")]
-    """A folder in the inD/rounD layout, `sample:SITE` or `synthetic:SITE`."""
+    """A folder in the inD/rounD or INTERACTION layout, `sample:SITE` or `synthetic:SITE`."""
     dt: float = DEFAULT_DT_S
     """Time step in seconds; it must divide the recordings' frame rate."""
 
@@ -71,6 +74,7 @@ class Inspect:
             console.print(_recording_table(self.data, found))
             console.print(_map_table(list(maps.values())))
             console.print(_drift_table(found, self.dt))
+            console.print(_scenario_table(found))
             _print_lines(console, "Repairs", _repairs(found, list(maps.values())))
         _print_lines(console, "Faults", list(faults.values()))
         if faults:
@@ -100,6 +104,12 @@ class Inspect:
                     recording=recording,
                     on_road=_on_road(recording),
                     drifts=_drifts(recording, self.dt),
+                    scenarios=find_scenarios(
+                        [recording],
+                        source=self.data,
+                        dt_s=self.dt,
+                        history=ticks(HISTORY_S, self.dt),
+                    ),
                 )
             )
         return found, faults
@@ -222,6 +232,21 @@ def _drift_cells(drifts: list[Drifts]) -> list[str]:
         for chosen in (metres, metres[moves]):
             cells += [f"{len(chosen):,}", _quantiles(chosen)]
     return cells
+
+
+def _scenario_table(found: list[Findings]) -> Table:
+    """Counts by tag, and medians of the columns."""
+    table = Table(title="Scenarios by tag; medians of their measures", title_justify="left")
+    for name in ("tag", "n", *COLUMNS):
+        table.add_column(name, justify="left" if name == "tag" else "right")
+    values = np.concatenate([each.scenarios.values for each in found])
+    tags = np.concatenate([each.scenarios.tags for each in found])
+    rows = {"all": np.ones(len(tags), dtype=bool)} | dict(zip(TAGS, tags.T, strict=True))
+    for tag, member in rows.items():
+        medians = np.median(values[member], axis=0).tolist() if member.any() else []
+        cells = [f"{value:.1f}" for value in medians] or ["-"] * len(COLUMNS)
+        table.add_row(tag, f"{int(member.sum()):,}", *cells)
+    return table
 
 
 def _quantiles(metres: Float[np.ndarray, " n"]) -> str:

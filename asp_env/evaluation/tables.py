@@ -67,11 +67,16 @@ def open_loop_tables(rows: Sequence[Row], privileged: Collection[str] = ()) -> l
 
 
 def driving_table(rows: Sequence[Row], privileged: Collection[str] = ()) -> Table:
-    """Driver by metric; the expert, which is the noise floor, first; * knows the future."""
+    """Driver by metric over all scenarios; the expert, which is the noise floor, first.
+
+    * knows the future.
+    """
     table = _table("driving, mean per episode, 95 % interval over recordings")
     short = short_names([row.predictor for row in rows])
     members: dict[str, dict[str, Row]] = {}
     for row in rows:
+        if row.subset != "all":
+            continue
         name = " + ".join(part for part in (row.planner, short[row.predictor]) if part)
         mark = MARK if row.planner in privileged or row.predictor in privileged else ""
         members.setdefault(name + mark, {})[row.metric] = row

@@ -5,7 +5,7 @@ from enum import IntEnum
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
-from asp_env.data.scenario import TURN_RAD
+from asp_env.data.scenario_rules import TURN_RAD
 from asp_env.dynamics import wrap_angle
 from asp_env.metrics.open_loop import MOVING_MPS, moving
 

@@ -1,50 +1,12 @@
 """Where a point lies along a route whose points are 1 m apart, compiled."""
 
-import math
 from typing import no_type_check
 
 import numpy as np
 from jaxtyping import Bool, Float
 from numba import njit
 
-
-@njit(cache=True)
-@no_type_check
-def project(route, count, x, y, near_m, reach_m):
-    """(arc length, lateral offset, heading) of the nearest point of a route.
-
-    Args:
-        route: (p, 2) points, the first `count` of them valid.
-        count: number of valid points, at least 2.
-        x: of the point, metres.
-        y: of the point, metres.
-        near_m: arc length around which to look; negative to look everywhere.
-        reach_m: how far around it, so that a route that crosses itself is not confused.
-    """
-    first, last = 0, count - 1
-    if near_m >= 0.0:
-        first = min(max(0, int(near_m - reach_m)), count - 2)
-        last = min(count - 1, max(first + 1, int(near_m + reach_m) + 1))
-    nearest, arc, offset_x, offset_y, nearest_x, nearest_y = np.inf, 0.0, 0.0, 0.0, 1.0, 0.0
-    for i in range(first, last):
-        ax, ay = route[i, 0], route[i, 1]
-        sx, sy = route[i + 1, 0] - ax, route[i + 1, 1] - ay
-        square = sx * sx + sy * sy
-        if square < 1e-12:
-            continue
-        share = ((x - ax) * sx + (y - ay) * sy) / square
-        if i > 0:  # both ends go on straight
-            share = max(share, 0.0)
-        if i < count - 2:
-            share = min(share, 1.0)
-        dx, dy = x - ax - share * sx, y - ay - share * sy
-        distance = dx * dx + dy * dy
-        if distance < nearest:
-            nearest, arc = distance, i + share
-            offset_x, offset_y, nearest_x, nearest_y = dx, dy, sx, sy
-    side = nearest_x * offset_y - nearest_y * offset_x
-    offset = math.copysign(math.hypot(offset_x, offset_y), side)
-    return arc, offset, math.atan2(nearest_y, nearest_x)
+from asp_env.data.geometry import project
 
 
 @njit(cache=True)

@@ -1,6 +1,6 @@
 """Writes folders in the inD layout: cars on sine curves over a lanelet2 map of two lanes."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 
 import numpy as np
@@ -20,22 +20,32 @@ def to_degrees(points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     return np.asarray(latitudes), np.asarray(longitudes)
 
 
+def in_degrees(points: np.ndarray) -> list[str]:
+    """What nodes at local points (n, 2) say of their place."""
+    latitudes, longitudes = to_degrees(points)
+    return [
+        f"lat='{latitude:.12f}' lon='{longitude:.12f}'"
+        for latitude, longitude in zip(latitudes, longitudes, strict=True)
+    ]
+
+
 def osm(
     ways: Mapping[str, tuple[Sequence[tuple[float, float]], Mapping[str, str]]],
     lanelets: Mapping[str, tuple[Mapping[str, str], Mapping[str, str]]],
+    places: Callable[[np.ndarray], list[str]] = in_degrees,
 ) -> str:
     """A map: ways by id as (local points, tags), relations by id as (way by role, tags).
 
-    Points at the same place become one node.
+    Points at the same place become one node; `places` writes where nodes are.
     """
     numbers: dict[tuple[float, float], int] = {}
     lines = ["<?xml version='1.0' encoding='UTF-8'?>", "<osm version='0.6'>"]
     for points, _ in ways.values():
         for point in points:
             numbers.setdefault((float(point[0]), float(point[1])), len(numbers) + 1)
-    latitudes, longitudes = to_degrees(np.array(list(numbers), dtype=np.float64))
-    for number, latitude, longitude in zip(numbers.values(), latitudes, longitudes, strict=True):
-        lines.append(f"<node id='{number}' lat='{latitude:.12f}' lon='{longitude:.12f}' />")
+    points = np.array(list(numbers), dtype=np.float64)
+    for number, place in zip(numbers.values(), places(points), strict=True):
+        lines.append(f"<node id='{number}' {place} />")
     for name, (points, tags) in ways.items():
         nodes = "".join(f"<nd ref='{numbers[float(x), float(y)]}' />" for x, y in points)
         lines.append(f"<way id='{name}'>{nodes}{_tags(tags)}</way>")
@@ -47,7 +57,7 @@ def osm(
     return "\n".join([*lines, "</osm>"])
 
 
-def two_lane_road() -> str:
+def two_lane_road(places: Callable[[np.ndarray], list[str]] = in_degrees) -> str:
     """A straight road along +x: one lane each way, 3.5 m wide, between y = -23.5 and -16.5."""
     edges = {"south": -23.5, "middle": -20.0, "north": -16.5}
     kinds = {
@@ -63,7 +73,7 @@ def two_lane_road() -> str:
         "101": ({"left": "middle", "right": "south"}, road),
         "102": ({"left": "middle", "right": "north"}, road),
     }
-    return osm(ways, lanelets)
+    return osm(ways, lanelets, places)
 
 
 def track_rows(track: int, frames: np.ndarray, rate_hz: float, kind: str = "car") -> pd.DataFrame:

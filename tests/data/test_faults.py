@@ -109,6 +109,9 @@ FAULTS = {
     ),
     "empty cell": (cell(TRACKS, 5, 6, ""), [f"{TRACKS}, line 5", "heading is ''", "number"]),
     "word": (cell(TRACKS, 9, 9, "fast"), [f"{TRACKS}, line 9", "xVelocity is 'fast'"]),
+    "line break in a cell": (cell(TRACKS, 9, 4, "3\r"), [f"{TRACKS}, line 9", "xCenter is '3?'"]),
+    "line break in the header": (cell(TRACKS, 1, 1, "trackId\r"), [TRACKS, "'trackId'"]),
+    "quote that stays open": (cell(TRACKS, 1, 0, '"recordingId'), [TRACKS, "lacks the column"]),
     "half a frame": (cell(TRACKS, 9, 2, "3.5"), [f"{TRACKS}, line 9", "whole number"]),
     "negative frame": (cell(TRACKS, 2, 2, "-1"), [f"{TRACKS}, line 2", "frame is -1"]),
     "short line": (

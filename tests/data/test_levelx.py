@@ -13,7 +13,7 @@ from hypothesis import given
 from asp_env.data.classes import FOOTPRINTS_M, AgentClass
 from asp_env.data.readers import tables
 from asp_env.data.readers.levelx import (
-    RecordingFiles,
+    LevelxFiles,
     RecordingMeta,
     find_map,
     find_recordings,
@@ -30,7 +30,7 @@ def read(folder: Path) -> TrackTable:
     return read_tracks(files)
 
 
-def described(folder: Path) -> list[tuple[RecordingFiles, RecordingMeta]]:
+def described(folder: Path) -> list[tuple[LevelxFiles, RecordingMeta]]:
     """Every recording of a folder with its metadata."""
     found = find_recordings(folder)
     return [(files, read_recording_meta(files.recording_meta)) for files in found]

@@ -1,5 +1,7 @@
 """Episodes cut from tracks by hand, and the laws of all of them."""
 
+import dataclasses
+
 import numpy as np
 import pytest
 from hypothesis import given
@@ -133,6 +135,12 @@ def test_standing_start() -> None:
     assert [each.ego_id for each in scenarios.tagged("standing-start")] == [2]
     assert len(scenarios.tagged("straight")) == 2
     assert len(scenarios.tagged("left")) == 0
+
+
+def test_names_are_files_names() -> None:
+    """A recording of a folder gives no name with a slash."""
+    drive = found(CAR, duration_s=7.0)[0]
+    assert dataclasses.replace(drive, recording_name="k1/000", ego_id=7).name == "k1_000-7-15"
 
 
 def test_several_recordings() -> None:

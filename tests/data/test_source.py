@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from asp_env import registry
-from asp_env.data.readers import levelx, opening
+from asp_env.data.readers import folders, opening
 from asp_env.data.recording import Recording
 from asp_env.data.source import Recordings, load, open_data
 from asp_env.errors import AspEnvError, DataError
@@ -251,7 +251,7 @@ def test_folders_are_searched_once(folder: Path, monkeypatch: pytest.MonkeyPatch
         searched.append(root)
         return walk(root, followlinks=followlinks)
 
-    monkeypatch.setattr(levelx.os, "walk", counted)
+    monkeypatch.setattr(folders.os, "walk", counted)
     recordings = open_data(folder)
     assert recordings[0].road_map is recordings[1].road_map
     once = len(searched)
@@ -284,8 +284,8 @@ def test_registered_source(folder: Path, monkeypatch: pytest.MonkeyPatch) -> Non
         ("syntetic:roundabout", "unknown source 'syntetic' (did you mean 'synthetic'?)"),
         ("sample:square", "unknown sample 'square'"),
         ("empty", "no recordings found; expected XX_recordingMeta.csv"),
+        ("empty", "or LOCATION/vehicle_tracks_NNN.csv"),
         ("file", "is a file; expected a folder"),
-        ("taf", "is in the INTERACTION layout"),
     ],
 )
 def test_bad_data(
@@ -295,8 +295,6 @@ def test_bad_data(
     monkeypatch.chdir(tmp_path)
     (tmp_path / "empty").mkdir()
     (tmp_path / "file").write_text("")
-    (tmp_path / "taf" / "tracks").mkdir(parents=True)
-    (tmp_path / "taf" / "tracks" / "vehicle_tracks_000.csv").write_text("")
     with pytest.raises(AspEnvError) as caught:
         open_data(data)
     assert expected in str(caught.value)

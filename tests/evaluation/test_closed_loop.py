@@ -68,7 +68,8 @@ def _drive(
 
 
 def _values(result: ClosedLoop, planner: str, predictor: str = "") -> dict[str, float]:
-    mine = [r for r in result.rows if (r.planner, r.predictor) == (planner, predictor)]
+    who = (planner, predictor, "all")
+    mine = [r for r in result.rows if (r.planner, r.predictor, r.subset) == who]
     return {row.metric: row.value for row in mine}
 
 
@@ -89,7 +90,7 @@ def test_the_expert_keeps_to_its_log(tmp_path):
 def test_every_predictor_has_its_run(crossings):
     """An expert and two runs of the same scenarios, each with rows, endings and rollouts."""
     names = ("oracle", "constant-velocity")
-    result = drive(Drive(data=str(crossings), out=NOWHERE, predictors=names, scenarios=5))
+    result = drive(Drive(data=str(crossings), out=NOWHERE, predictors=names, most=5))
     assert len(result.manifest["scenarios"]) == 5
     drivers = ["expert", "sampling + oracle", "sampling + constant-velocity"]
     assert list(result.rollouts) == drivers
@@ -111,7 +112,7 @@ def test_a_planner_without_forecasts_runs_once(crossings):
             out=NOWHERE,
             planner=planner,
             predictors=("oracle", "constant-velocity"),
-            scenarios=2,
+            most=2,
         )
         assert list(drive(config).rollouts) == drivers
 
@@ -119,7 +120,7 @@ def test_a_planner_without_forecasts_runs_once(crossings):
 @pytest.mark.parametrize("traffic", ["log", "idm"])
 def test_running_twice_gives_the_same_bits(crossings, traffic):
     """Rows and rollouts are equal, bit for bit."""
-    config = Drive(data=str(crossings), out=NOWHERE, traffic=traffic, scenarios=4)
+    config = Drive(data=str(crossings), out=NOWHERE, traffic=traffic, most=4)
     first, second = drive(config), drive(config)
     assert first.rows == second.rows
     for driver, rollouts in first.rollouts.items():
@@ -224,8 +225,8 @@ def test_a_blocked_way_is_no_collision(tmp_path):
 def test_a_run_writes_its_folder(crossings, tmp_path):
     """Metrics, manifest, report, and rollouts by driver that can be read again."""
     out = tmp_path / "out"
-    Drive(data=str(crossings), out=out, scenarios=2).run()
-    names = {"metrics.csv", "manifest.json", "report.html", "rollouts"}
+    Drive(data=str(crossings), out=out, most=2).run()
+    names = {"scenarios.json", "metrics.csv", "manifest.json", "report.html", "rollouts"}
     assert {path.name for path in out.iterdir()} == names
     drivers = sorted(path.name for path in (out / "rollouts").iterdir())
     assert drivers == ["expert", "sampling + constant-velocity"]
@@ -243,9 +244,9 @@ def test_a_run_writes_its_folder(crossings, tmp_path):
 @pytest.mark.parametrize(
     ("options", "what"),
     [
-        ({"traffic": "logs"}, r"unknown traffic 'logs' \(did you mean 'log'"),
+        ({"traffic": "logs"}, r"unknown driver 'logs' \(did you mean 'log'"),
         ({"planner": "sampler"}, "unknown planner 'sampler'"),
-        ({"scenarios": 0}, "--scenarios 0: expected at least 1"),
+        ({"most": 0}, "0 scenarios: expected at least 1"),
         ({"predictors": ()}, "none given"),
         ({"horizon": 0.1}, "no whole number of ticks"),
         ({"dt": 0.3}, "does not divide recordings of 25 Hz"),

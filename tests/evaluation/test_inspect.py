@@ -121,6 +121,18 @@ def test_tables(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert "Faults: none" in out
 
 
+def test_scenarios_by_tag(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """Both cars of each recording drive on from 3 s and from 3.2 s to 9.8 s, with two others."""
+    assert main(["inspect", str(folder)]) == 0
+    lines = capsys.readouterr().out.splitlines()
+    rows = {line.split("│")[1].strip(): line.split("│")[2:-1] for line in lines if "│" in line}
+    cells = {name: [cell.strip() for cell in row] for name, row in rows.items()}
+    assert cells["all"][:2] == ["6", "6.7"]  # medians of 6.8 and 6.6 s
+    assert cells["all"][-2:] == ["2.0", "2.0"]
+    assert cells["straight"] == cells["all"]
+    assert cells["standing-start"] == ["0", *"------"]
+
+
 def test_repairs_are_told(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
     """What the reader mended is listed by recording."""
     path = folder / "data" / "01_tracks.csv"

@@ -1,4 +1,4 @@
-"""Lanelet2 maps (`.osm`): lenient, and every repair is told.
+"""Lanelet2 maps (`.osm`, `.osm_xy`): lenient, and every repair is told.
 
 A lanelet's direction follows from its roles, as in Lanelet2 itself: seen along it, left is on the
 left. How its ways happen to be drawn says nothing, since neighbours that share them may run the
@@ -13,8 +13,8 @@ from pathlib import Path
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
-from pyproj import Transformer
 
+from asp_env.data.readers.origin import Origin, project
 from asp_env.data.readers.osm import Osm, Relation, Way, read_osm, shorten, speed_mps
 from asp_env.data.road_map import LineType, Ragged, RoadMap
 from asp_env.errors import DataError
@@ -34,25 +34,11 @@ CURB_TYPES = frozenset(
     {"curbstone", "road_border", "guard_rail", "fence", "wall", "jersey_barrier", "rail"}
 )
 
+FAR_M = 100_000.0
+"""A map whose middle is further from its recordings' origin is that of another place."""
+
 MEETS_WITHIN_M = 0.5
 """Ends of lanelets that do not share nodes meet if both their corners are this near."""
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Origin:
-    """Where a recording's metric frame lies: local = UTM(lat, lon) - (x, y)."""
-
-    x_m: float
-    y_m: float
-    longitude_deg: float
-    """Somewhere at the place: it tells the zone."""
-    latitude_deg: float
-
-    @property
-    def epsg(self) -> int:
-        """The code of the UTM zone."""
-        zone = int((self.longitude_deg + 180.0) // 6.0) % 60 + 1
-        return (32600 if self.latitude_deg >= 0 else 32700) + zone
 
 
 @dataclass(slots=True, kw_only=True)
@@ -89,15 +75,6 @@ class _Lanelet:
         return np.concatenate([self.left, self.right[::-1]])
 
 
-def project(
-    latitudes_deg: Float[np.ndarray, " n"], longitudes_deg: Float[np.ndarray, " n"], origin: Origin
-) -> Float[np.ndarray, "n 2"]:
-    """Points in the frame that `origin` describes, metres."""
-    utm = Transformer.from_crs(4326, origin.epsg, always_xy=True)
-    x_m, y_m = utm.transform(longitudes_deg, latitudes_deg)
-    return np.stack([np.asarray(x_m) - origin.x_m, np.asarray(y_m) - origin.y_m], axis=-1)
-
-
 def read_lanelet2(path: Path, origin: Origin) -> RoadMap:
     """Reads a map into a recording's frame.
 
@@ -108,7 +85,7 @@ def read_lanelet2(path: Path, origin: Origin) -> RoadMap:
     two-way, and have the limit of their tag `speed_limit` (Lanelet2) or `maxspeed` (OSM).
 
     Raises:
-        DataError: the file is no map, or a map without lanelets.
+        DataError: the file is no map, a map without lanelets, or one of another place.
     """
     osm = read_osm(path)
     if not any(relation.tags.get("type") == "lanelet" for relation in osm.relations):
@@ -118,6 +95,7 @@ def read_lanelet2(path: Path, origin: Origin) -> RoadMap:
         )
     repairs = list(osm.repairs)
     points = _points(osm, origin)
+    _check_near(path, osm, points, origin)
     lanelets = _lanelets(osm, points, repairs)
     vehicle = [lanelet for lanelet in lanelets if lanelet.subtype in VEHICLE_SUBTYPES]
     _untwist(vehicle, repairs)
@@ -145,9 +123,20 @@ def read_lanelet2(path: Path, origin: Origin) -> RoadMap:
 
 
 def _points(osm: Osm, origin: Origin) -> dict[str, np.ndarray]:
-    degrees = np.array(list(osm.nodes.values()), dtype=np.float64).reshape(-1, 2)
-    local = project(degrees[:, 0], degrees[:, 1], origin)
+    given = np.array(list(osm.nodes.values()), dtype=np.float64).reshape(-1, 2)
+    local = given if osm.local else project(given[:, 0], given[:, 1], origin)
     return dict(zip(osm.nodes, local, strict=True))
+
+
+def _check_near(path: Path, osm: Osm, points: Mapping[str, np.ndarray], origin: Origin) -> None:
+    if not points or math.hypot(*np.median(list(points.values()), axis=0)) < FAR_M:
+        return
+    middle = np.median(list(osm.nodes.values()), axis=0)
+    raise DataError(
+        f"{path}: lies about {middle[0]:.4f}, {middle[1]:.4f}, expected it at its recordings' "
+        f"origin {origin.latitude_deg:.4f}, {origin.longitude_deg:.4f} (degrees; told by "
+        "recordingMeta.csv or by meta_data.csv beside the tracks): put the right file in its place"
+    )
 
 
 def _polyline(way: Way, points: Mapping[str, np.ndarray]) -> Float[np.ndarray, "n 2"]:

@@ -6,14 +6,14 @@ recording, never per location: the origin differs between recordings of one site
 """
 
 import math
-import os
 import re
 from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 
-from asp_env.data.readers.lanelet2 import Origin, project
+from asp_env.data.readers.folders import maps_in, natural, upwards, walk
+from asp_env.data.readers.origin import Origin, project
 from asp_env.data.readers.osm import read_osm
 from asp_env.data.readers.tables import read_table
 from asp_env.errors import DataError
@@ -35,7 +35,7 @@ _PART = re.compile(r"^(.+)_(recordingMeta\.csv|tracksMeta\.csv|tracks\.csv(?:\.g
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class RecordingFiles:
+class LevelxFiles:
     """Where one recording's files lie. Those that are missing are named as they should be."""
 
     name: str
@@ -78,13 +78,13 @@ class RecordingMeta:
     origin: Origin
 
 
-def find_recordings(root: Path) -> tuple[RecordingFiles, ...]:
+def find_recordings(root: Path) -> tuple[LevelxFiles, ...]:
     """The recordings below a folder, by name; incomplete ones too, so that they can be reported.
 
     Where one id occurs in several folders, names carry the folder: `rounD/00`.
     """
     parts: dict[tuple[Path, str], dict[str, Path]] = {}
-    for folder, names in _walk(root):
+    for folder, names in walk(root):
         for name in names:
             if match := _PART.match(name):
                 kind = match[2].split(".")[0]
@@ -96,7 +96,7 @@ def find_recordings(root: Path) -> tuple[RecordingFiles, ...]:
         place = folder.parent if folder.name == "data" else folder
         inside = place.relative_to(root) if place.is_relative_to(root) else Path()
         found.append(
-            RecordingFiles(
+            LevelxFiles(
                 name=prefix if ids.count(prefix) == 1 else (inside / prefix).as_posix(),
                 root=root,
                 recording_meta=files.get("recordingMeta", folder / f"{prefix}_recordingMeta.csv"),
@@ -105,7 +105,7 @@ def find_recordings(root: Path) -> tuple[RecordingFiles, ...]:
                 background=background if background.is_file() else None,
             )
         )
-    return tuple(sorted(found, key=lambda files: _natural(files.name)))
+    return tuple(sorted(found, key=lambda files: natural(files.name)))
 
 
 def read_recording_meta(path: Path) -> RecordingMeta:
@@ -141,9 +141,7 @@ def read_recording_meta(path: Path) -> RecordingMeta:
     )
 
 
-def find_map(
-    files: RecordingFiles, meta: RecordingMeta, maps_below: dict[Path, list[Path]]
-) -> Path:
+def find_map(files: LevelxFiles, meta: RecordingMeta, maps_below: dict[Path, list[Path]]) -> Path:
     """The lanelet2 map of a recording: the nearest, going up from it, that fits its location.
 
     A map fits if its own name ends in the location's id (`location1.osm`), or its folder's name
@@ -158,11 +156,9 @@ def find_map(
     Raises:
         DataError: there is none.
     """
-    for folder in _upwards(files):
-        if folder not in maps_below:
-            paths = (place / name for place, names in _walk(folder) for name in names)
-            maps_below[folder] = sorted(path for path in paths if path.suffix == ".osm")
-        maps = maps_below[folder]
+    top = files.root.parent if files.root.name == "data" else files.root
+    for folder in upwards(files.recording_meta.parent, top):
+        maps = [path for path in maps_in(folder, maps_below) if path.suffix == ".osm"]
         fitting = [path for path in maps if _names_location(path, meta.location)]
         under_construction = meta.location == 1 and meta.number in CONSTRUCTION_RECORDINGS
         preferred = [path for path in fitting if _is_construction(path) == under_construction]
@@ -176,7 +172,7 @@ def find_map(
 
 
 def metres_per_pixel(
-    files: RecordingFiles, meta: RecordingMeta, size_px: tuple[int, int], xy: np.ndarray
+    files: LevelxFiles, meta: RecordingMeta, size_px: tuple[int, int], xy: np.ndarray
 ) -> float | None:
     """The scale of a background image.
 
@@ -216,31 +212,6 @@ def metres_per_pixel(
     return None
 
 
-def _walk(root: Path) -> list[tuple[Path, list[str]]]:
-    """Every folder below `root` with its files, hidden ones left out, linked ones followed."""
-    seen: set[str] = set()
-    found = []
-    for folder, folders, names in os.walk(root, followlinks=True):
-        real = os.path.realpath(folder)
-        if real in seen:
-            folders.clear()
-            continue
-        seen.add(real)
-        folders[:] = sorted(name for name in folders if not name.startswith("."))
-        found.append((Path(folder), sorted(names)))
-    return found
-
-
-def _upwards(files: RecordingFiles) -> list[Path]:
-    top = files.root.parent if files.root.name == "data" else files.root
-    folder = files.recording_meta.parent
-    found = [folder]
-    while folder != top and folder.is_relative_to(top):
-        folder = folder.parent
-        found.append(folder)
-    return found
-
-
 def _names_location(path: Path, location: int) -> bool:
     own = re.search(r"location[_-]?0*(\d+)$", path.stem, re.IGNORECASE)
     if own:
@@ -267,11 +238,6 @@ def _near(maps: list[Path], origin: Origin) -> list[Path]:
         if distance < NEAR_M:
             found.append((distance, path))
     return [path for _, path in sorted(found)]
-
-
-def _natural(name: str) -> list[tuple[int, int, str]]:
-    parts = re.split(r"(\d+)", name)
-    return [(1, int(part), "") if part.isdigit() else (0, 0, part) for part in parts]
 
 
 def _positive(path: Path, column: str) -> float | None:

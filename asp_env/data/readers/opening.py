@@ -11,18 +11,21 @@ from typing import Any
 import numpy as np
 
 from asp_env.data import cache
-from asp_env.data.readers.lanelet2 import Origin, read_lanelet2
-from asp_env.data.readers.levelx import (
-    RecordingFiles,
-    RecordingMeta,
-    find_map,
-    metres_per_pixel,
-    read_recording_meta,
-)
-from asp_env.data.readers.tracks import read_tracks
+from asp_env.data.readers import interaction, levelx
+from asp_env.data.readers.interaction import InteractionFiles, InteractionMeta
+from asp_env.data.readers.interaction_tracks import read_interaction
+from asp_env.data.readers.lanelet2 import read_lanelet2
+from asp_env.data.readers.levelx import LevelxFiles, RecordingMeta
+from asp_env.data.readers.origin import Origin
+from asp_env.data.readers.tracks import TrackTable, read_tracks
 from asp_env.data.recording import Background, Recording
 from asp_env.data.road_map import Ragged, RoadMap
 from asp_env.errors import DataError
+
+RecordingFiles = LevelxFiles | InteractionFiles
+"""Where one recording's files lie, of any layout."""
+
+Meta = RecordingMeta | InteractionMeta
 
 Entry = tuple[dict[str, Any], dict[str, np.ndarray]]
 """Facts and arrays, as the cache keeps them."""
@@ -38,7 +41,7 @@ class Opened:
 
     recordings: dict[str, Recording] = field(default_factory=dict)
     maps: dict[tuple[Path, Origin], RoadMap] = field(default_factory=dict)
-    places: dict[str, tuple[RecordingMeta, Path]] = field(default_factory=dict)
+    places: dict[str, tuple[Meta, Path]] = field(default_factory=dict)
     """Of each recording: its metadata, and where its map lies."""
     hashes: dict[str, str] = field(default_factory=dict)
     maps_below: dict[Path, list[Path]] = field(default_factory=dict)
@@ -79,15 +82,20 @@ def content_hash(files: RecordingFiles, opened: Opened) -> str:
     return opened.hashes[files.name]
 
 
-def _place(files: RecordingFiles, opened: Opened) -> tuple[RecordingMeta, Path]:
+def _place(files: RecordingFiles, opened: Opened) -> tuple[Meta, Path]:
     if files.name not in opened.places:
         files.check_complete()
-        meta = read_recording_meta(files.recording_meta)
-        opened.places[files.name] = (meta, find_map(files, meta, opened.maps_below))
+        if isinstance(files, LevelxFiles):
+            meta = levelx.read_recording_meta(files.recording_meta)
+            map_path = levelx.find_map(files, meta, opened.maps_below)
+        else:
+            meta = interaction.read_meta(files)
+            map_path = interaction.find_map(files, meta, opened.maps_below)
+        opened.places[files.name] = (meta, map_path)
     return opened.places[files.name]
 
 
-def _recording(files: RecordingFiles, meta: RecordingMeta, road_map: RoadMap) -> Recording:
+def _recording(files: RecordingFiles, meta: Meta, road_map: RoadMap) -> Recording:
     sources = [*files.tables, *([files.background] if files.background else [])]
     facts, arrays = _cached(files.tracks, sources, lambda: _track_entry(files, meta), "tracks")
     scale = facts["metres_per_pixel"]
@@ -97,7 +105,7 @@ def _recording(files: RecordingFiles, meta: RecordingMeta, road_map: RoadMap) ->
     return Recording(
         name=files.name,
         location=str(meta.location),
-        frame_rate_hz=meta.frame_rate_hz,
+        frame_rate_hz=facts["frame_rate_hz"],
         num_frames=facts["num_frames"],
         speed_limit_mps=meta.speed_limit_mps,
         road_map=road_map,
@@ -107,17 +115,22 @@ def _recording(files: RecordingFiles, meta: RecordingMeta, road_map: RoadMap) ->
     )
 
 
-def _track_entry(files: RecordingFiles, meta: RecordingMeta) -> Entry:
-    table = read_tracks(files)
+def _track_entry(files: RecordingFiles, meta: Meta) -> Entry:
     scale = None
-    repairs = list(table.repairs)
-    if files.background is not None:
-        size = _png_size(files.background)
-        scale = metres_per_pixel(files, meta, size, table.states[:, :2]) if size else None
-        if scale is None:
-            repairs.append(f"{files.background.name} left out: its scale cannot be told")
+    if isinstance(files, InteractionFiles):
+        table, rate_hz = read_interaction(files)
+        repairs = list(table.repairs)
+    else:
+        assert isinstance(meta, RecordingMeta)
+        table, rate_hz = read_tracks(files), meta.frame_rate_hz
+        repairs = list(table.repairs)
+        if files.background is not None:
+            scale = _scale(files, files.background, meta, table)
+            if scale is None:
+                repairs.append(f"{files.background.name} left out: its scale cannot be told")
     last_frames = table.first_frames + np.diff(table.starts) - 1
     facts = {
+        "frame_rate_hz": rate_hz,
         "num_frames": int(last_frames.max()) + 1,
         "metres_per_pixel": scale,
         "repairs": repairs,
@@ -125,16 +138,23 @@ def _track_entry(files: RecordingFiles, meta: RecordingMeta) -> Entry:
     return facts, {name: getattr(table, name) for name in _TRACK_COLUMNS}
 
 
+def _scale(
+    files: LevelxFiles, picture: Path, meta: RecordingMeta, table: TrackTable
+) -> float | None:
+    size = _png_size(picture)
+    return levelx.metres_per_pixel(files, meta, size, table.states[:, :2]) if size else None
+
+
 def _road_map(path: Path, origin: Origin) -> RoadMap:
     facts, arrays = _cached(path, [path], lambda: _map_entry(path, origin), origin)
-    parts = {
+    parts: dict[str, Any] = {name: arrays[name] for name in _MAP_COLUMNS}
+    parts |= {
         name: Ragged(points=arrays[f"{name}_points"], starts=arrays[f"{name}_starts"])
         for name in _MAP_PARTS
     }
     return RoadMap(
         name=path.stem,
         repairs=tuple(facts["repairs"]),
-        **{name: arrays[name] for name in _MAP_COLUMNS},
         **parts,
     )
 

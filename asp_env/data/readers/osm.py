@@ -36,7 +36,8 @@ class Osm:
     """What a file holds. Ways have at least two nodes, all of which exist."""
 
     nodes: Mapping[str, tuple[float, float]]
-    """(latitude, longitude) in degrees by id."""
+    """By id: (latitude, longitude) in degrees, or (x, y) in metres if `local`."""
+    local: bool
     ways: Mapping[str, Way]
     relations: tuple[Relation, ...]
     repairs: tuple[str, ...]
@@ -45,6 +46,8 @@ class Osm:
 def read_osm(path: Path) -> Osm:
     """Reads a map file. Of elements with the same id the first counts; deleted ones do not.
 
+    Nodes of a file whose name ends in `.osm_xy` have local metres in place of degrees.
+
     Raises:
         DataError: the file is absent or no XML.
     """
@@ -52,6 +55,7 @@ def read_osm(path: Path) -> Osm:
     raw_ways: dict[str, Way] = {}
     relations: dict[str, Relation] = {}
     doubles: list[str] = []
+    local = path.suffix == ".osm_xy"
     try:
         for _, element in ElementTree.iterparse(path):
             if element.tag not in ("node", "way", "relation"):
@@ -63,7 +67,7 @@ def read_osm(path: Path) -> Osm:
             elif number in known:
                 doubles.append(f"{element.tag} {number}")
             elif element.tag == "node":
-                _add_node(nodes, number, element)
+                _add_node(nodes, number, element, ("x", "y") if local else ("lat", "lon"))
             elif element.tag == "way":
                 raw_ways[number] = _way(number, element)
             else:
@@ -79,7 +83,13 @@ def read_osm(path: Path) -> Osm:
     if doubles:
         repairs.append(f"{len(doubles)} ids given twice, the first kept: {shorten(doubles)}")
     ways = _complete(raw_ways, nodes, repairs)
-    return Osm(nodes=nodes, ways=ways, relations=tuple(relations.values()), repairs=tuple(repairs))
+    return Osm(
+        nodes=nodes,
+        local=local,
+        ways=ways,
+        relations=tuple(relations.values()),
+        repairs=tuple(repairs),
+    )
 
 
 def shorten(names: list[str], limit: int = 5) -> str:
@@ -89,10 +99,13 @@ def shorten(names: list[str], limit: int = 5) -> str:
 
 
 def _add_node(
-    nodes: dict[str, tuple[float, float]], number: str, element: ElementTree.Element
+    nodes: dict[str, tuple[float, float]],
+    number: str,
+    element: ElementTree.Element,
+    names: tuple[str, str],
 ) -> None:
     try:
-        nodes[number] = (float(element.get("lat", "")), float(element.get("lon", "")))
+        nodes[number] = (float(element.get(names[0], "")), float(element.get(names[1], "")))
     except ValueError:
         return  # a node without a position is a missing one, and reported as such
 

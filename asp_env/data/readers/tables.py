@@ -109,7 +109,7 @@ def _wanted(
     if missing:
         raise DataError(
             f"{path}: lacks the column {', '.join(map(repr, missing))}; "
-            f"expected it among those found: {', '.join(header)[:200]}"
+            f"expected it among those found: {' '.join(', '.join(header).split())[:200]}"
         )
     return {name: kind for name, kind in columns.items() if name in header}
 
@@ -143,6 +143,8 @@ def _chunks(path: Path, wanted: Mapping[str, Kind]) -> Iterator[dict[str, np.nda
             if not len(frame):
                 continue
             frame.columns = frame.columns.str.strip()
+            if lost := [name for name in wanted if name not in frame]:
+                raise ValueError(f"a line break stands before {lost[0]!r} in the header")
             yield {name: _checked(frame[name], kind) for name, kind in wanted.items()}
 
 
@@ -193,8 +195,12 @@ def _fault(cell: str, kind: Kind) -> str:
 def _lines(path: Path) -> Iterator[tuple[int, list[str]]]:
     """(line number from 1, cells) of every line that is not blank."""
     with _open(path) as file:
-        text = (line.decode("utf-8-sig", "replace").replace("\0", "?") for line in file)
-        for number, row in enumerate(csv.reader(text), start=1):
+        for number, line in enumerate(file, start=1):
+            text = line.decode("utf-8-sig", "replace").rstrip("\r\n")
+            try:  # line by line, so that a quote that is never closed spoils its own alone
+                row = next(csv.reader([text.replace("\0", "?").replace("\r", "?")]), [])
+            except csv.Error as error:
+                raise DataError(f"{path}, line {number}: cannot be read: {error}") from error
             if row:
                 yield number, row
 

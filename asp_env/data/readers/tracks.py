@@ -7,7 +7,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 
 from asp_env.data.classes import FOOTPRINTS_M, VULNERABLE, parse_class
-from asp_env.data.readers.levelx import RecordingFiles
+from asp_env.data.readers.levelx import LevelxFiles
 from asp_env.data.readers.osm import shorten
 from asp_env.data.readers.tables import (
     Kind,
@@ -67,7 +67,7 @@ class _Rows:
     sizes: Float[np.ndarray, "rows 2"]
 
 
-def read_tracks(files: RecordingFiles) -> TrackTable:
+def read_tracks(files: LevelxFiles) -> TrackTable:
     """Reads a recording's tracks.
 
     Vehicles keep the file's heading; their speed is the velocity's, negative when they back up.
@@ -123,7 +123,7 @@ def _assemble(
     repairs: list[str],
 ) -> TrackTable:
     lengths = np.diff(starts, append=len(rows.track))
-    states = _states(
+    states = states_of(
         rows.measured, np.repeat(starts, lengths), np.repeat(vulnerable[owner], lengths)
     )
     if (np.diff(by_id) < 0).any():
@@ -140,11 +140,21 @@ def _assemble(
     )
 
 
-def _states(
+def states_of(
     measured: Float[np.ndarray, "rows 5"],
     first_row: Int[np.ndarray, " rows"],
     vulnerable: Bool[np.ndarray, " rows"],
 ) -> Float[np.ndarray, "rows 4"]:
+    """The states of a recording's rows.
+
+    Vulnerable road users head where they move, from the past alone; vehicles' speeds have the
+    sign of motion along the heading.
+
+    Args:
+        measured: x, y, heading in degrees, velocity along x and y.
+        first_row: of each row, the first of its track.
+        vulnerable: which rows are of vulnerable road users.
+    """
     heading = np.radians(measured[:, 2])
     velocity_x, velocity_y = measured[:, 3], measured[:, 4]
     total = np.hypot(velocity_x, velocity_y)
@@ -161,7 +171,7 @@ def _states(
     return states.astype(np.float32)
 
 
-def _classes(files: RecordingFiles, names: np.ndarray) -> Int[np.ndarray, " metas"]:
+def _classes(files: LevelxFiles, names: np.ndarray) -> Int[np.ndarray, " metas"]:
     numbers = {}
     for name in dict.fromkeys(names):
         try:
@@ -172,7 +182,7 @@ def _classes(files: RecordingFiles, names: np.ndarray) -> Int[np.ndarray, " meta
     return np.array([numbers[name] for name in names], dtype=np.int8)
 
 
-def _read_rows(files: RecordingFiles) -> _Rows:
+def _read_rows(files: LevelxFiles) -> _Rows:
     track, frame, measured, sizes = [], [], [], []
     optional = frozenset({"width", "length"})
     for chunk in read_columns(files.tracks, _TRACKS, optional=optional):
@@ -191,7 +201,7 @@ def _read_rows(files: RecordingFiles) -> _Rows:
     return _sorted(files, rows)
 
 
-def _sorted(files: RecordingFiles, rows: _Rows) -> _Rows:
+def _sorted(files: LevelxFiles, rows: _Rows) -> _Rows:
     step, later = np.diff(rows.track), np.diff(rows.frame)
     if not ((step > 0) | ((step == 0) & (later > 0))).all():
         order = np.lexsort((rows.frame, rows.track))
@@ -217,7 +227,7 @@ def _sorted(files: RecordingFiles, rows: _Rows) -> _Rows:
     return rows
 
 
-def _check_ids(files: RecordingFiles, rows: _Rows, ids: Int[np.ndarray, " metas"]) -> None:
+def _check_ids(files: LevelxFiles, rows: _Rows, ids: Int[np.ndarray, " metas"]) -> None:
     there = np.unique(rows.track)
     strangers = np.setdiff1d(there, ids)
     if len(strangers):

@@ -8,7 +8,7 @@ import numpy as np
 from numba import njit
 
 from asp_env.data.recording import Recording
-from asp_env.data.scenario import STANDING_MPS
+from asp_env.data.scenario_rules import STANDING_MPS
 from asp_env.sim.idm import IDM, limit_speeds
 
 BEYOND_M = 60.0

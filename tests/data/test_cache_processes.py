@@ -1,0 +1,110 @@
+"""Several processes fill the cache at once: each gets what is right, and one copy is left."""
+
+import json
+import os
+import signal
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from asp_env.data import cache
+from asp_env.data.causal import causal_histories
+from asp_env.data.source import open_data
+from tests.data import interaction_files, levelx_files
+
+READER = """
+import hashlib, json, sys
+from asp_env.data.causal import causal_histories
+from asp_env.data.source import open_data
+
+print("ready", flush=True)
+sys.stdin.readline()
+recordings = open_data(sys.argv[1])
+told = {}
+for recording, causal in zip(recordings, causal_histories(recordings), strict=True):
+    digest = hashlib.sha256(recording.states.tobytes())
+    digest.update(recording.road_map.lanes.points.tobytes())
+    digest.update(causal.states.tobytes())
+    told[recording.name] = digest.hexdigest()
+print(json.dumps([told, recordings.data_hash()]))
+"""
+
+WRITER = """
+import sys
+from pathlib import Path
+import numpy as np
+from asp_env.data import cache
+
+array = np.ones(1 << 22)
+print("ready", flush=True)
+while True:
+    cache.save(Path(sys.argv[1]), [["format", 1, 0]], {}, {"states": array})
+"""
+
+
+def start(code: str, *arguments: Path) -> subprocess.Popen[str]:
+    """A process that has imported all it needs and waits for a line."""
+    command = [sys.executable, "-W", "error", "-c", code, *map(str, arguments)]
+    process = subprocess.Popen(
+        command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
+    )
+    assert process.stdout is not None
+    assert process.stdout.readline() == "ready\n"
+    return process
+
+
+def test_readers_at_once(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Three that begin in the same moment read both layouts alike, and leave one file of each."""
+    kept = tmp_path / "cache"
+    monkeypatch.setenv("ASP_ENV_CACHE", str(kept))
+    folder = tmp_path / "data"
+    levelx_files.write_folder(folder / "inD", recordings=2)
+    interaction_files.write_folder(folder / "INTERACTION", recordings=2)
+    readers = [start(READER, folder) for _ in range(3)]
+    assert not kept.exists()
+    for reader in readers:
+        assert reader.stdin is not None
+        reader.stdin.write("go\n")
+        reader.stdin.flush()
+    ends = [reader.communicate(timeout=300) for reader in readers]
+    assert [(reader.returncode, err) for reader, (_, err) in zip(readers, ends, strict=True)] == [
+        (0, "")
+    ] * 3
+    told = [json.loads(out) for out, _ in ends]
+    assert all(each == told[0] for each in told)
+
+    entries = sorted(kept.iterdir())
+    assert len(entries) == 4 * 3 + 2  # tracks, hash and causal states of each recording; two maps
+    assert not [path for path in entries if path.name.startswith(".") or path.suffix != ".bin"]
+    before = [(path.stat().st_ino, path.stat().st_mtime_ns) for path in entries]
+    recordings = open_data(folder)
+    assert recordings.data_hash() == told[0][1]
+    assert len(list(causal_histories(recordings))) == 4
+    assert [(path.stat().st_ino, path.stat().st_mtime_ns) for path in entries] == before
+
+    monkeypatch.setenv("ASP_ENV_CACHE", str(tmp_path / "another"))
+    for recording, alone in zip(recordings, open_data(folder), strict=True):
+        assert np.array_equal(recording.states, alone.states)
+
+
+def test_killed_writer(tmp_path: Path) -> None:
+    """Whatever moment a writer is killed in: a whole file or none, and no rest stays for good."""
+    path = tmp_path / "a.bin"
+    stamp = [["format", 1, 0]]
+    for _ in range(3):
+        writer = start(WRITER, path)
+        while not any(tmp_path.glob(".a.bin-*")):
+            assert writer.poll() is None
+        writer.send_signal(signal.SIGKILL)
+        writer.communicate()
+        found = cache.load(path, stamp)
+        assert found is None or (found[1]["states"] == 1).all()
+    left = list(tmp_path.glob(".a.bin-*"))
+    for rest in left:
+        os.utime(rest, ns=(1, 1))
+    (tmp_path / ".a.bin-of-one-that-lives").write_text("")
+    cache.save(path, stamp, {}, {"states": np.zeros(3)})
+    assert sorted(each.name for each in tmp_path.iterdir()) == [".a.bin-of-one-that-lives", "a.bin"]

@@ -1,0 +1,180 @@
+"""Folders in the INTERACTION layout: what is found in them, and in which frame the maps lie."""
+
+import shutil
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+import pytest
+
+from asp_env.cli import main
+from asp_env.data.source import open_data
+from asp_env.errors import DataError
+from tests.data import levelx_files
+from tests.data.interaction_files import (
+    PLACE,
+    walk,
+    write_folder,
+    write_map,
+    write_recording,
+    write_taf_bw,
+)
+
+
+@pytest.fixture(autouse=True)
+def kept(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """A cache folder of the test's own."""
+    monkeypatch.setenv("ASP_ENV_CACHE", str(tmp_path / "cache"))
+    return tmp_path / "cache"
+
+
+def edges(lanes: np.ndarray) -> tuple[float, float, float, float]:
+    """Smallest and largest x, smallest and largest y."""
+    return (*lanes.min(axis=0)[:1], *lanes.max(axis=0)[:1], lanes[:, 1].min(), lanes[:, 1].max())
+
+
+ROAD = (0.0, 120.0, -21.75, -18.25)
+"""Where the lanes of `two_lane_road` lie."""
+
+
+def test_interaction(tmp_path: Path) -> None:
+    """Recordings beside maps about (0, 0): names, places, clock and lanes are as written."""
+    recordings = open_data(write_folder(tmp_path / "data", recordings=2))
+    assert recordings.names == (f"{PLACE}/000", f"{PLACE}/001")
+    first, second = recordings
+    assert (first.location, first.frame_rate_hz, first.num_frames) == (PLACE, 10.0, 96)
+    assert (first.speed_limit_mps, first.background) == (None, None)
+    assert first.road_map is second.road_map
+    assert first.road_map.name == PLACE
+    assert edges(first.road_map.lanes.points) == pytest.approx(ROAD, abs=1e-3)
+
+
+def test_taf_bw(tmp_path: Path) -> None:
+    """Places beside maps, with origin and speed limit of their own."""
+    write_taf_bw(tmp_path / "data")
+    (recording,) = open_data(tmp_path / "data")
+    assert (recording.name, recording.location) == ("k1_2020/004", "k1_2020")
+    assert recording.speed_limit_mps == pytest.approx(50 / 3.6)
+    assert edges(recording.road_map.lanes.points) == pytest.approx(ROAD, abs=1e-3)
+
+
+def test_map_in_local_metres(tmp_path: Path) -> None:
+    """An `.osm_xy` serves where there is no `.osm`."""
+    write_recording(tmp_path / "data")
+    write_map(tmp_path / "data", suffix=".osm_xy")
+    (recording,) = open_data(tmp_path / "data")
+    assert edges(recording.road_map.lanes.points) == pytest.approx(ROAD, abs=1e-5)
+    write_map(tmp_path / "data", suffix=".osm_xy", text="spoilt")
+    write_map(tmp_path / "data")
+    assert len(open_data(tmp_path / "data")[0].road_map.lanes) == 2
+
+
+@pytest.mark.parametrize(
+    "given", [".", "recorded_trackfiles", f"recorded_trackfiles/{PLACE}", "../data/./maps/.."]
+)
+def test_any_folder_of_it(tmp_path: Path, given: str) -> None:
+    """The whole, or its tracks, or those of one place: the map is found."""
+    write_folder(tmp_path / "data")
+    (recording,) = open_data(tmp_path / "data" / given)
+    assert recording.name == f"{PLACE}/000"
+    assert len(recording.road_map.lanes) == 2
+
+
+def test_map_called_as_the_location_is(tmp_path: Path) -> None:
+    """A map that has the name in `meta_data.csv` serves where none has the folder's."""
+    there = write_taf_bw(tmp_path / "data", locationId="K1")
+    maps = tmp_path / "data" / "maps"
+    (maps / f"{there.name}.osm").rename(maps / "k1.osm")
+    assert open_data(tmp_path / "data")[0].road_map.name == "k1"
+
+
+def test_places_of_one_name(tmp_path: Path) -> None:
+    """Each has the map that is nearest, a name and a location of its own."""
+    for year in ("2019", "2020"):
+        write_folder(tmp_path / "data" / year)
+    write_map(
+        tmp_path / "data" / "2019",
+        text=levelx_files.two_lane_road(
+            lambda points: [f"lat='{y * 9e-6}' lon='{x * 9e-6}'" for x, y in points]
+        ),
+    )
+    recordings = open_data(tmp_path / "data")
+    locations = [f"{year}/recorded_trackfiles/{PLACE}" for year in ("2019", "2020")]
+    assert recordings.names == tuple(f"{location}/000" for location in locations)
+    assert [recording.location for recording in recordings] == locations
+    assert len({edges(recording.road_map.lanes.points) for recording in recordings}) == 2
+
+
+def test_beside_levelx(tmp_path: Path) -> None:
+    """A folder of both layouts holds the recordings of both."""
+    levelx_files.write_folder(tmp_path / "data" / "inD")
+    write_folder(tmp_path / "data" / "INTERACTION")
+    recordings = open_data(tmp_path / "data")
+    assert recordings.names == ("00", f"{PLACE}/000")
+    assert [recording.frame_rate_hz for recording in recordings] == [25.0, 10.0]
+    assert len(set(recordings.hashes())) == 2
+
+
+def test_names_that_clash(tmp_path: Path) -> None:
+    """Two recordings of one name are refused, since nobody could tell which is meant."""
+    for folder in ("x", "y"):
+        levelx_files.write_folder(tmp_path / "data" / folder)
+    write_recording(tmp_path, number="00", place="x")
+    shutil.copy(
+        tmp_path / "recorded_trackfiles" / "x" / "vehicle_tracks_00.csv", tmp_path / "data" / "x"
+    )
+    with pytest.raises(DataError, match="two recordings are called x/00"):
+        open_data(tmp_path / "data")
+
+
+def test_hash_and_cache_follow_every_file(tmp_path: Path, kept: Path) -> None:
+    """Tracks, pedestrians, origin and map: each is seen when it changes."""
+    folder = tmp_path / "data"
+    there = write_taf_bw(folder)
+    seen = {open_data(folder).data_hash()}
+    assert len(open_data(folder)[0]) == 3
+    entries = len(list(kept.iterdir()))
+
+    def again(change: Callable[[], object]) -> None:
+        change()
+        seen.add(open_data(folder).data_hash())
+
+    again(lambda: walk("P1", (0, 0), (0, 1), 20).to_csv(there / "pedestrian_tracks_004.csv"))
+    assert len(open_data(folder)[0]) == 4
+    tracks, meta = there / "vehicle_tracks_004.csv", there / "meta_data.csv"
+    again(lambda: tracks.write_text(tracks.read_text().replace("car", "bus")))
+    assert open_data(folder)[0].classes.tolist()[:3] == [3, 3, 3]
+    again(lambda: meta.write_text(meta.read_text().replace("49.0053", "49.0054")))
+    assert open_data(folder)[0].road_map.lanes.points[:, 1].max() == pytest.approx(-29.4, abs=0.1)
+    path = folder / "maps" / "k1_2020.osm"
+    again(lambda: path.write_text(path.read_text() + "\n"))
+    assert len(seen) == 5
+    assert len(list(kept.iterdir())) == entries + 1
+
+
+def test_from_the_cache(tmp_path: Path) -> None:
+    """The second time all is equal, mapped and read-only."""
+    folder = write_folder(tmp_path / "data")
+    before, after = open_data(folder)[0], open_data(folder)[0]
+    for name in ("track_ids", "classes", "sizes", "first_frames", "starts", "states"):
+        assert np.array_equal(getattr(before, name), getattr(after, name))
+        assert not getattr(after, name).flags.writeable
+    assert after.frame_rate_hz == before.frame_rate_hz
+
+
+def test_commands(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """The table, both kinds of evaluation: all take it as they take any other DATA."""
+    folder = str(write_folder(tmp_path / "data", recordings=2))
+    assert main(["inspect", folder]) == 0
+    told = capsys.readouterr().out
+    assert f"{PLACE}/000" in told
+    assert "Faults: none" in told
+    evaluate = ["evaluate", folder, "--predictors", "constant-velocity", "--out"]
+    assert main([*evaluate, str(tmp_path / "open")]) == 0
+    drive = ["drive", folder, "--predictors", "constant-velocity", "--out"]
+    assert main([*drive, str(tmp_path / "closed")]) == 0
+    for out in ("open", "closed"):
+        table = pd.read_csv(tmp_path / out / "metrics.csv")
+        assert set(table["data"].dropna()) == {folder}
+        assert table["n"].to_numpy().max() > 0
