@@ -43,6 +43,11 @@ class Recordings(Sequence[Any]):  # not of Recording: checking its items at run 
         self._files = tuple(files)
         self._opened = Opened() if opened is None else opened
 
+    def __deepcopy__(self, memo: dict[int, Any]) -> "Recordings":
+        """Itself: recordings never change."""
+        del memo
+        return self
+
     def __len__(self) -> int:
         """How many there are."""
         return len(self._files)

@@ -1,6 +1,5 @@
 """Episodes of recordings as the environments drive them: one core, of any number side by side."""
 
-import copy
 import dataclasses
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -15,7 +14,7 @@ from asp_env.data.scenario import Scenario, ScenarioSet, find_scenarios
 from asp_env.data.snippets import HISTORY_S
 from asp_env.data.source import open_data
 from asp_env.dynamics import MAX_ACCELERATION_MPS2, MAX_STEERING_RAD
-from asp_env.envs.start import Starts, choose
+from asp_env.envs.start import Starts, checked, tagged
 from asp_env.errors import AspEnvError, unknown_name
 from asp_env.sim.observation import Observation, Observer
 from asp_env.sim.reward import reward_terms, weighted_sum, weights_from
@@ -80,8 +79,7 @@ class ReplayEpisodes:
         chosen = _options(options)
         history = ticks(HISTORY_S, chosen.dt_s)
         self.recordings = open_data(data)
-        found = find_scenarios(self.recordings, source=data, dt_s=chosen.dt_s, history=history)
-        self.scenarios = choose(found, chosen.scenarios, data=data)
+        self.scenarios = self._choose(chosen, history)
         self._starts = Starts(
             recordings=self.recordings,
             scenarios=self.scenarios,
@@ -104,15 +102,14 @@ class ReplayEpisodes:
         self.action_space = spaces.Box(-1.0, 1.0, (2,), dtype=np.float32)
         self.events: Events | None = None
 
-    def __deepcopy__(self, memo: dict[int, Any]) -> "ReplayEpisodes":
-        """A copy shares the recordings and the scenarios, which nobody changes."""
-        copied = object.__new__(type(self))
-        memo[id(self)] = copied
-        for shared in (self.recordings, self.scenarios, self._starts):
-            memo[id(shared)] = shared
-        for name, value in vars(self).items():
-            setattr(copied, name, copy.deepcopy(value, memo))
-        return copied
+    def _choose(self, options: ReplayOptions, history: int) -> ScenarioSet:
+        wanted, recordings = options.scenarios, self.recordings
+        if isinstance(wanted, ScenarioSet):
+            return checked(wanted, recordings.names, data=recordings.source)
+        found = find_scenarios(
+            recordings, source=recordings.source, dt_s=options.dt_s, history=history
+        )
+        return tagged(found, wanted, data=recordings.source)
 
     def restrict(self, scenarios: ScenarioSet, num_episodes: int) -> None:
         """From now on draws from these scenarios and holds that many episodes, none begun."""
@@ -142,6 +139,18 @@ class ReplayEpisodes:
         scenario = self._starts.find(options, drawn)
         return scenario, np.random.default_rng(np_random.integers(2**63))
 
+    def begin(
+        self,
+        scenarios: Sequence[Scenario],
+        rngs: Sequence[np.random.Generator],
+        where: Bool[np.ndarray, " b"],
+    ) -> None:
+        """Starts the episodes at `where`; the others' entries are not read."""
+        self.simulation.reset(scenarios, rngs, where)
+        for b in np.flatnonzero(where).tolist():
+            self._names[b], self._tags[b] = scenarios[b].name, scenarios[b].tags
+        self.events = self.simulation.world.events()
+
     def snapshot(self) -> Any:
         """The whole state, to be handed to `restore`: no recording, no picture."""
         return self.simulation.snapshot()
@@ -154,18 +163,6 @@ class ReplayEpisodes:
             self._names[b] = None if scenario is None else scenario.name
             self._tags[b] = None if scenario is None else scenario.tags
         self.events = world.events()
-
-    def begin(
-        self,
-        scenarios: Sequence[Scenario],
-        rngs: Sequence[np.random.Generator],
-        where: Bool[np.ndarray, " b"],
-    ) -> None:
-        """Starts the episodes at `where`; the others' entries are not read."""
-        self.simulation.reset(scenarios, rngs, where)
-        for b in np.flatnonzero(where).tolist():
-            self._names[b], self._tags[b] = scenarios[b].name, scenarios[b].tags
-        self.events = self.simulation.world.events()
 
     def step(self, actions: Float[np.ndarray, "b 2"]) -> Outcome:
         """One tick; actions in [-1, 1]."""

@@ -207,18 +207,18 @@ class ParallelReplayEnv(ParallelEnv[str, dict[str, np.ndarray], Any]):
 
     def _scenarios(self, data: str) -> tuple[ScenarioSet, int]:
         """The scenarios whose own vehicle may be an agent, and the most agents of one of them."""
-        world = self._episodes.simulation.world
-        kept, most = [], 0
-        for scenario in self._episodes.scenarios:
+        world, found = self._episodes.simulation.world, self._episodes.scenarios
+        kept, most = np.zeros(len(found), dtype=bool), 0
+        for row, scenario in enumerate(found):
             recording = self.recordings[scenario.recording]
             wanted = self._wanted[scenario.recording]
             if wanted[recording.track_ids == scenario.ego_id].any():
                 there = candidates(recording, scenario, dt_s=world.dt_s, history=world.history)
                 most = max(most, int((there & wanted).sum()))
-                kept.append(scenario)
-        if not kept:
+                kept[row] = True
+        if not most:
             raise AspEnvError(f"{data}: no scenario's vehicle is of the given classes and ids")
-        return ScenarioSet(scenarios=tuple(kept)), most
+        return found.select(kept), most
 
     def _observe(self) -> Observations:
         rows = np.array([self._numbers[name] for name in self.agents])

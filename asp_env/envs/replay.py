@@ -1,31 +1,50 @@
 """`asp_env/Replay-v0`: drive one vehicle of a recording."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
+from functools import partial
 from typing import Any
 
 import gymnasium
 import numpy as np
+from jaxtyping import Float
 
+from asp_env.data.scenario import Scenario, ScenarioSet
 from asp_env.data.scene import Scene
 from asp_env.data.snippets import Future
-from asp_env.envs.episodes import ReplayEpisodes, as_actions
+from asp_env.data.source import Recordings
+from asp_env.envs.episodes import Outcome, ReplayEpisodes, as_actions
 from asp_env.errors import AspEnvError
 from asp_env.render.frames import draw_frame
 from asp_env.sim.recorded import recorded_future
 from asp_env.sim.replay import ReplayWorld
 
+NOT_BEGUN = "no episode has begun: call reset first"
 METADATA = {"render_modes": ["rgb_array"], "render_fps": 5}
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class EnvSnapshot:
-    """The whole state of an environment: small, picklable, without recordings and pictures."""
+    """The whole state of an environment: how it came about, and the arrays of it.
 
-    episodes: Any
+    Pickles hold only how it came about, a few kilobytes; from those an environment that is made
+    with the same arguments gets to the same state by driving there.
+    """
+
+    scenario: Scenario
+    rng: dict[str, Any]
+    """State of the episode's own generator at its start."""
+    actions: Float[np.ndarray, "steps 2"]
+    """Since the start, in [-1, 1]."""
     generator: dict[str, Any]
     """State of `np_random`."""
     seed: int | None
     running: bool
+    arrays: Any = None
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        """Without the arrays."""
+        names = [field.name for field in fields(self) if field.name != "arrays"]
+        return partial(EnvSnapshot, **{name: getattr(self, name) for name in names}), ()
 
 
 class ReplayEnv(gymnasium.Env[dict[str, Any], Any]):
@@ -83,11 +102,12 @@ width m |
             raise AspEnvError(f"render mode {render_mode!r}: expected rgb_array or None")
         self.render_mode = render_mode
         self._episodes = ReplayEpisodes(data, options, 1)
-        self.recordings = self._episodes.recordings
-        self.scenarios = self._episodes.scenarios
         self.observation_space = self._episodes.observer.space
         self.action_space = self._episodes.action_space
         self._running = False
+        self._start: tuple[Scenario, dict[str, Any]] | None = None
+        """The scenario, and the state of its generator when it began."""
+        self._actions: list[Float[np.ndarray, " 2"]] = []
 
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
@@ -103,8 +123,7 @@ width m |
             AspEnvError: an option is unknown, or what it asks for does not exist.
         """
         super().reset(seed=seed)
-        scenario, rng = self._episodes.draw(self.np_random, options or {})
-        self._episodes.begin([scenario], [rng], np.ones(1, dtype=bool))
+        self._begin(*self._episodes.draw(self.np_random, options or {}))
         self._running = True
         return self._observe(), self._info()
 
@@ -117,7 +136,7 @@ width m |
         """
         if not self._running:
             raise gymnasium.error.ResetNeeded("the episode is over: call reset before step")
-        outcome = self._episodes.step(as_actions(action, (2,))[None])
+        outcome = self._act(as_actions(action, (2,)))
         terminated, truncated = bool(outcome.terminated[0]), bool(outcome.truncated[0])
         self._running = not (terminated or truncated)
         info = self._info() | {
@@ -132,12 +151,16 @@ width m |
         Raises:
             gymnasium.error.ResetNeeded: no episode has begun.
         """
-        self._world()
+        if self._start is None:
+            raise gymnasium.error.ResetNeeded(NOT_BEGUN)
         return EnvSnapshot(
-            episodes=self._episodes.snapshot(),
+            scenario=self._start[0],
+            rng=self._start[1],
+            actions=np.array(self._actions, dtype=np.float32).reshape(-1, 2),
             generator=self.np_random.bit_generator.state,
             seed=self._np_random_seed,
             running=self._running,
+            arrays=self._episodes.snapshot(),
         )
 
     def restore(self, snapshot: EnvSnapshot) -> None:
@@ -145,7 +168,16 @@ width m |
 
         What comes after is the same bit for bit.
         """
-        self._episodes.restore(snapshot.episodes)
+        if snapshot.arrays is None:
+            rng = np.random.default_rng()
+            rng.bit_generator.state = snapshot.rng
+            self._begin(snapshot.scenario, rng)
+            for action in snapshot.actions:
+                self._act(action)
+        else:
+            self._episodes.restore(snapshot.arrays)
+            self._start = snapshot.scenario, snapshot.rng
+            self._actions = list(snapshot.actions)
         self.np_random.bit_generator.state = snapshot.generator
         self._np_random_seed = snapshot.seed
         self._running = snapshot.running
@@ -179,6 +211,24 @@ width m |
         recording = self.recordings[int(self._world().episodes.recording[0])]
         return draw_frame(scene, background=recording.background)
 
+    @property
+    def recordings(self) -> Recordings:
+        """Of DATA."""
+        return self._episodes.recordings
+
+    @property
+    def scenarios(self) -> ScenarioSet:
+        """Those that are drawn from."""
+        return self._episodes.scenarios
+
+    def _begin(self, scenario: Scenario, rng: np.random.Generator) -> None:
+        self._start, self._actions = (scenario, rng.bit_generator.state), []
+        self._episodes.begin([scenario], [rng], np.ones(1, dtype=bool))
+
+    def _act(self, action: Float[np.ndarray, " 2"]) -> Outcome:
+        self._actions.append(action)
+        return self._episodes.step(action[None])
+
     def _observe(self) -> dict[str, Any]:
         return {name: value[0] for name, value in self._episodes.observe().items()}
 
@@ -186,7 +236,6 @@ width m |
         return {name: value.tolist()[0] for name, value in self._episodes.info().items()}
 
     def _world(self) -> ReplayWorld:
-        world = self._episodes.simulation.world
-        if world.scenarios[0] is None:
-            raise gymnasium.error.ResetNeeded("no episode has begun: call reset first")
-        return world
+        if self._start is None:
+            raise gymnasium.error.ResetNeeded(NOT_BEGUN)
+        return self._episodes.simulation.world

@@ -17,33 +17,43 @@ OPTIONS = ("scenario", "start_tick", "ego")
 """What `reset(options=…)` understands."""
 
 
-def choose(
-    found: ScenarioSet, wanted: ScenarioSet | str | Sequence[str] | None, *, data: str
-) -> ScenarioSet:
-    """The scenarios to draw from: all, those with every one of some tags, or those given.
+def tagged(found: ScenarioSet, tags: str | Sequence[str] | None, *, data: str) -> ScenarioSet:
+    """Those that carry every one of some tags.
 
     Raises:
-        AspEnvError: none is left.
+        AspEnvError: there is none, or a tag is unknown.
     """
-    if not len(found) and not isinstance(wanted, ScenarioSet):
+    if not len(found):
         raise AspEnvError(
             f"{data}: no vehicle covers 10 m in 4 s after 3 s of history; use other recordings"
         )
-    if wanted is None:
-        return found
-    if isinstance(wanted, ScenarioSet):
-        if not len(wanted):
-            raise AspEnvError("scenarios: the set is empty; expected at least one scenario")
-        return wanted
+    wanted = [tags] if isinstance(tags, str) else list(tags or ())
     known = {tag for scenario in found for tag in scenario.tags}
     left = found
-    for tag in [wanted] if isinstance(wanted, str) else wanted:
+    for tag in wanted:
         if tag not in known:
             raise unknown_name("scenario tag", tag, known)
         left = left.tagged(tag)
     if not len(left):
         raise AspEnvError(f"{data}: no scenario carries all of the tags {', '.join(wanted)}")
     return left
+
+
+def checked(given: ScenarioSet, names: Sequence[str], *, data: str) -> ScenarioSet:
+    """Scenarios that the caller chose.
+
+    Raises:
+        AspEnvError: there is none, or one is not of these recordings.
+    """
+    if not len(given):
+        raise AspEnvError("scenarios: the set is empty; expected at least one scenario")
+    for scenario in given:
+        if scenario.recording_name not in names[scenario.recording : scenario.recording + 1]:
+            raise AspEnvError(
+                f"scenario {scenario.name}: expected one of {data}, whose recordings are "
+                f"{', '.join(names)}"
+            )
+    return given
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -55,6 +65,11 @@ class Starts:
     data: str
     dt_s: float
     history: int
+
+    def __deepcopy__(self, memo: dict[int, Any]) -> "Starts":
+        """Itself, since nothing of it ever changes."""
+        del memo
+        return self
 
     def find(self, options: Mapping[str, Any], drawn: int) -> Scenario:
         """The scenario that the options of a reset ask for, else the drawn one.

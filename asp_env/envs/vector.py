@@ -11,8 +11,10 @@ from gymnasium.vector import AutoresetMode, VectorEnv
 from gymnasium.vector.utils import batch_space
 from jaxtyping import Bool, Shaped
 
+from asp_env.data.scenario import ScenarioSet
 from asp_env.data.scene import Scene
 from asp_env.data.snippets import Future
+from asp_env.data.source import Recordings
 from asp_env.envs.buffers import Buffers
 from asp_env.envs.episodes import Outcome, ReplayEpisodes, as_actions
 from asp_env.errors import AspEnvError
@@ -65,8 +67,6 @@ class ReplayVectorEnv(VectorEnv[Observation, Any, np.ndarray]):
         self.metadata = {**self.metadata, "autoreset_mode": self._mode}
         self.render_mode = render_mode
         self._episodes = ReplayEpisodes(data, options, num_envs)
-        self.recordings = self._episodes.recordings
-        self.scenarios = self._episodes.scenarios
         self.single_observation_space = self._episodes.observer.space
         self.single_action_space = self._episodes.action_space
         self.observation_space = batch_space(self.single_observation_space, num_envs)
@@ -216,6 +216,16 @@ class ReplayVectorEnv(VectorEnv[Observation, Any, np.ndarray]):
         self._seeds = list(snapshot.seeds)
         self._begun[:] = True
         self._over = snapshot.over.copy()
+
+    @property
+    def recordings(self) -> Recordings:
+        """Of DATA."""
+        return self._episodes.recordings
+
+    @property
+    def scenarios(self) -> ScenarioSet:
+        """Those that are drawn from."""
+        return self._episodes.scenarios
 
     @property
     def np_random(self) -> tuple[np.random.Generator, ...]:

@@ -15,7 +15,7 @@ from asp_env.dynamics import MAX_STEERING_RAD, wrap_angle
 from asp_env.sim.sight import Sight
 from asp_env.sim.world import Events
 from asp_env.views import PictureView
-from asp_env.views.vectors import AGENT_FIELDS, LINE_FIELDS, Vectors, VectorView
+from asp_env.views.vectors import AGENT_FIELDS, LINE_FIELDS, VectorBounds, Vectors, VectorView
 
 FARTHEST_M = 1000.0
 """Positions in an ego's frame are shown up to here."""
@@ -81,14 +81,17 @@ class VectorsPart:
             "lines": _box(*_field_bounds(LINE_FIELDS), lines),
             "lines_valid": spaces.Box(0, 1, lines, dtype=np.int8),
         }
+        bounds = (self.spaces["agents"], self.spaces["lines"])
+        self._within = VectorBounds(
+            *(bound.reshape(-1) for box in bounds for bound in (box.low, box.high))
+        )
 
     def write(self, sight: Sight, events: Events, out: Arrays) -> None:
         """Writes into the memory itself."""
         del events
         masks = out["agents_valid"].view(np.bool_), out["lines_valid"].view(np.bool_)
-        self._view.draw(sight, Vectors(out["agents"], masks[0], out["lines"], masks[1]))
-        for name in ("agents", "lines"):
-            _clip_to(self.spaces[name], out[name])
+        memory = Vectors(out["agents"], masks[0], out["lines"], masks[1])
+        self._view.draw(sight, memory, self._within)
 
 
 @final
@@ -165,7 +168,7 @@ def _field_bounds(names: tuple[str, ...]) -> tuple[np.ndarray, np.ndarray]:
     """Of the fields of agents or lines; all but some lie between 0 and 1."""
     wide = {"x": FARTHEST_M, "y": FARTHEST_M, "cos": 1.0, "sin": 1.0, "speed": FASTEST_MPS}
     sizes = {"length": STATE_FIELDS["length_m"][1], "width": STATE_FIELDS["width_m"][1]}
-    low = [-wide.get(name, 0.0) for name in names]
+    low = [-wide[name] if name in wide else 0.0 for name in names]
     return np.array(low), np.array([wide.get(name, sizes.get(name, 1.0)) for name in names])
 
 
@@ -200,8 +203,8 @@ def _clip(rows, low, high):
         row = rows[t]
         for i in range(len(low)):
             value, least, most = row[i], low[i], high[i]
-            value = value if value > least else least
-            row[i] = value if value < most else most
+            value = value if value >= least else least
+            row[i] = value if value <= most else most
 
 
 @njit(cache=True)
