@@ -10,11 +10,12 @@ from gymnasium import spaces
 from jaxtyping import Bool, Float, Int, Shaped
 
 from asp_env.data.clock import DEFAULT_DT_S, ticks
-from asp_env.data.scenario import Scenario, ScenarioSet, find_scenarios
+from asp_env.data.scenario import Scenario, ScenarioSet
+from asp_env.data.scenario_filter import ScenarioFilter
 from asp_env.data.snippets import HISTORY_S
 from asp_env.data.source import open_data
 from asp_env.dynamics import MAX_ACCELERATION_MPS2, MAX_STEERING_RAD
-from asp_env.envs.start import Starts, checked, tagged
+from asp_env.envs.start import Starts
 from asp_env.errors import AspEnvError, unknown_name
 from asp_env.sim.observation import Observation, Observer
 from asp_env.sim.reward import reward_terms, weighted_sum, weights_from
@@ -45,8 +46,8 @@ class ReplayOptions:
     """Length of a tick."""
     reward_weights: Mapping[str, float] | None = None
     """Weights by name, where they differ from the defaults."""
-    scenarios: ScenarioSet | str | Sequence[str] | None = None
-    """The scenarios to draw from: all, those with every one of these tags, or these."""
+    scenarios: ScenarioSet | ScenarioFilter | str = ""
+    """The scenarios to draw from: those that fit a filter, such as `left,length>=8`, or these."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -79,14 +80,10 @@ class ReplayEpisodes:
         chosen = _options(options)
         history = ticks(HISTORY_S, chosen.dt_s)
         self.recordings = open_data(data)
-        self.scenarios = self._choose(chosen, history)
-        self._starts = Starts(
-            recordings=self.recordings,
-            scenarios=self.scenarios,
-            data=data,
-            dt_s=chosen.dt_s,
-            history=history,
+        self._starts = Starts.choose(
+            self.recordings, chosen.scenarios, dt_s=chosen.dt_s, history=history
         )
+        self.scenarios = self._starts.scenarios
         raster = make_picture_view(chosen.view, pixels=chosen.raster_px)
         self.observer = Observer(chosen.observations, raster, history)
         self.simulation = Simulation(
@@ -101,15 +98,6 @@ class ReplayEpisodes:
         self._tags = np.full(num_episodes, None, dtype=object)
         self.action_space = spaces.Box(-1.0, 1.0, (2,), dtype=np.float32)
         self.events: Events | None = None
-
-    def _choose(self, options: ReplayOptions, history: int) -> ScenarioSet:
-        wanted, recordings = options.scenarios, self.recordings
-        if isinstance(wanted, ScenarioSet):
-            return checked(wanted, recordings.names, data=recordings.source)
-        found = find_scenarios(
-            recordings, source=recordings.source, dt_s=options.dt_s, history=history
-        )
-        return tagged(found, wanted, data=recordings.source)
 
     def restrict(self, scenarios: ScenarioSet, num_episodes: int) -> None:
         """From now on draws from these scenarios and holds that many episodes, none begun."""

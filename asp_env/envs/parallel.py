@@ -14,7 +14,6 @@ from asp_env.data.scenario import ScenarioSet
 from asp_env.data.scene import Scene
 from asp_env.dynamics import MAX_ACCELERATION_MPS2, MAX_STEERING_RAD
 from asp_env.envs.episodes import Outcome, ReplayEpisodes, as_actions
-from asp_env.envs.replay import METADATA
 from asp_env.envs.start import OPTIONS
 from asp_env.envs.together import TogetherDriver, Wanted, candidates, viewpoints
 from asp_env.errors import AspEnvError, unknown_name
@@ -67,13 +66,14 @@ class ParallelReplayEnv(ParallelEnv[str, dict[str, np.ndarray], Any]):
         Raises:
             AspEnvError: an argument is not understood, or no scenario is left.
         """
-        if render_mode is not None and render_mode not in METADATA["render_modes"]:
+        if render_mode not in (None, "rgb_array"):
             raise AspEnvError(f"render mode {render_mode!r}: expected rgb_array or None")
         if max_agents is not None and max_agents < 1:
             raise AspEnvError(f"max_agents {max_agents}: expected at least 1")
-        self.metadata = {**METADATA, "name": "asp_env/ParallelReplay-v0"}
+        self.metadata = {"name": "asp_env/ParallelReplay-v0", "render_modes": ["rgb_array"]}
         self.render_mode = render_mode
         self._episodes = ReplayEpisodes(data, options, 1)
+        self.metadata["render_fps"] = 1 / self._episodes.simulation.world.dt_s
         self.recordings = self._episodes.recordings
         self._wanted = tuple(Wanted(classes=classes, ids=ids).among(r) for r in self.recordings)
         self.scenarios, most = self._scenarios(data)

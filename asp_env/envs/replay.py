@@ -1,5 +1,6 @@
 """`asp_env/Replay-v0`: drive one vehicle of a recording."""
 
+from collections.abc import Mapping
 from dataclasses import dataclass, fields
 from functools import partial
 from typing import Any
@@ -31,11 +32,11 @@ class EnvSnapshot:
     """
 
     scenario: Scenario
-    rng: dict[str, Any]
+    rng: Mapping[str, Any]
     """State of the episode's own generator at its start."""
     actions: Float[np.ndarray, "steps 2"]
     """Since the start, in [-1, 1]."""
-    generator: dict[str, Any]
+    generator: Mapping[str, Any]
     """State of `np_random`."""
     seed: int | None
     running: bool
@@ -55,34 +56,54 @@ class ReplayEnv(gymnasium.Env[dict[str, Any], Any]):
     positive), held for one tick of the kinematic bicycle model. Braking ends at speed 0.
 
     ## Observation space
-    A `Dict` of the parts named in `observations`:
+    A `Dict` of what `observations` names, in any choice; only that is computed. All values are
+    finite and within finite bounds: what would lie beyond is shown at the bound.
 
-    | part | space | what it is |
+    | name | parts and spaces | what it is |
     |---|---|---|
-    | `raster` | `Box(0, 255, (12, H, W), uint8)` | the view, heading up, see `asp_env.views` |
-    | `actions` | `Box(±[10, π/4], (15, 2), float32)` | acceleration m/s² and steering rad of the \
-last 3 s, oldest first, inferred from the motion |
-    | `state` | `Box(…, (9,), float32)` | fields and bounds in \
-`asp_env.sim.observation.STATE_FIELDS`: speed m/s, acceleration m/s², steering rad, offset to the \
+    | `raster` | `raster`: `Box(0, 255, (12, H, W), uint8)` | the picture that `view` draws, \
+heading up, see `asp_env.views` |
+    | `chauffeurnet`, `mtp`, … | a part of that name | the picture of that view in its usual size, \
+beside or instead of `raster` |
+    | `vectors` | `agents`: `Box(…, (16, 16, 12), float32)` | the ego and its nearest neighbours \
+over the last 3 s, fields as `asp_env.views.vectors.AGENT_FIELDS`, m, rad as cos and sin, m/s, in \
+the ego's frame now |
+    | | `agents_valid`: `Box(0, 1, (16, 16), int8)` | who was there when |
+    | | `lines`: `Box(…, (64, 10, 8), float32)` | the nearest pieces of lanes and boundaries as 10 \
+points, fields as `LINE_FIELDS`, in the ego's frame |
+    | | `lines_valid`: `Box(0, 1, (64, 10), int8)` | which points there are |
+    | `actions` | `actions`: `Box(±[10, π/4], (15, 2), float32)` | acceleration m/s² and steering \
+rad of the last 3 s, oldest first, inferred from the motion |
+    | `state` | `state`: `Box(…, (9,), float32)` | fields and bounds in \
+`asp_env.sim.observed.STATE_FIELDS`: speed m/s, acceleration m/s², steering rad, offset to the \
 left of the route m, heading error rad, share of the route done, way to the goal m, length m, \
 width m |
+    | `route` | `route`: `Box(±1000, (30, 2), float32)` | points 2, 4, … 60 m ahead on the ego's \
+way, in its frame, m; beyond the end of the way straight on |
 
     ## Reward
     The weighted sum of the terms in `info["reward_terms"]`: progress along the logged way,
     comfort, collision at fault, off-road (`asp_env.sim.reward`).
 
     ## Start and end of an episode
-    `reset` draws one of the scenarios (a vehicle that covers at least 10 m in 4 to 15 s) or takes
-    the one of `options={"scenario": number}`. Terminated: a collision that the ego answers for
-    (`COLLISION`), over 2 m off the road (`OFF_ROAD`), or the end of the logged way (`GOAL`).
-    Truncated: the recording has no more (`OUT_OF_DATA`). `info["ending"]` names it.
+    `reset` draws one of the scenarios (a vehicle that covers at least 10 m in 4 to 15 s), or takes
+    `options={"scenario": number or name}`. With `ego` (the track id of any vehicle, in the
+    recording of the scenario) and `start_tick` it begins anywhere with 3 s of history. Terminated:
+    a collision that the ego answers for (`COLLISION`), over 2 m off the road (`OFF_ROAD`), or the
+    end of the logged way (`GOAL`). Truncated: the recording has no more (`OUT_OF_DATA`).
+    `info["ending"]` names it.
 
     ## Arguments
     `data`: a folder in the inD/rounD or INTERACTION layout, `sample:intersection`,
-    `sample:roundabout` or `synthetic:…`. `observations`: which parts. `view` and `raster_px`
-    (height, width): what the raster shows, always 72 m by 48 m. `traffic`: `log`, `log-actions` or
-    `idm`. `dt_s`: length of a tick. `reward_weights`: weights by name, where they differ from the
-    defaults.
+    `sample:roundabout` or `synthetic:…`. Then those of
+    `asp_env.envs.episodes.ReplayOptions`: `observations`, `view` and `raster_px` (height, width;
+    by default the view's own) of the raster, `traffic` (`log`, `log-actions`, `idm`, … or a table
+    of them), `dt_s` (length of a tick), `reward_weights` by name, where they differ from the
+    defaults, and `scenarios` (a set of them, or a filter such as `left,length>=8`).
+
+    ## Going back
+    `snapshot()` and `restore()` on `env.unwrapped` bring back the whole state bit for bit, that of
+    `np_random` included, for search and counterfactuals; snapshots can be pickled.
 
     ## Version history
     v0: first.
@@ -105,7 +126,7 @@ width m |
         self.observation_space = self._episodes.observer.space
         self.action_space = self._episodes.action_space
         self._running = False
-        self._start: tuple[Scenario, dict[str, Any]] | None = None
+        self._start: tuple[Scenario, Mapping[str, Any]] | None = None
         """The scenario, and the state of its generator when it began."""
         self._actions: list[Float[np.ndarray, " 2"]] = []
 

@@ -1,6 +1,6 @@
 """Many episodes of `asp_env/Replay-v0` side by side, on arrays all the way."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -30,7 +30,7 @@ class VectorSnapshot:
     """The whole state of a vector environment: picklable, without recordings and pictures."""
 
     episodes: Any
-    generators: tuple[dict[str, Any], ...]
+    generators: tuple[Mapping[str, Any], ...]
     """States of `np_random`."""
     seeds: tuple[int | None, ...]
     over: Bool[np.ndarray, " n"]
@@ -246,7 +246,7 @@ class ReplayVectorEnv(VectorEnv[Observation, Any, np.ndarray]):
 
     def _begin(self, where: Bool[np.ndarray, " n"], options: Sequence[dict[str, Any]]) -> None:
         world = self._episodes.simulation.world
-        scenarios, rngs = list(world.scenarios), list(world.rngs)
+        scenarios, rngs = [self.scenarios[0]] * self.num_envs, list(world.rngs)
         for b in np.flatnonzero(where).tolist():
             scenarios[b], rngs[b] = self._episodes.draw(self._generator(b), options[b])
         self._episodes.begin(scenarios, rngs, where)
@@ -326,4 +326,6 @@ def _masked(infos: Infos, where: Bool[np.ndarray, " n"]) -> Infos:
 def _only(value: Shaped[np.ndarray, " n"], where: Bool[np.ndarray, " n"]) -> np.ndarray:
     if where.all():
         return value
-    return np.where(where, value, None if value.dtype == object else value.dtype.type(0))
+    out = np.full(len(value), None if value.dtype == object else 0, dtype=value.dtype)
+    out[where] = value[where]
+    return out

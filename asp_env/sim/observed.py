@@ -4,7 +4,7 @@ Every value is finite and lies within the bounds of its space; what would lie be
 """
 
 import math
-from typing import final, no_type_check
+from typing import Any, final, no_type_check
 
 import numpy as np
 from gymnasium import spaces
@@ -44,6 +44,7 @@ ROUTE_STEP_M = 2.0
 """Between the points of the `route` observation; the first lies this far ahead of the ego."""
 
 Arrays = dict[str, np.ndarray]
+Spaces = dict[str, spaces.Box[Any]]
 
 
 @final
@@ -54,7 +55,7 @@ class PicturePart:
         """A part of that name."""
         self._name, self._view = name, view
         self.history = view.history
-        self.spaces = {name: spaces.Box(0, 255, view.shape, dtype=np.uint8)}
+        self.spaces: Spaces = {name: spaces.Box(0, 255, view.shape, dtype=np.uint8)}
 
     def write(self, sight: Sight, events: Events, out: Arrays) -> None:
         """Draws into the memory itself."""
@@ -75,7 +76,7 @@ class VectorsPart:
         self.history = view.history
         shape = view.shape
         agents, lines = (shape.agents, shape.ticks), (shape.lines, shape.points)
-        self.spaces = {
+        self.spaces: Spaces = {
             "agents": _box(*_field_bounds(AGENT_FIELDS), agents),
             "agents_valid": spaces.Box(0, 1, agents, dtype=np.int8),
             "lines": _box(*_field_bounds(LINE_FIELDS), lines),
@@ -102,7 +103,7 @@ class ActionsPart:
         """Of that many ticks."""
         self.history = history
         limit = np.array([MAX_SEEN_ACCELERATION_MPS2, MAX_STEERING_RAD])
-        self.spaces = {"actions": _box(-limit, limit, (history,))}
+        self.spaces: Spaces = {"actions": _box(-limit, limit, (history,))}
 
     def write(self, sight: Sight, events: Events, out: Arrays) -> None:
         """Infers those of the targets alone."""
@@ -120,7 +121,7 @@ class StatePart:
     def __init__(self) -> None:
         """The bounds are those of the fields."""
         low, high = np.array(list(STATE_FIELDS.values())).T
-        self.spaces = {"state": _box(low, high, ())}
+        self.spaces: Spaces = {"state": _box(low, high, ())}
 
     def write(self, sight: Sight, events: Events, out: Arrays) -> None:
         """The fields in their order."""
@@ -154,7 +155,7 @@ class RoutePart:
     def __init__(self) -> None:
         """Of `ROUTE_POINTS` points."""
         high = np.full(2, FARTHEST_M)
-        self.spaces = {"route": _box(-high, high, (ROUTE_POINTS,))}
+        self.spaces: Spaces = {"route": _box(-high, high, (ROUTE_POINTS,))}
 
     def write(self, sight: Sight, events: Events, out: Arrays) -> None:
         """Writes into the memory itself."""
@@ -172,7 +173,7 @@ def _field_bounds(names: tuple[str, ...]) -> tuple[np.ndarray, np.ndarray]:
     return np.array(low), np.array([wide.get(name, sizes.get(name, 1.0)) for name in names])
 
 
-def _box(low: np.ndarray, high: np.ndarray, leading: tuple[int, ...]) -> spaces.Box:
+def _box(low: np.ndarray, high: np.ndarray, leading: tuple[int, ...]) -> spaces.Box[Any]:
     """A table of float32 whose last axis has these bounds."""
     shape = (*leading, len(low))
     return spaces.Box(
@@ -182,7 +183,7 @@ def _box(low: np.ndarray, high: np.ndarray, leading: tuple[int, ...]) -> spaces.
     )
 
 
-def _clip_to(box: spaces.Box, values: np.ndarray) -> None:
+def _clip_to(box: spaces.Box[Any], values: np.ndarray) -> None:
     """Moves what lies outside a space into it."""
     _clip(values.reshape(len(values), -1), box.low.reshape(-1), box.high.reshape(-1))
 

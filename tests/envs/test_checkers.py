@@ -58,6 +58,7 @@ def test_the_spaces_are_those_of_the_contract(crossing):
 def test_all_that_is_seen_is_finite_and_within_finite_bounds(crossing, name):
     """Through wild drives far off the road, alone or beside the raster."""
     env = ReplayEnv(crossing, observations=(name,))
+    assert isinstance(env.observation_space, gymnasium.spaces.Dict)
     for box in env.observation_space.values():
         assert isinstance(box, gymnasium.spaces.Box)
         assert box.is_bounded()

@@ -129,8 +129,7 @@ def test_disabled_waits_for_a_reset(crossing):
     """A step with a finished episode in it is refused, and says which it is."""
     envs = _make(crossing, autoreset_mode="Disabled")
     envs.reset(options={"scenario": [1, 5, 1]})
-    for _ in range(35):
-        told = envs.step(STILL)
+    told = [envs.step(STILL) for _ in range(35)][-1]
     assert told[2].tolist() == [False, True, False]
     with pytest.raises(gymnasium.error.ResetNeeded, match=r"the episodes \[1\] are over"):
         envs.step(STILL)
@@ -146,8 +145,7 @@ def test_actions_that_are_ignored_may_be_anything(crossing):
     """In the step that resets an episode, its action is not looked at."""
     envs = _make(crossing)
     envs.reset(options={"scenario": [1, 5, 1]})
-    for _ in range(35):
-        told = envs.step(STILL)
+    told = [envs.step(STILL) for _ in range(35)][-1]
     assert told[2].tolist() == [False, True, False]
     wild = np.array([(0.0, 0.0), (np.nan, np.inf), (0.0, 0.0)])
     told = envs.step(wild)
@@ -212,8 +210,7 @@ def test_gymnasiums_wrappers_understand_the_infos(crossing):
     """A list of dictionaries as of single environments; statistics of episodes."""
     envs = DictInfoToList(RecordEpisodeStatistics(_make(crossing)))
     envs.reset(options={"scenario": [1, 5, 1]})
-    for _ in range(35):
-        infos = envs.step(STILL)[4]
+    infos: Any = [envs.step(STILL)[4] for _ in range(35)][-1]
     assert "episode" not in infos[0]
     assert infos[1]["episode"]["l"] == 35
     assert infos[1]["ending"] == "GOAL"
@@ -233,6 +230,7 @@ def test_made_by_gymnasium(crossing):
     assert str(envs) == "ReplayVectorEnv(asp_env/Replay-v0, num_envs=3)"
     assert envs.metadata["autoreset_mode"] is AutoresetMode.NEXT_STEP
     assert "autoreset_mode" not in ReplayVectorEnv.metadata
+    assert isinstance(envs.observation_space, gymnasium.spaces.Dict)
     assert envs.observation_space["state"].shape == (3, 9)
     assert envs.reset(seed=0)[0] in envs.observation_space
     envs.close()
