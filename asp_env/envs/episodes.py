@@ -99,6 +99,22 @@ class ReplayEpisodes:
         self.action_space = spaces.Box(-1.0, 1.0, (2,), dtype=np.float32)
         self.events: Events | None = None
 
+    def restrict(self, scenarios: ScenarioSet, num_episodes: int) -> None:
+        """From now on draws from these scenarios and holds that many episodes, none begun."""
+        world = self.simulation.world
+        self.scenarios = scenarios
+        self._starts = dataclasses.replace(self._starts, scenarios=scenarios)
+        self.simulation = Simulation(
+            self.recordings,
+            self.simulation.driver,
+            num_episodes=num_episodes,
+            dt_s=world.dt_s,
+            history=world.history,
+        )
+        self._names = np.full(num_episodes, None, dtype=object)
+        self._tags = np.full(num_episodes, None, dtype=object)
+        self.events = None
+
     def draw(
         self, np_random: np.random.Generator, options: Mapping[str, Any]
     ) -> tuple[Scenario, np.random.Generator]:

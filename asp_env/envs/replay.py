@@ -13,9 +13,11 @@ from asp_env.data.forecast import Forecast
 from asp_env.data.recording import Background
 from asp_env.data.scenario import Scenario, ScenarioSet
 from asp_env.data.scene import Scene
+from asp_env.data.snippets import Future
 from asp_env.data.source import Recordings
 from asp_env.envs.episodes import Outcome, ReplayEpisodes, as_actions
 from asp_env.render.live import MODES, Live
+from asp_env.sim.recorded import recorded_future
 from asp_env.sim.replay import ReplayWorld
 
 NOT_BEGUN = "no episode has begun: call reset first"
@@ -235,6 +237,19 @@ way, in its frame, m; beyond the end of the way straight on |
         self._live.tell(self.scene(), forecast, plan)
         if self.render_mode == "human":
             self.render()
+
+    def recorded_future(self, scene: Scene, horizon: int) -> Future:
+        """What the targets of a scene of now went on to do, for privileged predictors alone.
+
+        Raises:
+            gymnasium.error.ResetNeeded: no episode has begun.
+        """
+        return recorded_future(self._world(), scene, horizon)
+
+    @property
+    def dt_s(self) -> float:
+        """Length of a tick."""
+        return self._episodes.simulation.world.dt_s
 
     def render(self) -> Any:
         """A picture from above: RGB uint8 (H, W, 3) in mode `rgb_array`, on screen in `human`.

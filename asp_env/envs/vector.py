@@ -13,11 +13,14 @@ from jaxtyping import Bool, Shaped
 
 from asp_env.data.scenario import ScenarioSet
 from asp_env.data.scene import Scene
+from asp_env.data.snippets import Future
 from asp_env.data.source import Recordings
 from asp_env.envs.buffers import Buffers
 from asp_env.envs.episodes import Outcome, ReplayEpisodes, as_actions
 from asp_env.errors import AspEnvError
+from asp_env.render.frames import draw_frame
 from asp_env.sim.observation import Observation
+from asp_env.sim.recorded import recorded_future
 
 Infos = dict[str, Any]
 
@@ -164,6 +167,34 @@ class ReplayVectorEnv(VectorEnv[Observation, Any, np.ndarray]):
         """
         self._need_begun()
         return self._episodes.simulation.world.scene()
+
+    def recorded_future(self, scene: Scene, horizon: int) -> Future:
+        """What the targets of a scene of now went on to do, for privileged predictors alone.
+
+        Raises:
+            gymnasium.error.ResetNeeded: no episode has begun.
+        """
+        self._need_begun()
+        return recorded_future(self._episodes.simulation.world, scene, horizon)
+
+    @property
+    def dt_s(self) -> float:
+        """Length of a tick."""
+        return self._episodes.simulation.world.dt_s
+
+    def render(self) -> tuple[Any, ...] | None:
+        """What `ReplayEnv.render` returns, of each environment; None without a render mode.
+
+        Raises:
+            gymnasium.error.ResetNeeded: an episode has not begun.
+        """
+        if self.render_mode is None:
+            return None
+        scene, recording = self.scene(), self._episodes.simulation.world.episodes.recording
+        return tuple(
+            draw_frame(scene, situation=b, background=self.recordings[int(recording[b])].background)
+            for b in range(self.num_envs)
+        )
 
     def snapshot(self) -> VectorSnapshot:
         """The whole state with those of `np_random`, to be handed to `restore`.
