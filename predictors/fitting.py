@@ -21,6 +21,7 @@ from asp_env.errors import AspEnvError
 from asp_env.views import make_view
 from predictors.calibration import temperature_on
 from predictors.checkpoint import CONFIG, read_config, save_learned, shape_for, write_json
+from predictors.drawing import hired
 from predictors.hardware import LOGS, Hardware, make_trainer, quiet
 from predictors.lightning_parts import Fit, KeepBest, TellEpochs
 from predictors.network import LearnedPlug
@@ -120,16 +121,19 @@ def train(
         if not resumed:
             write_json(run, state / RUN)
         shutil.rmtree(out / LOGS / started, ignore_errors=True)
-    module = Fit(network, config=config, training=batches[0], validation=batches[1])
-    _fit(trainer, module, best.state_path, hardware)
-    if not trainer.is_global_zero:
-        trainer.strategy.barrier()
-        return out
+    with hired([each.drawing for each in batches], hardware.drawing) as crew:
+        if crew is not None:
+            batches = [each.drawn_by(crew, number) for number, each in enumerate(batches)]
+        module = Fit(network, config=config, training=batches[0], validation=batches[1])
+        _fit(trainer, module, best.state_path, hardware)
+        if not trainer.is_global_zero:
+            trainer.strategy.barrier()
+            return out
 
-    weights = load_file(best.best_path)
-    network.load_state_dict(weights)
-    with torch.compiler.set_stance("force_eager") if hardware.compiled else nullcontext():
-        temperature = temperature_on(network, batches[1])
+        weights = load_file(best.best_path)
+        network.load_state_dict(weights)
+        with torch.compiler.set_stance("force_eager") if hardware.compiled else nullcontext():
+            temperature = temperature_on(network, batches[1])
     save_learned(
         out,
         plug=plug,

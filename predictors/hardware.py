@@ -49,13 +49,17 @@ class Hardware:
     """`ddp` also where there is but one process."""
     compiled: bool = False
     """Whether the encoder is compiled by `torch.compile`."""
+    drawing: int = 0
+    """Processes that draw batches ahead for each device; with none, a thread does."""
 
     def __post_init__(self) -> None:
         """Checks the numbers.
 
         Raises:
-            AspEnvError: one is below 1, or there is nothing to compile with.
+            AspEnvError: one is too low, or there is nothing to compile with.
         """
+        if self.drawing < 0:
+            raise AspEnvError(f"training: drawing is {self.drawing}, expected 0 or more")
         for field in ("devices", "nodes"):
             value = getattr(self, field)
             if value != "auto" and value < 1:

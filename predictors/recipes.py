@@ -51,8 +51,6 @@ class TrainingConfig:
     batch_size: int = 32
     learning_rate: float = 1e-4
     weight_decay: float = 0.0
-    gradient_clip: float | None = None
-    """The largest norm of a gradient; longer ones are shortened."""
     schedule: Literal["plateau", "one-cycle"] = "plateau"
     """`plateau` divides the learning rate by 5 after 3 epochs without improvement; `one-cycle`
     raises it over the first tenth of all steps and lowers it along a cosine to zero."""
@@ -131,7 +129,6 @@ def _small(
         batch_size=64,
         learning_rate=1e-3,
         weight_decay=1e-2,
-        gradient_clip=5.0,
         schedule="one-cycle",
         precision="32-true" if vectors else "bf16-mixed",
         threads=1,

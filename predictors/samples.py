@@ -1,10 +1,7 @@
 """Training data: snippets drawn on the fly, in the order of an epoch."""
 
 import copy
-from collections import deque
 from collections.abc import Iterator, Sequence
-from concurrent.futures import ThreadPoolExecutor
-from itertools import islice
 from typing import final
 
 import numpy as np
@@ -15,16 +12,12 @@ from asp_env.data.snippets import (
     SnippetIndex,
     gather_future,
     gather_present,
-    gather_scene,
 )
 from asp_env.dynamics import MAX_ACCELERATION_MPS2, MAX_STEERING_RAD, inverse
 from asp_env.errors import AspEnvError
 from asp_env.metrics.open_loop import moving
 from asp_env.views import SceneView
-from predictors.batch import Batch, Labels, make_batch, make_labels
-
-AHEAD = 4
-"""Batches drawn in advance."""
+from predictors.drawing import Crew, Drawing, Drawn, drawn_by_crew, drawn_by_thread
 
 CHUNK = 4096
 """Snippets read at once where a whole set is scanned."""
@@ -35,10 +28,9 @@ MIN_ACTION_RANGE = (0.5, 0.05)
 
 @final
 class Batches:
-    """Batches of snippets, drawn by a thread while the network works on the one before.
+    """Batches of snippets, drawn while the network works on the one before.
 
-    Drawing releases the interpreter's lock, so that processes of their own would only add copies.
-    The order is given, hence the batches are the same whenever it is.
+    The order is given, hence the batches are the same whenever and by whomever they are drawn.
     """
 
     def __init__(
@@ -62,13 +54,22 @@ class Batches:
             histories: the same recordings with what was known at the time; themselves if None.
         """
         self.snippets = snippets
-        self._recordings = recordings
-        self._histories = recordings if histories is None else histories
-        self._later_ticks = tuple(later_ticks)
-        self._view = view
+        self.drawing = Drawing(
+            recordings=recordings,
+            histories=recordings if histories is None else histories,
+            view=view,
+            later_ticks=tuple(later_ticks),
+        )
+        self._crew: tuple[Crew, int] | None = None
         self._batch_size = batch_size
         self._rank = 0
         self.ranks = 1
+
+    def drawn_by(self, crew: Crew, number: int) -> "Batches":
+        """The same, drawn by a crew that knows their drawing by this number."""
+        other = copy.copy(self)
+        other._crew = crew, number
+        return other
 
     def reordered(self, rows: Int[np.ndarray, " m"]) -> "Batches":
         """Batches of the snippets at some rows, in their order."""
@@ -103,27 +104,12 @@ class Batches:
         """How many batches there are."""
         return -(-len(self.snippets) // self._batch_size)
 
-    def __iter__(self) -> Iterator[tuple[Batch, Labels]]:
+    def __iter__(self) -> Iterator[Drawn]:
         """All batches in order."""
-        numbers = iter(range(len(self)))
-        with ThreadPoolExecutor(1, thread_name_prefix="draw") as pool:
-            waiting = deque(pool.submit(self._make, number) for number in islice(numbers, AHEAD))
-            while waiting:
-                ready = waiting.popleft().result()
-                waiting.extend(pool.submit(self._make, number) for number in islice(numbers, 1))
-                yield ready
-
-    def _make(self, number: int) -> tuple[Batch, Labels]:
-        chosen = self.snippets.select(self.share(number))
-        scene = gather_scene(self._histories, chosen)
-        later = tuple(
-            make_batch(
-                gather_scene(self._histories, chosen.shifted(ticks)), self._view, chosen.history
-            )
-            for ticks in self._later_ticks
-        )
-        labels = make_labels(scene, gather_future(self._recordings, chosen), later)
-        return make_batch(scene, self._view, chosen.history), labels
+        chosen = (self.snippets.select(self.share(number)) for number in range(len(self)))
+        if self._crew is None:
+            return drawn_by_thread(self.drawing, chosen)
+        return drawn_by_crew(*self._crew, chosen)
 
 
 def epoch_rows(count: int, *, per_epoch: int, epoch: int, seed: int) -> Int[np.ndarray, " rows"]:

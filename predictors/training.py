@@ -58,6 +58,8 @@ class Train:
     """How processes work together; ddp takes it also where there is but one."""
     compile: bool = False
     """Compile the encoder with torch.compile: some tens of seconds at first, faster later."""
+    drawing: int = 0
+    """Processes that draw batches ahead for each device, where one thread is too slow for a GPU."""
 
     def run(self) -> None:
         """Trains.
@@ -73,7 +75,11 @@ class Train:
             raise MissingExtraError(str(error.name), "train", "training") from error
 
         hardware = Hardware(
-            devices=self.devices, nodes=self.nodes, strategy=self.strategy, compiled=self.compile
+            devices=self.devices,
+            nodes=self.nodes,
+            strategy=self.strategy,
+            compiled=self.compile,
+            drawing=self.drawing,
         )
         if self.variant is not None and not variant(self.predictor, self.variant).goes_on:
             config = self.config_for(self.horizon)

@@ -36,6 +36,10 @@ class CausalHistories(Sequence[Any]):  # not of Recording: checking its items wo
         self._recorded = recordings
         self._filtered: dict[int, Recording] = {}
 
+    def __reduce__(self) -> tuple[Any, ...]:
+        """A copy in another process filters anew what is not in the cache."""
+        return CausalHistories, (self._recorded,)
+
     def __len__(self) -> int:
         """How many there are."""
         return len(self._recorded)

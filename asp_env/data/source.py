@@ -48,6 +48,10 @@ class Recordings(Sequence[Any]):  # not of Recording: checking its items at run 
         del memo
         return self
 
+    def __reduce__(self) -> tuple[Any, ...]:
+        """A copy in another process opens its files anew, mapped from the same cache."""
+        return Recordings, (self.source, self._files)
+
     def __len__(self) -> int:
         """How many there are."""
         return len(self._files)
