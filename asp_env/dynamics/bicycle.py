@@ -126,7 +126,8 @@ def _lowest_below_zero(values: Any) -> Any:
     """The least of each value and those before it, or 0 if none is negative."""
     xp = namespace(values)
     if xp is np:
-        return np.minimum(np.minimum.accumulate(values, axis=-1), 0.0)
+        lowest = values if values.shape[-1] == 1 else np.minimum.accumulate(values, axis=-1)
+        return np.minimum(lowest, 0.0)
     return xp.clamp(xp.cummin(values, dim=-1).values, max=0.0)
 
 
