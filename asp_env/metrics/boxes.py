@@ -94,9 +94,8 @@ def is_behind(x, y, heading, length, x_o, y_o):
 
 @njit(cache=True)
 @no_type_check
-def _contact(x, y, heading, speed, length, width, x_o, y_o, heading_o, speed_o, length_o, width_o):
-    if not overlaps(x, y, heading, length, width, x_o, y_o, heading_o, length_o, width_o):
-        return Contact.NONE.value
+def _kind(x, y, heading, speed, length, width, x_o, y_o, heading_o, speed_o, length_o, width_o):
+    """The `Contact` of two boxes that overlap."""
     if abs(speed) <= STANDING_MPS:
         return Contact.EGO_STANDS.value
     if abs(speed_o) <= STANDING_MPS:
@@ -116,21 +115,30 @@ def _contacts(states, sizes, valid, before, out):
     for b in range(states.shape[0]):
         x, y, heading, speed = states[b, 0, 0], states[b, 0, 1], states[b, 0, 2], states[b, 0, 3]
         length, width = sizes[b, 0, 0], sizes[b, 0, 1]
+        cos, sin, around = math.cos(heading), math.sin(heading), 0.5 * (length + width)
         for a in range(states.shape[1]):
-            out[b, a] = 0
+            known, out[b, a] = before[b, a], 0
             if a == 0 or not (valid[b, 0] and valid[b, a]):
                 continue
-            dx, dy = states[b, a, 0] - x, states[b, a, 1] - y
+            x_o, y_o = states[b, a, 0], states[b, a, 1]
+            dx, dy = x_o - x, y_o - y
             # no root for the many far away: two boxes reach no further than half their sides' sum
-            reach = 0.5 * (length + width + sizes[b, a, 0] + sizes[b, a, 1])
+            length_o, width_o = sizes[b, a, 0], sizes[b, a, 1]
+            reach = around + 0.5 * (length_o + width_o)
             if dx * dx + dy * dy >= reach * reach:
                 continue
-            found = _contact(
-                x, y, heading, speed, length, width,
-                states[b, a, 0], states[b, a, 1], states[b, a, 2], states[b, a, 3],
-                sizes[b, a, 0], sizes[b, a, 1],
-            )  # fmt: skip
-            out[b, a] = before[b, a] if found > 0 and before[b, a] > 0 else found
+            heading_o, speed_o = states[b, a, 2], states[b, a, 3]
+            cos_o, sin_o = math.cos(heading_o), math.sin(heading_o)
+            if not turned_overlaps(
+                x, y, cos, sin, length, width, x_o, y_o, cos_o, sin_o, length_o, width_o
+            ):
+                continue
+            out[b, a] = known
+            if known == 0:
+                out[b, a] = _kind(
+                    *(x, y, heading, speed, length, width),
+                    *(x_o, y_o, heading_o, speed_o, length_o, width_o),
+                )
 
 
 def ego_contacts(

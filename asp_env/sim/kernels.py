@@ -59,8 +59,12 @@ def _write_tick(states, valid, log_states, log_valid, gone, rows, now, driven, o
                 states[b, k, a, :] = 0.0
                 continue
             valid[b, k, a] = True
-            for field in range(4):
-                states[b, k, a, field] = moved[at, field] if mine else log_states[b, k, a, field]
+            if mine:
+                for field in range(4):
+                    states[b, k, a, field] = moved[at, field]
+            else:
+                for field in range(4):
+                    states[b, k, a, field] = log_states[b, k, a, field]
 
 
 def write_tick(
