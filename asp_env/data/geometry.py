@@ -44,6 +44,15 @@ def states_to_frame(
     return np.concatenate([xy, heading[..., None], speed[..., None]], axis=-1)
 
 
+def between_states(
+    before: Shaped[np.ndarray, "*batch 4"], after: Shaped[np.ndarray, "*batch 4"], share: float
+) -> Shaped[np.ndarray, "*batch 4"]:
+    """States a share of the way from one to another; headings turn the shorter way."""
+    step = after - before
+    step[..., 2] = wrap_angle(step[..., 2])
+    return before + share * step
+
+
 def box_corners(
     states: Shaped[np.ndarray, "*batch n"], sizes: Shaped[np.ndarray, "*batch 2"]
 ) -> Shaped[np.ndarray, "*batch 4 2"]:

@@ -3,6 +3,7 @@
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
@@ -66,6 +67,11 @@ class Recording:
             and self.starts[-1] == len(self.states)
         ):
             raise DataError(f"recording {self.name}: the track table's columns differ in length")
+
+    def __deepcopy__(self, memo: dict[int, Any]) -> "Recording":
+        """Itself, since nobody changes it."""
+        del memo
+        return self
 
     def __len__(self) -> int:
         """How many tracks there are."""

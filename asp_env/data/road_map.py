@@ -2,6 +2,7 @@
 
 from dataclasses import dataclass, field
 from enum import IntEnum
+from typing import Any
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
@@ -96,6 +97,11 @@ class RoadMap:
                 f"map {self.name}: {sorted(told)} areas, directions and limits of lanes; expected "
                 f"one of each for all {len(self.lanes)} lanes, or none"
             )
+
+    def __deepcopy__(self, memo: dict[int, Any]) -> "RoadMap":
+        """Itself, since nobody changes it."""
+        del memo
+        return self
 
     @property
     def extent_m(self) -> tuple[float, float, float, float]:

@@ -2,9 +2,11 @@
 
 import dataclasses
 import json
+import math
 import os
 import zipfile
 import zlib
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -12,6 +14,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
+from asp_env.data.classes import AgentClass
 from asp_env.data.scenario import Scenario
 from asp_env.errors import DataError
 
@@ -21,6 +24,25 @@ _DAMAGED = (
     *(OSError, EOFError, ValueError, KeyError, TypeError),
     *(zipfile.BadZipFile, zlib.error, RuntimeError),  # the last: encrypted, or of another method
 )
+
+
+_AXES = (
+    ("states", "ticks a 4", "f"),
+    ("valid", "ticks a", "b"),
+    ("log_states", "ticks a 4", "f"),
+    ("log_valid", "ticks a", "b"),
+    ("sizes", "a 2", "f"),
+    ("classes", "a", "iu"),
+    ("ids", "a", "iu"),
+    ("route", "p 2", "f"),
+    ("plans", "plans horizon 2", "f"),
+    ("forecast_states", "rows modes steps 2", "f"),
+    ("forecast_log_probs", "rows modes", "f"),
+    ("forecast_slots", "rows", "iu"),
+    ("forecast_ticks", "rows", "iu"),
+    ("events", "ticks kinds", "b"),
+)
+"""Arrays with their axes and kinds of numbers."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -79,7 +101,8 @@ class Rollout:
                 arrays = {name: file[name] for name in file.files}
             header = json.loads(arrays.pop("header").tobytes())
             if header["format"] != FORMAT:
-                raise DataError(f"{path}: rollout format {header['format']}, expected {FORMAT}")
+                raise DataError(f"rollout format {header['format']}, expected {FORMAT}")
+            _check(arrays, header)
             scenario = header["scenario"]
             scenario["tags"] = tuple(scenario["tags"])
             return cls(
@@ -88,8 +111,33 @@ class Rollout:
                 event_names=tuple(header["event_names"]),
                 **arrays,
             )
-        except DataError:
-            raise
+        except DataError as error:
+            raise DataError(f"{path}: {error}") from error
         except _DAMAGED as error:
             why = str(error) or type(error).__name__
             raise DataError(f"{path}: not a rollout that can be read ({why})") from error
+
+
+def _check(arrays: Mapping[str, np.ndarray], header: Mapping[str, Any]) -> None:
+    """Refuses parts that do not fit together.
+
+    Raises:
+        DataError: an axis, a kind of number or a number does not fit the others.
+    """
+    sizes: dict[str, int] = {"kinds": len(header["event_names"])}
+    for name, axes, kinds in _AXES:
+        array = arrays[name]
+        if array.dtype.kind not in kinds or array.ndim != len(axes.split()):
+            raise DataError(f"{name}: {array.dtype} {array.shape}, expected ({axes})")
+        for axis, size in zip(axes.split(), array.shape, strict=True):
+            expected = int(axis) if axis.isdigit() else sizes.setdefault(axis, size)
+            if size != expected:
+                raise DataError(f"{name}: {size} along {axis!r}, expected {expected}")
+    if not (sizes["ticks"] and sizes["a"] and sizes["plans"] <= sizes["ticks"]):
+        raise DataError(f"{sizes['ticks']} ticks, {sizes['a']} agents, {sizes['plans']} plans")
+    ends = {"forecast_slots": sizes["a"], "forecast_ticks": sizes["ticks"]}
+    for name, end in (ends | {"classes": len(AgentClass)}).items():
+        if not ((arrays[name] >= 0) & (arrays[name] < end)).all():
+            raise DataError(f"{name}: expected numbers from 0 to {end - 1}")
+    if not 0 < header["dt_s"] < math.inf:
+        raise DataError(f"time step {header['dt_s']} s: expected a positive number")

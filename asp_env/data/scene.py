@@ -43,6 +43,15 @@ class Scene:
         """The same scene with other agents to forecast."""
         return dataclasses.replace(self, targets=targets)
 
+    def situation(self, number: int) -> "Scene":
+        """One of the situations alone, as situation 0."""
+        shared = ("targets", "maps", "dt_s")
+        names = [field.name for field in dataclasses.fields(self) if field.name not in shared]
+        targets = self.targets[self.targets[:, 0] == number]
+        targets[:, 0] = 0
+        mine = {name: getattr(self, name)[number : number + 1] for name in names}
+        return dataclasses.replace(self, targets=targets, **mine)
+
     @property
     def history(self) -> int:
         """n, the number of past ticks."""

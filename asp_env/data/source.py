@@ -43,6 +43,11 @@ class Recordings(Sequence[Any]):  # not of Recording: checking its items at run 
         self._files = tuple(files)
         self._opened = Opened() if opened is None else opened
 
+    def __deepcopy__(self, memo: dict[int, Any]) -> "Recordings":
+        """Itself: recordings never change."""
+        del memo
+        return self
+
     def __reduce__(self) -> tuple[Any, ...]:
         """A copy in another process opens its files anew, mapped from the same cache."""
         return Recordings, (self.source, self._files)

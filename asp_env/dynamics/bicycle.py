@@ -99,14 +99,16 @@ def _integrate(
     heading_before = _before(heading_0, heading_after)
 
     course = heading_before + slip
-    step_x = speed_before * xp.cos(course)
-    step_y = speed_before * xp.sin(course)
+    velocity_x = speed_before * xp.cos(course)
+    velocity_y = speed_before * xp.sin(course)
+    share_s = dt_s
     if integrator == "heun":
         end_course = course + speed_before * turn
-        step_x = 0.5 * (step_x + speed_after * xp.cos(end_course))
-        step_y = 0.5 * (step_y + speed_after * xp.sin(end_course))
-    x = states[..., 0:1] + _running_sum(step_x * dt_s)
-    y = states[..., 1:2] + _running_sum(step_y * dt_s)
+        velocity_x = velocity_x + speed_after * xp.cos(end_course)
+        velocity_y = velocity_y + speed_after * xp.sin(end_course)
+        share_s = 0.5 * dt_s
+    x = states[..., 0:1] + _running_sum(velocity_x * share_s)
+    y = states[..., 1:2] + _running_sum(velocity_y * share_s)
     return xp.stack([x, y, wrap_angle(heading_after), speed_after], axis=-1)
 
 
@@ -126,7 +128,8 @@ def _lowest_below_zero(values: Any) -> Any:
     """The least of each value and those before it, or 0 if none is negative."""
     xp = namespace(values)
     if xp is np:
-        return np.minimum(np.minimum.accumulate(values, axis=-1), 0.0)
+        lowest = values if values.shape[-1] == 1 else np.minimum.accumulate(values, axis=-1)
+        return np.minimum(lowest, 0.0)
     return xp.clamp(xp.cummin(values, dim=-1).values, max=0.0)
 
 

@@ -1,6 +1,5 @@
 """Episodes of recordings as the environments drive them: one core, of any number side by side."""
 
-import copy
 import dataclasses
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -11,11 +10,12 @@ from gymnasium import spaces
 from jaxtyping import Bool, Float, Int, Shaped
 
 from asp_env.data.clock import DEFAULT_DT_S, ticks
-from asp_env.data.scenario import Scenario, ScenarioSet, find_scenarios
+from asp_env.data.scenario import Scenario, ScenarioSet
+from asp_env.data.scenario_filter import ScenarioFilter
 from asp_env.data.snippets import HISTORY_S
 from asp_env.data.source import open_data
 from asp_env.dynamics import MAX_ACCELERATION_MPS2, MAX_STEERING_RAD
-from asp_env.envs.start import Starts, choose
+from asp_env.envs.start import Starts
 from asp_env.errors import AspEnvError, unknown_name
 from asp_env.sim.observation import Observation, Observer
 from asp_env.sim.reward import reward_terms, weighted_sum, weights_from
@@ -46,8 +46,8 @@ class ReplayOptions:
     """Length of a tick."""
     reward_weights: Mapping[str, float] | None = None
     """Weights by name, where they differ from the defaults."""
-    scenarios: ScenarioSet | str | Sequence[str] | None = None
-    """The scenarios to draw from: all, those with every one of these tags, or these."""
+    scenarios: ScenarioSet | ScenarioFilter | str = ""
+    """The scenarios to draw from: those that fit a filter, such as `left,length>=8`, or these."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -80,15 +80,10 @@ class ReplayEpisodes:
         chosen = _options(options)
         history = ticks(HISTORY_S, chosen.dt_s)
         self.recordings = open_data(data)
-        found = find_scenarios(self.recordings, source=data, dt_s=chosen.dt_s, history=history)
-        self.scenarios = choose(found, chosen.scenarios, data=data)
-        self._starts = Starts(
-            recordings=self.recordings,
-            scenarios=self.scenarios,
-            data=data,
-            dt_s=chosen.dt_s,
-            history=history,
+        self._starts = Starts.choose(
+            self.recordings, chosen.scenarios, dt_s=chosen.dt_s, history=history
         )
+        self.scenarios = self._starts.scenarios
         raster = make_picture_view(chosen.view, pixels=chosen.raster_px)
         self.observer = Observer(chosen.observations, raster, history)
         self.simulation = Simulation(
@@ -104,15 +99,21 @@ class ReplayEpisodes:
         self.action_space = spaces.Box(-1.0, 1.0, (2,), dtype=np.float32)
         self.events: Events | None = None
 
-    def __deepcopy__(self, memo: dict[int, Any]) -> "ReplayEpisodes":
-        """A copy shares the recordings and the scenarios, which nobody changes."""
-        copied = object.__new__(type(self))
-        memo[id(self)] = copied
-        for shared in (self.recordings, self.scenarios, self._starts):
-            memo[id(shared)] = shared
-        for name, value in vars(self).items():
-            setattr(copied, name, copy.deepcopy(value, memo))
-        return copied
+    def restrict(self, scenarios: ScenarioSet, num_episodes: int) -> None:
+        """From now on draws from these scenarios and holds that many episodes, none begun."""
+        world = self.simulation.world
+        self.scenarios = scenarios
+        self._starts = dataclasses.replace(self._starts, scenarios=scenarios)
+        self.simulation = Simulation(
+            self.recordings,
+            self.simulation.driver,
+            num_episodes=num_episodes,
+            dt_s=world.dt_s,
+            history=world.history,
+        )
+        self._names = np.full(num_episodes, None, dtype=object)
+        self._tags = np.full(num_episodes, None, dtype=object)
+        self.events = None
 
     def draw(
         self, np_random: np.random.Generator, options: Mapping[str, Any]
@@ -126,6 +127,18 @@ class ReplayEpisodes:
         scenario = self._starts.find(options, drawn)
         return scenario, np.random.default_rng(np_random.integers(2**63))
 
+    def begin(
+        self,
+        scenarios: Sequence[Scenario],
+        rngs: Sequence[np.random.Generator],
+        where: Bool[np.ndarray, " b"],
+    ) -> None:
+        """Starts the episodes at `where`; the others' entries are not read."""
+        self.simulation.reset(scenarios, rngs, where)
+        for b in np.flatnonzero(where).tolist():
+            self._names[b], self._tags[b] = scenarios[b].name, scenarios[b].tags
+        self.events = self.simulation.world.events()
+
     def snapshot(self) -> Any:
         """The whole state, to be handed to `restore`: no recording, no picture."""
         return self.simulation.snapshot()
@@ -138,18 +151,6 @@ class ReplayEpisodes:
             self._names[b] = None if scenario is None else scenario.name
             self._tags[b] = None if scenario is None else scenario.tags
         self.events = world.events()
-
-    def begin(
-        self,
-        scenarios: Sequence[Scenario],
-        rngs: Sequence[np.random.Generator],
-        where: Bool[np.ndarray, " b"],
-    ) -> None:
-        """Starts the episodes at `where`; the others' entries are not read."""
-        self.simulation.reset(scenarios, rngs, where)
-        for b in np.flatnonzero(where).tolist():
-            self._names[b], self._tags[b] = scenarios[b].name, scenarios[b].tags
-        self.events = self.simulation.world.events()
 
     def step(self, actions: Float[np.ndarray, "b 2"]) -> Outcome:
         """One tick; actions in [-1, 1]."""

@@ -10,8 +10,8 @@ from gymnasium import spaces
 class FlatParts(gymnasium.ObservationWrapper[dict[str, Any], Any, dict[str, Any]]):
     """Makes a vector of every table among the parts of a Dict; images and vectors stay.
 
-    The action history is a table, (15, 2), of which stable-baselines3's `check_env` warns; behind
-    this wrapper it is a vector, (30,), time by time.
+    stable-baselines3's `check_env` warns of tables such as the action history, (15, 2); behind this
+    wrapper it is a vector, (30,), time by time. Agents, lines, their masks and the route likewise.
     """
 
     def __init__(self, env: gymnasium.Env[dict[str, Any], Any]) -> None:
@@ -29,6 +29,8 @@ class FlatParts(gymnasium.ObservationWrapper[dict[str, Any], Any, dict[str, Any]
 
 
 def _flat(box: spaces.Space[Any]) -> spaces.Space[Any]:
-    if not isinstance(box, spaces.Box) or len(box.shape) != 2:
+    if not isinstance(box, spaces.Box) or len(box.shape) < 2:
+        return box
+    if len(box.shape) == 3 and box.dtype == np.uint8:
         return box
     return spaces.Box(np.ravel(box.low), np.ravel(box.high), dtype=box.low.dtype.type)

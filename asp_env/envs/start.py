@@ -1,60 +1,57 @@
 """Which scenarios an environment draws from, and the one that a reset asks for."""
 
-import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 
-from asp_env.data.classes import VULNERABLE, AgentClass
-from asp_env.data.clock import frames_per_tick
-from asp_env.data.recording import Recording
-from asp_env.data.scenario import MAX_LENGTH_S, Scenario, ScenarioSet
+from asp_env.data.scenario import Scenario, ScenarioSet
+from asp_env.data.scenario_choice import choose_scenarios, scenario_of
+from asp_env.data.scenario_filter import ScenarioFilter
+from asp_env.data.source import Recordings
 from asp_env.errors import AspEnvError, unknown_name
 
 OPTIONS = ("scenario", "start_tick", "ego")
 """What `reset(options=…)` understands."""
 
 
-def choose(
-    found: ScenarioSet, wanted: ScenarioSet | str | Sequence[str] | None, *, data: str
-) -> ScenarioSet:
-    """The scenarios to draw from: all, those with every one of some tags, or those given.
-
-    Raises:
-        AspEnvError: none is left.
-    """
-    if not len(found) and not isinstance(wanted, ScenarioSet):
-        raise AspEnvError(
-            f"{data}: no vehicle covers 10 m in 4 s after 3 s of history; use other recordings"
-        )
-    if wanted is None:
-        return found
-    if isinstance(wanted, ScenarioSet):
-        if not len(wanted):
-            raise AspEnvError("scenarios: the set is empty; expected at least one scenario")
-        return wanted
-    known = {tag for scenario in found for tag in scenario.tags}
-    left = found
-    for tag in [wanted] if isinstance(wanted, str) else wanted:
-        if tag not in known:
-            raise unknown_name("scenario tag", tag, known)
-        left = left.tagged(tag)
-    if not len(left):
-        raise AspEnvError(f"{data}: no scenario carries all of the tags {', '.join(wanted)}")
-    return left
-
-
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Starts:
     """Where episodes of some recordings may begin."""
 
-    recordings: Sequence[Recording]
+    recordings: Recordings
     scenarios: ScenarioSet
-    data: str
-    dt_s: float
-    history: int
+
+    @classmethod
+    def choose(
+        cls,
+        recordings: Recordings,
+        wanted: ScenarioSet | ScenarioFilter | str,
+        *,
+        dt_s: float,
+        history: int,
+    ) -> "Starts":
+        """The scenarios to draw from: those that fit a filter or its words, or those given.
+
+        Raises:
+            AspEnvError: there is none, or those given are of other data or another time step.
+        """
+        data = recordings.source
+        if isinstance(wanted, ScenarioSet):
+            _check(wanted, recordings, dt_s=dt_s, history=history)
+            return cls(recordings=recordings, scenarios=wanted)
+        found = choose_scenarios(recordings, str(wanted), dt_s=dt_s, history=history)
+        if not len(found):
+            raise AspEnvError(
+                f"{data}: no vehicle covers 10 m in 4 s after 3 s of history; use other recordings"
+            )
+        return cls(recordings=recordings, scenarios=found)
+
+    def __deepcopy__(self, memo: dict[int, Any]) -> "Starts":
+        """Itself, since nothing of it ever changes."""
+        del memo
+        return self
 
     def find(self, options: Mapping[str, Any], drawn: int) -> Scenario:
         """The scenario that the options of a reset ask for, else the drawn one.
@@ -70,7 +67,7 @@ class Starts:
             if name not in OPTIONS:
                 raise unknown_name("reset option", str(name), OPTIONS)
         asked = options.get("scenario")
-        given = self.scenarios[drawn if asked is None else self._number(asked)]
+        given = self.scenarios[drawn] if asked is None else self._asked(asked)
         ego, start_tick = options.get("ego"), options.get("start_tick")
         if ego is None and start_tick is None:
             return given
@@ -80,64 +77,44 @@ class Starts:
             )
         if asked is None and len(self.recordings) > 1:
             raise AspEnvError(
-                f"ego {ego} without a scenario: {self.data} has {len(self.recordings)} recordings; "
-                "name a scenario of the recording that is meant"
+                f"ego {ego} without a scenario: {self.scenarios.source} has "
+                f"{len(self.recordings)} recordings; name a scenario of the one that is meant"
             )
-        return self._anywhere(
-            given.recording,
-            given.ego_id if ego is None else _whole("ego", ego),
-            None if start_tick is None else _whole("start_tick", start_tick),
+        return scenario_of(
+            self.recordings,
+            source=self.scenarios.source,
+            recording=given.recording,
+            ego_id=given.ego_id if ego is None else _whole("ego", ego),
+            start_tick=None if start_tick is None else _whole("start_tick", start_tick),
+            dt_s=self.scenarios.dt_s,
+            history=self.scenarios.history,
         )
 
-    def _number(self, asked: Any) -> int:
+    def _asked(self, asked: Any) -> Scenario:
         if isinstance(asked, str):
-            names = [scenario.name for scenario in self.scenarios]
-            if asked not in names:
-                raise unknown_name("scenario", asked, names)
-            return names.index(asked)
+            return self.scenarios.by_name(asked)
         whole = isinstance(asked, int | np.integer) and not isinstance(asked, bool)
         if not (whole and 0 <= asked < len(self.scenarios)):
             raise AspEnvError(
                 f"scenario {asked}: expected 0 to {len(self.scenarios) - 1} for this data, or a "
                 "scenario's name"
             )
-        return int(asked)
+        return self.scenarios[int(asked)]
 
-    def _anywhere(self, number: int, ego_id: int, start_tick: int | None) -> Scenario:
-        """An episode of one vehicle of a recording."""
-        recording = self.recordings[number]
-        where = f"recording {recording.name}"
-        found = np.flatnonzero(recording.track_ids == ego_id)
-        if not len(found):
-            raise AspEnvError(
-                f"ego {ego_id}: {where} has no such track; expected one of its "
-                f"{len(recording)} track ids"
-            )
-        track = int(found[0])
-        kind = AgentClass(int(recording.classes[track]))
-        if kind in VULNERABLE | {AgentClass.TRAILER}:
-            raise AspEnvError(f"ego {ego_id}: is a {kind.name.lower()}, expected a vehicle")
-        stride = frames_per_tick(recording.frame_rate_hz, self.dt_s)
-        earliest = math.ceil(int(recording.first_frames[track]) / stride) + self.history
-        last = int(recording.last_frames[track]) // stride
-        if earliest >= last:
-            raise AspEnvError(
-                f"ego {ego_id}: its track spans {last - earliest + self.history} ticks of "
-                f"{self.dt_s:g} s, expected over {self.history}: the history and one to drive"
-            )
-        start = earliest if start_tick is None else start_tick
-        if not earliest <= start < last:
-            raise AspEnvError(
-                f"start_tick {start}: expected {earliest} to {last - 1} for ego {ego_id} of "
-                f"{where}, which has its history of {self.history} ticks from then on"
-            )
-        return Scenario(
-            source=self.data,
-            recording=number,
-            recording_name=recording.name,
-            start_tick=start,
-            length=min(int(MAX_LENGTH_S / self.dt_s + 1e-6), last - start),
-            ego_id=ego_id,
+
+def _check(given: ScenarioSet, recordings: Recordings, *, dt_s: float, history: int) -> None:
+    if not len(given):
+        raise AspEnvError("scenarios: the set is empty; expected at least one scenario")
+    names = tuple(recording.name for recording in recordings)
+    if given.recordings != names:
+        raise AspEnvError(
+            f"scenarios of {given.source}: expected some of {recordings.source}, whose recordings "
+            f"are {', '.join(names)}"
+        )
+    if abs(given.dt_s - dt_s) > 1e-9 or given.history != history:
+        raise AspEnvError(
+            f"scenarios for {given.history} past ticks of {given.dt_s:g} s: expected {history} of "
+            f"{dt_s:g} s"
         )
 
 

@@ -1,6 +1,6 @@
 """Many episodes of `asp_env/Replay-v0` side by side, on arrays all the way."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -11,11 +11,16 @@ from gymnasium.vector import AutoresetMode, VectorEnv
 from gymnasium.vector.utils import batch_space
 from jaxtyping import Bool, Shaped
 
+from asp_env.data.scenario import ScenarioSet
 from asp_env.data.scene import Scene
+from asp_env.data.snippets import Future
+from asp_env.data.source import Recordings
 from asp_env.envs.buffers import Buffers
 from asp_env.envs.episodes import Outcome, ReplayEpisodes, as_actions
 from asp_env.errors import AspEnvError
+from asp_env.render.frames import draw_frame
 from asp_env.sim.observation import Observation
+from asp_env.sim.recorded import recorded_future
 
 Infos = dict[str, Any]
 
@@ -25,7 +30,7 @@ class VectorSnapshot:
     """The whole state of a vector environment: picklable, without recordings and pictures."""
 
     episodes: Any
-    generators: tuple[dict[str, Any], ...]
+    generators: tuple[Mapping[str, Any], ...]
     """States of `np_random`."""
     seeds: tuple[int | None, ...]
     over: Bool[np.ndarray, " n"]
@@ -57,13 +62,13 @@ class ReplayVectorEnv(VectorEnv[Observation, Any, np.ndarray]):
         """
         if num_envs < 1:
             raise AspEnvError(f"num_envs {num_envs}: expected at least 1")
+        if render_mode not in (None, "rgb_array"):
+            raise AspEnvError(f"render mode {render_mode!r}: expected rgb_array or None")
         self.num_envs = num_envs
         self._mode = _autoreset_mode(autoreset_mode)
         self.metadata = {**self.metadata, "autoreset_mode": self._mode}
         self.render_mode = render_mode
         self._episodes = ReplayEpisodes(data, options, num_envs)
-        self.recordings = self._episodes.recordings
-        self.scenarios = self._episodes.scenarios
         self.single_observation_space = self._episodes.observer.space
         self.single_action_space = self._episodes.action_space
         self.observation_space = batch_space(self.single_observation_space, num_envs)
@@ -163,6 +168,34 @@ class ReplayVectorEnv(VectorEnv[Observation, Any, np.ndarray]):
         self._need_begun()
         return self._episodes.simulation.world.scene()
 
+    def recorded_future(self, scene: Scene, horizon: int) -> Future:
+        """What the targets of a scene of now went on to do, for privileged predictors alone.
+
+        Raises:
+            gymnasium.error.ResetNeeded: no episode has begun.
+        """
+        self._need_begun()
+        return recorded_future(self._episodes.simulation.world, scene, horizon)
+
+    @property
+    def dt_s(self) -> float:
+        """Length of a tick."""
+        return self._episodes.simulation.world.dt_s
+
+    def render(self) -> tuple[Any, ...] | None:
+        """What `ReplayEnv.render` returns, of each environment; None without a render mode.
+
+        Raises:
+            gymnasium.error.ResetNeeded: an episode has not begun.
+        """
+        if self.render_mode is None:
+            return None
+        scene, recording = self.scene(), self._episodes.simulation.world.episodes.recording
+        return tuple(
+            draw_frame(scene, situation=b, background=self.recordings[int(recording[b])].background)
+            for b in range(self.num_envs)
+        )
+
     def snapshot(self) -> VectorSnapshot:
         """The whole state with those of `np_random`, to be handed to `restore`.
 
@@ -187,14 +220,26 @@ class ReplayVectorEnv(VectorEnv[Observation, Any, np.ndarray]):
         self._over = snapshot.over.copy()
 
     @property
-    def np_random(self) -> tuple[np.random.Generator, ...]:
-        """The generator of each environment."""
+    def recordings(self) -> Recordings:
+        """Of DATA."""
+        return self._episodes.recordings
+
+    @property
+    def scenarios(self) -> ScenarioSet:
+        """Those that are drawn from."""
+        return self._episodes.scenarios
+
+    @property
+    def np_random(self) -> tuple[np.random.Generator, ...]:  # pyright: ignore[reportIncompatibleMethodOverride]
+        """The generator of each environment, as of `SyncVectorEnv`."""
         return tuple(self._generator(b) for b in range(self.num_envs))
 
     @property
-    def np_random_seed(self) -> tuple[int | None, ...]:
-        """The seed of each environment's generator."""
-        return tuple(self._seeds[b] for b in range(self.num_envs) if self._generator(b))
+    def np_random_seed(self) -> tuple[int | None, ...]:  # pyright: ignore[reportIncompatibleMethodOverride]
+        """The seed of each environment's generator, as of `SyncVectorEnv`."""
+        for b in range(self.num_envs):
+            self._generator(b)
+        return tuple(self._seeds)
 
     def _generator(self, b: int) -> np.random.Generator:
         generator = self._generators[b]
@@ -205,7 +250,7 @@ class ReplayVectorEnv(VectorEnv[Observation, Any, np.ndarray]):
 
     def _begin(self, where: Bool[np.ndarray, " n"], options: Sequence[dict[str, Any]]) -> None:
         world = self._episodes.simulation.world
-        scenarios, rngs = list(world.scenarios), list(world.rngs)
+        scenarios, rngs = [self.scenarios[0]] * self.num_envs, list(world.rngs)
         for b in np.flatnonzero(where).tolist():
             scenarios[b], rngs[b] = self._episodes.draw(self._generator(b), options[b])
         self._episodes.begin(scenarios, rngs, where)
@@ -285,4 +330,6 @@ def _masked(infos: Infos, where: Bool[np.ndarray, " n"]) -> Infos:
 def _only(value: Shaped[np.ndarray, " n"], where: Bool[np.ndarray, " n"]) -> np.ndarray:
     if where.all():
         return value
-    return np.where(where, value, None if value.dtype == object else value.dtype.type(0))
+    out = np.full(len(value), None if value.dtype == object else 0, dtype=value.dtype)
+    out[where] = value[where]
+    return out

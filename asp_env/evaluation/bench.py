@@ -61,7 +61,7 @@ class Bench:
         for name in self.sections:
             if name not in SECTIONS:
                 raise unknown_name("section", name, SECTIONS)
-        console = Console(width=max(Console().width, 110))
+        console = Console(width=max(Console().width, 120))
         recordings = open_data(self.data)
         latencies: list[Latency] = []
         if self.predictors:
@@ -98,7 +98,8 @@ def rates_table(title: str, rates: Sequence[Rate], copy_bytes_per_s: float) -> T
     """Rates with their share of copying speed, and their ratio to the same thing done otherwise."""
     table = Table(title=title)
     for heading in ("what", "rate", "bytes written, of a copy", "ratio"):
-        table.add_column(heading, justify="left" if heading == "what" else "right")
+        what = heading == "what"
+        table.add_column(heading, justify="left" if what else "right", no_wrap=what)
     for rate in rates:
         share = rate.per_s * rate.bytes_each / copy_bytes_per_s
         ratio = "" if rate.beside is None else f"{rate.per_s / rate.beside:.3g} x"

@@ -31,7 +31,9 @@ from asp_env.evaluation.tables import driving_table
 from asp_env.evaluation.unseen import PartChoice, nothing_left, ticks_to_judge
 from asp_env.metrics.driving import driving_metrics
 from asp_env.metrics.masked import Masked
+from asp_env.metrics.presets import DEFAULT_PRESET, PRESETS, Preset, find_preset
 from asp_env.planning.planner import Planner, load_planner
+from asp_env.sim.drivers import Driver
 from asp_env.sim.traffic import make_traffic
 from asp_env.sim.world import Ending
 
@@ -72,6 +74,8 @@ class Drive:
     """Seconds per tick."""
     part: PartChoice = "auto"
     """Which part of DATA; auto takes what no named predictor has seen."""
+    metrics: str = DEFAULT_PRESET
+    """Whose definitions judge the drives: nuplan, pdms, waymax or strict."""
 
     def run(self) -> None:
         """Drives, writes the folder, prints the table; the expert stands first."""
@@ -84,7 +88,8 @@ class Drive:
             save_rollouts(folder, result)
             write_report(folder, title=f"Driving on {Path(self.data).name}", maps=result.maps)
         console = Console()
-        console.print(driving_table(result.rows, result.manifest["privileged"]))
+        shown = PRESETS[self.metrics].shown
+        console.print(driving_table(result.rows, result.manifest["privileged"], shown))
         console.print(f"wrote {self.out}/report.html")
 
 
@@ -118,7 +123,8 @@ class ClosedLoop:
 
 def drive(config: Drive) -> ClosedLoop:
     """Drives with every predictor, the expert first."""
-    make_traffic(config.traffic, dt_s=config.dt)  # refused before anything is computed
+    traffic = make_traffic(config.traffic, dt_s=config.dt)  # refused before anything is computed
+    preset = find_preset(config.metrics)
     recordings = open_data(config.data)
     horizon, history = ticks(config.horizon, config.dt), ticks(HISTORY_S, config.dt)
     predictors = load_predictors(config.predictors, horizon=horizon, dt_s=config.dt)
@@ -143,20 +149,20 @@ def drive(config: Drive) -> ClosedLoop:
         task = progress.add_task("driving", total=len(entrants) * len(scenarios))
         runs = [
             _drive_all(
-                config, recordings, scenarios, *entrant, horizon, history,
+                config, preset, traffic, recordings, scenarios, *entrant, horizon, history,
                 lambda count: progress.advance(task, count),
             )
             for entrant in entrants
         ]  # fmt: skip
     reference = next((run for run in runs if run.predictor == REFERENCE), None)
     named = dict(zip(config.predictors, predictors, strict=True))
-    rows = [row for run in runs for row in _rows(config, run, reference, chosen)]
+    rows = [row for run in runs for row in _rows(config, preset, run, reference, chosen)]
     short = short_names(config.predictors)
     drivers = {
         f"{run.planner} + {short[run.predictor]}" if run.predictor else run.planner: run
         for run in runs
     }
-    kept = _worst(runs)
+    kept = _worst(runs, preset)
     return ClosedLoop(
         rows=rows,
         manifest={
@@ -169,6 +175,7 @@ def drive(config: Drive) -> ClosedLoop:
                 *(name for name, p in named.items() if p.privileged),
             ],
             "traffic": config.traffic,
+            "metrics": {"preset": preset.name, "version": preset.version, "about": preset.about},
             "horizon_s": config.horizon,
             "dt_s": config.dt,
             "part": part,
@@ -191,6 +198,8 @@ def drive(config: Drive) -> ClosedLoop:
 
 def _drive_all(
     config: Drive,
+    preset: Preset,
+    traffic: Driver,
     recordings: Recordings,
     scenarios: Sequence[Scenario],
     planner: Planner,
@@ -210,12 +219,14 @@ def _drive_all(
             some,
             planner,
             predictor,
-            traffic=config.traffic,
+            preset=preset,
+            traffic=traffic,
             horizon=horizon,
             history=history,
             dt_s=config.dt,
         )
-        for metric, found in driving_metrics(driven.drives).items():
+        metrics_of = {**driving_metrics(driven.drives, preset), **driven.realism}
+        for metric, found in metrics_of.items():
             metrics.setdefault(metric, []).append(found)
         endings += [Ending(kind) for kind in driven.endings.tolist()]
         rollouts += driven.rollouts
@@ -237,10 +248,12 @@ def _drive_all(
     )
 
 
-def _rows(config: Drive, run: _Run, reference: _Run | None, scenarios: ScenarioSet) -> list[Row]:
+def _rows(
+    config: Drive, preset: Preset, run: _Run, reference: _Run | None, scenarios: ScenarioSet
+) -> list[Row]:
     """Of all scenarios, and of those with each tag."""
     values = dict(run.metrics)
-    if reference is not None and run is not reference:
+    if preset.weights and reference is not None and run is not reference:
         gain = run.metrics["score"].value - reference.metrics["score"].value
         values[f"score - {REFERENCE}"] = Masked(value=gain, valid=run.metrics["score"].valid)
     subsets = {"all": np.ones(len(scenarios), dtype=bool)}
@@ -262,6 +275,7 @@ def _rows(config: Drive, run: _Run, reference: _Run | None, scenarios: ScenarioS
                 traffic=config.traffic,
                 latency_ticks=0,
                 horizon_s=config.horizon,
+                rules=preset.label,
                 subset=subset,
                 metric=metric,
                 value=estimate.value,
@@ -273,9 +287,16 @@ def _rows(config: Drive, run: _Run, reference: _Run | None, scenarios: ScenarioS
     return rows
 
 
-def _worst(runs: Sequence[_Run]) -> list[int]:
-    """The scenarios with the lowest mean scores; the expert's count only where it is alone."""
-    scores = np.mean([run.metrics["score"].value for run in runs[1:] or runs], axis=0)
+def _worst(runs: Sequence[_Run], preset: Preset) -> list[int]:
+    """The scenarios with the lowest mean scores; the expert's count only where it is alone.
+
+    Without a score, those with the lowest mean of progress on the road without a collision.
+    """
+    names = ("score",) if preset.weights else ("no collision", "on road", "progress")
+    scores = np.mean(
+        [np.prod([run.metrics[name].value for name in names], axis=0) for run in runs[1:] or runs],
+        axis=0,
+    )
     return np.argsort(scores, kind="stable")[:SAVED_ROLLOUTS].tolist()
 
 

@@ -18,6 +18,7 @@ from asp_env.evaluation.open_loop import Evaluate, evaluate
 from asp_env.evaluation.output import output_folder, write_manifest, write_metrics
 from asp_env.evaluation.report import check_report_possible, write_report
 from asp_env.evaluation.tables import driving_table, open_loop_tables
+from asp_env.metrics.presets import DEFAULT_PRESET, PRESETS
 
 SITE = "intersection"
 PREDICTOR = "ffw-asp"
@@ -105,7 +106,9 @@ class Demo:
             )
         for table in (
             *open_loop_tables(opened.rows, opened.manifest["privileged"]),
-            driving_table(closed.rows, closed.manifest["privileged"]),
+            driving_table(
+                closed.rows, closed.manifest["privileged"], PRESETS[DEFAULT_PRESET].shown
+            ),
         ):
             console.print(table)
         console.print(f"wrote {self.out / 'report.html'}")

@@ -1,21 +1,31 @@
 """Driving many episodes at once, and what is kept of them."""
 
 import dataclasses
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Bool, Int
 
 from asp_env.data.forecast import Forecast, fill_missing
 from asp_env.data.predictor import Predictor
 from asp_env.data.rollout import Rollout
 from asp_env.data.scenario import Scenario
 from asp_env.data.scene import Scene
-from asp_env.data.source import Recordings
-from asp_env.metrics.boxes import time_to_collision
-from asp_env.metrics.drivable import OFF_ROAD_M
-from asp_env.metrics.driving import MIN_TTC_S, Drives
+from asp_env.evaluation.traffic_realism import traffic_realism
+from asp_env.metrics.driving import (
+    COMPLIANT_M,
+    OVERSPEED_MPS,
+    Drives,
+    against_traffic_m,
+    at_fault,
+    overspeed_mps,
+)
+from asp_env.metrics.masked import Masked
+from asp_env.metrics.on_map import on_map
+from asp_env.metrics.presets import Preset
+from asp_env.metrics.ttc import time_to_collision
 from asp_env.planning.planner import Plan, Planner
 from asp_env.sim.recorded import recorded_future
 from asp_env.sim.replay import ReplayWorld
@@ -26,7 +36,9 @@ from asp_env.sim.world import EGO, Ending, Events
 FORECAST_WITHIN_M = 60.0
 """Agents further from the ego than this are not forecast."""
 
-EVENTS = ("collision", "at-fault collision", "off-road", "TTC under 0.95 s")
+EVENTS = ("collision", "at-fault collision", "off-road", "short TTC", "wrong way", "speeding")
+"""What rollouts mark. An at-fault collision where it begins, the wrong way where over 2 m of it are
+driven within 1 s, speeding where the limit is exceeded by over 2.23 m/s."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -43,16 +55,19 @@ class Driven:
     """Episodes that have been driven, side by side, with everything that was said on the way."""
 
     drives: Drives
+    realism: Mapping[str, Masked]
+    """Of the traffic; missing where it was replayed."""
     endings: Int[np.ndarray, " b"]
     rollouts: tuple[Rollout, ...]
 
 
 def drive_episodes(
-    recordings: Recordings,
+    recordings: Sequence[Any],  # of Recording: checking its items at run time opens them
     scenarios: Sequence[Scenario],
     planner: Planner,
     predictor: Predictor,
     *,
+    preset: Preset,
     traffic: TrafficSpec,
     horizon: int,
     history: int,
@@ -60,7 +75,8 @@ def drive_episodes(
 ) -> Driven:
     """Drives every scenario to its end, all at once: one forecast and one plan call per tick.
 
-    A planner that is privileged is the logged driver: the world replays its ego.
+    A planner that is privileged is the logged driver: the world replays its ego. What costs more
+    than contacts and the road is measured at the end, of all ticks at once, as `preset` has it.
     """
     driver = make_traffic(traffic, dt_s=dt_s)
     simulation = Simulation(
@@ -70,7 +86,6 @@ def drive_episodes(
     generators = [np.random.default_rng(scenario.seed) for scenario in scenarios]
     simulation.reset(scenarios, generators)
     events = [world.events()]
-    ttc = [_ttc(world, events[-1])]
     said: list[Said] = []
     endings = np.zeros(len(scenarios), dtype=np.int64)
     lasted = [np.ones(len(scenarios), dtype=bool)]
@@ -82,10 +97,10 @@ def drive_episodes(
             actions = said[-1].plan.actions[:, 0].astype(np.float32)
         simulation.step(actions, running & (not planner.privileged))
         events.append(world.events())
-        ttc.append(_ttc(world, events[-1]))
         lasted.append(running)
         endings = np.where(running, ending(events[-1]), endings)
-    return _collect(world, scenarios, events, ttc, lasted, said, endings)
+    drives = _measure(world, events, np.stack(lasted, axis=1), preset)
+    return _collect(world, scenarios, drives, preset, said, endings)
 
 
 def _decide(
@@ -115,44 +130,70 @@ def _near(scene: Scene, running: Bool[np.ndarray, " b"]) -> Int[np.ndarray, "t 2
     return scene.targets[(away <= FORECAST_WITHIN_M) & running[situation]]
 
 
-def _ttc(world: ReplayWorld, events: Events) -> Float[np.ndarray, " b"]:
-    episodes, rows = world.episodes, np.arange(len(world))
-    return time_to_collision(
-        np.ascontiguousarray(episodes.states[rows, world.now]),
-        episodes.sizes,
-        np.ascontiguousarray(episodes.valid[rows, world.now]),
-        (events.contacts > 0) | episodes.own_trailer,
+def _measure(
+    world: ReplayWorld,
+    events: Sequence[Events],
+    lasted: Bool[np.ndarray, "b t"],
+    preset: Preset,
+) -> Drives:
+    episodes = world.episodes
+    ticks = slice(world.history, world.history + len(events))
+    states, valid = episodes.states[:, ticks], episodes.valid[:, ticks]
+    contacts = np.stack([each.contacts for each in events], axis=1)
+    off_road_m = np.stack([each.off_road_m for each in events], axis=1)
+    limits = [world.recordings[int(i)].speed_limit_mps for i in episodes.recording]
+    found = on_map(
+        *world.maps(),
+        states[:, :, EGO],
+        episodes.sizes[:, EGO],
+        [route[there] for route, there in zip(episodes.route, episodes.route_valid, strict=True)],
+        Masked(
+            value=np.array([limit or 0.0 for limit in limits]),
+            valid=np.array([limit is not None for limit in limits]),
+        ),
+    )
+    return Drives(
+        states=states[:, :, EGO],
+        log_states=episodes.log_states[:, ticks, EGO],
+        contacts=contacts,
+        off_road_m=off_road_m,
+        ttc_s=time_to_collision(
+            states,
+            valid,
+            episodes.sizes,
+            contacts=contacts,
+            ignored=episodes.own_trailer,
+            beside=found.several_lanes | found.at_crossing | (off_road_m > preset.off_road_m),
+            count=lasted.sum(axis=1),
+            rule=preset.ttc,
+            dt_s=world.dt_s,
+        ),
+        route_m=np.stack([each.route_m for each in events], axis=1),
+        route_offset_m=np.stack([each.route_offset_m for each in events], axis=1),
+        goal_m=events[0].goal_m,
+        on_map=found,
+        lasted=lasted,
+        dt_s=world.dt_s,
     )
 
 
 def _collect(
     world: ReplayWorld,
     scenarios: Sequence[Scenario],
-    events: Sequence[Events],
-    ttc: Sequence[Float[np.ndarray, " b"]],
-    lasted: Sequence[Bool[np.ndarray, " b"]],
+    drives: Drives,
+    preset: Preset,
     said: Sequence[Said],
     endings: Int[np.ndarray, " b"],
 ) -> Driven:
-    episodes = world.episodes
-    ticks = slice(world.history, world.history + len(events))
-    drives = Drives(
-        states=episodes.states[:, ticks, EGO],
-        log_states=episodes.log_states[:, ticks, EGO],
-        contacts=np.stack([each.contacts for each in events], axis=1),
-        off_road_m=np.stack([each.off_road_m for each in events], axis=1),
-        ttc_s=np.stack(ttc, axis=1),
-        route_m=np.stack([each.route_m for each in events], axis=1),
-        goal_m=events[0].goal_m,
-        lasted=np.stack(lasted, axis=1),
-        dt_s=world.dt_s,
-    )
+    over = overspeed_mps(drives)
     flags = np.stack(
         [
             (drives.contacts > 0).any(axis=2),
-            np.stack([each.at_fault for each in events], axis=1),
-            drives.off_road_m > OFF_ROAD_M,
-            drives.ttc_s < MIN_TTC_S,
+            at_fault(drives, preset),
+            drives.off_road_m > preset.off_road_m,
+            drives.ttc_s <= preset.ttc.above_s,
+            against_traffic_m(drives) > COMPLIANT_M,
+            over.valid & (over.value > OVERSPEED_MPS),
         ],
         axis=-1,
     )
@@ -160,7 +201,12 @@ def _collect(
         _rollout(world, scenario, b, int(drives.lasted[b].sum()), flags[b], said)
         for b, scenario in enumerate(scenarios)
     )
-    return Driven(drives=drives, endings=endings, rollouts=rollouts)
+    return Driven(
+        drives=drives,
+        realism=traffic_realism(world, drives.lasted),
+        endings=endings,
+        rollouts=rollouts,
+    )
 
 
 def _rollout(

@@ -38,6 +38,8 @@ class Row:
     low: float | None = None
     high: float | None = None
     n: int
+    rules: str = ""
+    """By which preset of metrics, and which version of it, drives were judged."""
 
 
 @contextmanager

@@ -23,13 +23,23 @@ MORE = {
 }
 DRIVING = {"score": "score"}
 DRIVING_SHORT = {
+    "no collision": "no coll.",
     "no at-fault collision": "no fault",
     "on road": "road",
+    "on mapped road": "road",
+    "direction": "dir.",
+    "right way": "way",
+    "feasible": "feas.",
     "TTC": "TTC",
-    "progress": "progr.",
-    "comfort": "comf.",
+    "progress": "prog",
+    "speed": "speed",
+    "comfort": "comf",
+    "log divergence": "to log m",
 }
 
+
+ROOMY = 6
+"""More metrics than this stand closer together."""
 
 MARK = " *"
 """Stands behind who was handed the recorded future."""
@@ -66,12 +76,15 @@ def open_loop_tables(rows: Sequence[Row], privileged: Collection[str] = ()) -> l
     return tables
 
 
-def driving_table(rows: Sequence[Row], privileged: Collection[str] = ()) -> Table:
-    """Driver by metric over all scenarios; the expert, which is the noise floor, first.
+def driving_table(rows: Sequence[Row], privileged: Collection[str], shown: Sequence[str]) -> Table:
+    """Driver by the shown metrics over all scenarios, and score, if there is one.
 
-    * knows the future.
+    The expert, which is the noise floor, stands first; * knows the future.
     """
-    table = _table("driving, mean per episode, 95 % interval over recordings")
+    rules = " and ".join(dict.fromkeys(row.rules for row in rows))
+    table = _table(f"driving by {rules}, mean per episode, 95 % interval over recordings")
+    if len(shown) > ROOMY:
+        table.padding = 0
     short = short_names([row.predictor for row in rows])
     members: dict[str, dict[str, Row]] = {}
     for row in rows:
@@ -80,7 +93,8 @@ def driving_table(rows: Sequence[Row], privileged: Collection[str] = ()) -> Tabl
         name = " + ".join(part for part in (row.planner, short[row.predictor]) if part)
         mark = MARK if row.planner in privileged or row.predictor in privileged else ""
         members.setdefault(name + mark, {})[row.metric] = row
-    _fill(table, "driver", members, DRIVING, DRIVING_SHORT)
+    scored = DRIVING if any(row.metric in DRIVING for row in rows) else {}
+    _fill(table, "driver", members, scored, {name: DRIVING_SHORT[name] for name in shown})
     return table
 
 

@@ -1,4 +1,4 @@
-"""Oriented boxes against each other, compiled: contacts of the ego and time to collision."""
+"""Oriented boxes against each other, compiled: contacts of the ego, and of forecasts."""
 
 import math
 from enum import IntEnum
@@ -17,9 +17,6 @@ STANDING_MPS = 0.05
 BEHIND_RAD = math.radians(150.0)
 """Beyond this angle to the ego's heading, seen from its rear axle, somebody is behind it."""
 
-TTC_STEP_S = 0.1
-TTC_HORIZON_S = 3.0
-
 
 class Contact(IntEnum):
     """How the ego's box meets another one; of several that hold, the first, as in nuPlan.
@@ -37,8 +34,8 @@ class Contact(IntEnum):
 
 
 AT_FAULT = (Contact.OTHER_STANDS, Contact.FRONT, Contact.SIDE)
-"""Contacts the ego answers for. nuPlan counts a side contact only while the ego is in several
-lanes; here it always counts, which is stricter."""
+"""Contacts the ego may answer for. By nuPlan's rule a side contact is its fault only while it is in
+several lanes or off the road; that is for a preset to say."""
 
 TOWING = (
     *(AgentClass.CAR, AgentClass.VAN, AgentClass.TRUCK),
@@ -97,9 +94,8 @@ def is_behind(x, y, heading, length, x_o, y_o):
 
 @njit(cache=True)
 @no_type_check
-def _contact(x, y, heading, speed, length, width, x_o, y_o, heading_o, speed_o, length_o, width_o):
-    if not overlaps(x, y, heading, length, width, x_o, y_o, heading_o, length_o, width_o):
-        return Contact.NONE.value
+def _kind(x, y, heading, speed, length, width, x_o, y_o, heading_o, speed_o, length_o, width_o):
+    """The `Contact` of two boxes that overlap."""
     if abs(speed) <= STANDING_MPS:
         return Contact.EGO_STANDS.value
     if abs(speed_o) <= STANDING_MPS:
@@ -119,21 +115,30 @@ def _contacts(states, sizes, valid, before, out):
     for b in range(states.shape[0]):
         x, y, heading, speed = states[b, 0, 0], states[b, 0, 1], states[b, 0, 2], states[b, 0, 3]
         length, width = sizes[b, 0, 0], sizes[b, 0, 1]
+        cos, sin, around = math.cos(heading), math.sin(heading), 0.5 * (length + width)
         for a in range(states.shape[1]):
-            out[b, a] = 0
+            known, out[b, a] = before[b, a], 0
             if a == 0 or not (valid[b, 0] and valid[b, a]):
                 continue
-            dx, dy = states[b, a, 0] - x, states[b, a, 1] - y
+            x_o, y_o = states[b, a, 0], states[b, a, 1]
+            dx, dy = x_o - x, y_o - y
             # no root for the many far away: two boxes reach no further than half their sides' sum
-            reach = 0.5 * (length + width + sizes[b, a, 0] + sizes[b, a, 1])
+            length_o, width_o = sizes[b, a, 0], sizes[b, a, 1]
+            reach = around + 0.5 * (length_o + width_o)
             if dx * dx + dy * dy >= reach * reach:
                 continue
-            found = _contact(
-                x, y, heading, speed, length, width,
-                states[b, a, 0], states[b, a, 1], states[b, a, 2], states[b, a, 3],
-                sizes[b, a, 0], sizes[b, a, 1],
-            )  # fmt: skip
-            out[b, a] = before[b, a] if found > 0 and before[b, a] > 0 else found
+            heading_o, speed_o = states[b, a, 2], states[b, a, 3]
+            cos_o, sin_o = math.cos(heading_o), math.sin(heading_o)
+            if not turned_overlaps(
+                x, y, cos, sin, length, width, x_o, y_o, cos_o, sin_o, length_o, width_o
+            ):
+                continue
+            out[b, a] = known
+            if known == 0:
+                out[b, a] = _kind(
+                    *(x, y, heading, speed, length, width),
+                    *(x_o, y_o, heading_o, speed_o, length_o, width_o),
+                )
 
 
 def ego_contacts(
@@ -161,55 +166,6 @@ def touching_trailers(
     """Trailers whose box overlaps that of the ego (slot 0), if the ego's class may tow one."""
     trailers = (classes == AgentClass.TRAILER) & np.isin(classes[:, :1], TOWING)
     return trailers & (ego_contacts(states, sizes, valid) > 0)
-
-
-@njit(cache=True)
-@no_type_check
-def _ttc(states, sizes, valid, touching, out):
-    steps = round(TTC_HORIZON_S / TTC_STEP_S)
-    for b in range(states.shape[0]):
-        out[b] = np.inf
-        if not valid[b, 0] or abs(states[b, 0, 3]) <= STANDING_MPS:
-            continue
-        ego, size = states[b, 0], sizes[b, 0]
-        vx, vy = ego[3] * math.cos(ego[2]), ego[3] * math.sin(ego[2])
-        for a in range(1, states.shape[1]):
-            if not valid[b, a] or touching[b, a]:
-                continue
-            other, size_o = states[b, a], sizes[b, a]
-            dx, dy = other[0] - ego[0], other[1] - ego[1]
-            if dx * math.cos(ego[2]) + dy * math.sin(ego[2]) < -0.5 * size[0]:
-                continue
-            vxo, vyo = other[3] * math.cos(other[2]), other[3] * math.sin(other[2])
-            for k in range(1, steps + 1):
-                t = k * TTC_STEP_S
-                if t >= out[b]:
-                    break
-                if overlaps(
-                    ego[0] + t * vx, ego[1] + t * vy, ego[2], size[0], size[1],
-                    other[0] + t * vxo, other[1] + t * vyo, other[2], size_o[0], size_o[1],
-                ):  # fmt: skip
-                    out[b] = t
-                    break
-
-
-def time_to_collision(
-    states: Float[np.ndarray, "b a 4"],
-    sizes: Float[np.ndarray, "b a 2"],
-    valid: Bool[np.ndarray, "b a"],
-    touching: Bool[np.ndarray, "b a"],
-) -> Float[np.ndarray, " b"]:
-    """Seconds until the ego (slot 0) meets anybody if all keep heading and speed; else infinity.
-
-    nuPlan's rule: steps of 0.1 s up to 3 s; a standing ego has no time to collision. Agents that
-    the ego touches now, and those whose centre is behind its rear bumper, are left out; everybody
-    else counts. That is stricter than nuPlan, where only those within 30° ahead count everywhere,
-    those beside only at intersections or while the ego is between lanes, and who has ever touched
-    the ego not at all.
-    """
-    out = np.zeros(len(states), dtype=np.float64)
-    _ttc(states, sizes, valid, touching, out)
-    return out
 
 
 @njit(cache=True, nogil=True)

@@ -5,13 +5,15 @@ from jaxtyping import Bool, Float
 
 from asp_env.metrics.masked import Masked
 
-MIN_LON_ACCELERATION_MPS2 = -4.05
-MAX_LON_ACCELERATION_MPS2 = 2.40
-MAX_LAT_ACCELERATION_MPS2 = 4.89
-MAX_YAW_RATE_RADPS = 0.95
-MAX_YAW_ACCELERATION_RADPS2 = 1.93
-MAX_LON_JERK_MPS3 = 4.13
-MAX_JERK_MPS3 = 8.37
+BOUNDS = {
+    "longitudinal acceleration m/s²": (-4.05, 2.40),
+    "lateral acceleration m/s²": (-4.89, 4.89),
+    "yaw rate rad/s": (-0.95, 0.95),
+    "yaw acceleration rad/s²": (-1.93, 1.93),
+    "longitudinal jerk m/s³": (-4.13, 4.13),
+    "jerk m/s³": (0.0, 8.37),
+}
+"""nuPlan's lowest and highest value of each quantity."""
 
 WINDOW_S = 1.0
 """Derivatives are slopes of a parabola fitted over the ticks within this time."""
@@ -44,6 +46,20 @@ def slope(values: Float[np.ndarray, "*batch t"], dt_s: float) -> Float[np.ndarra
     return np.concatenate([head, linear, tail], axis=-1)
 
 
+def strains(states: Float[np.ndarray, "*batch t 4"], dt_s: float) -> dict[str, np.ndarray]:
+    """What is bounded, (*batch, t) by the names of `BOUNDS`. Needs `window_ticks` ticks."""
+    heading = np.unwrap(states[..., 2].astype(np.float64), axis=-1)
+    speed = states[..., 3].astype(np.float64)
+    yaw_rate = slope(heading, dt_s)
+    longitudinal, lateral = slope(speed, dt_s), speed * yaw_rate
+    jerk = slope(longitudinal, dt_s)
+    values = (
+        *(longitudinal, lateral, yaw_rate, slope(yaw_rate, dt_s)),
+        *(jerk, np.hypot(jerk, slope(lateral, dt_s))),
+    )
+    return dict(zip(BOUNDS, values, strict=True))
+
+
 def comfortable(
     states: Float[np.ndarray, "*batch t 4"], dt_s: float, long_enough: Bool[np.ndarray, "*batch"]
 ) -> Masked:
@@ -52,19 +68,8 @@ def comfortable(
         return Masked(
             value=np.zeros(states.shape[:-2]), valid=np.zeros(states.shape[:-2], dtype=bool)
         )
-    heading = np.unwrap(states[..., 2].astype(np.float64), axis=-1)
-    speed = states[..., 3].astype(np.float64)
-    yaw_rate = slope(heading, dt_s)
-    lon = slope(speed, dt_s)
-    lat = speed * yaw_rate
-    lon_jerk, lat_jerk = slope(lon, dt_s), slope(lat, dt_s)
-    fine = (
-        (lon >= MIN_LON_ACCELERATION_MPS2)
-        & (lon <= MAX_LON_ACCELERATION_MPS2)
-        & (np.abs(lat) <= MAX_LAT_ACCELERATION_MPS2)
-        & (np.abs(yaw_rate) <= MAX_YAW_RATE_RADPS)
-        & (np.abs(slope(yaw_rate, dt_s)) <= MAX_YAW_ACCELERATION_RADPS2)
-        & (np.abs(lon_jerk) <= MAX_LON_JERK_MPS3)
-        & (np.hypot(lon_jerk, lat_jerk) <= MAX_JERK_MPS3)
-    )
+    fine = np.ones(states.shape[:-1], dtype=bool)
+    for name, value in strains(states, dt_s).items():
+        low, high = BOUNDS[name]
+        fine &= (value >= low) & (value <= high)
     return Masked(value=np.asarray(fine.all(axis=-1), dtype=np.float64), valid=long_enough)

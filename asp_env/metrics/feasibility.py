@@ -47,20 +47,31 @@ def infeasible_modes(
 ) -> Bool[np.ndarray, "n m"]:
     """(n, m) whether |acceleration| ever exceeds 10.4 m/s² or |curvature| 0.3 1/m (Waymax).
 
-    Between consecutive states, the first being `now`, the acceleration is Δv / Δt and the curvature
-    Δheading over the way at the mean speed. A tick that begins or ends below 0.6 m/s shows none.
+    Between consecutive states, the first being `now`, as in `infeasible_ticks`.
     """
     start = np.broadcast_to(now[:, None, None], (*modes.shape[:2], 1, 4))
-    states = np.concatenate([start, modes], axis=2).astype(np.float64)
+    beyond = infeasible_ticks(np.concatenate([start, modes], axis=2), dt_s=dt_s)
+    return np.asarray(beyond.any(axis=2))
+
+
+def infeasible_ticks(
+    states: Float[np.ndarray, "*batch t 4"], *, dt_s: float
+) -> Bool[np.ndarray, "*batch t-1"]:
+    """Whether |acceleration| exceeds 10.4 m/s² or |curvature| 0.3 1/m from a state to the next.
+
+    The acceleration is Δv / Δt and the curvature Δheading over the way at the mean speed. A tick
+    that begins or ends below 0.6 m/s shows none.
+    """
+    states = states.astype(np.float64)
     speed = states[..., 3]
-    acceleration = np.diff(speed, axis=2) / dt_s
+    acceleration = np.diff(speed, axis=-1) / dt_s
     slow = np.minimum(np.abs(speed[..., 1:]), np.abs(speed[..., :-1])) < MIN_SPEED_MPS
     way_m = 0.5 * (speed[..., 1:] + speed[..., :-1]) * dt_s
-    turned = wrap_angle(np.diff(states[..., 2], axis=2))
+    turned = wrap_angle(np.diff(states[..., 2], axis=-1))
     # reversing between two ticks: no way, and the acceleration is what tells
     curvature = turned / np.where(slow | (np.abs(way_m) < SLACK), np.inf, way_m)
     hard = np.abs(acceleration) > MAX_ACCELERATION_MPS2 + SLACK
-    return (hard | (np.abs(curvature) > MAX_CURVATURE_PER_M + SLACK)).any(axis=2)
+    return hard | (np.abs(curvature) > MAX_CURVATURE_PER_M + SLACK)
 
 
 def overlapping_modes(

@@ -7,13 +7,14 @@ the one whose heading fits best. Leading axes of points and states are kept thro
 
 import math
 from dataclasses import dataclass
+from itertools import pairwise
 from typing import no_type_check
 
 import numpy as np
 from jaxtyping import Bool, Float
 from numba import njit
 
-from asp_env.data.geometry import box_corners
+from asp_env.data.geometry import box_corners, path_length
 from asp_env.data.road_map import RoadMap
 from asp_env.metrics.masked import Masked
 from asp_env.metrics.per_map import PerMap
@@ -23,7 +24,10 @@ CROSSING_RAD = math.radians(30.0)
 complement to 180°: what is nearly opposite is one road drawn for either direction."""
 
 GRID_M = 1.0
-"""Overlaps are looked for at points this far apart."""
+"""Overlaps are looked for at points this far apart, and kept per metre of a lane."""
+
+BETWEEN_M = 10
+"""Between two lanes that cross within this distance one is still at the crossing."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -32,10 +36,10 @@ class LaneTable:
 
     boxes: Float[np.ndarray, "lanes 4"]
     """Smallest x, smallest y, largest x, largest y of each area."""
-    chains: Bool[np.ndarray, "chains lanes"]
-    """Every lane alone, and every path of two and of three lanes that follow each other."""
-    crossed_m: Float[np.ndarray, "lanes 2"]
-    """From where to where along each lane others cross it; the first is larger if none does."""
+    chains: Float[np.ndarray, "chains lanes"]
+    """1 for the members of every path of one, two or three lanes that follow each other."""
+    crossed: Bool[np.ndarray, "lanes metres"]
+    """Metres along each lane at which others cross it."""
 
 
 @njit(cache=True)
@@ -111,15 +115,13 @@ def along_lanes(
 def _tabulate(road_map: RoadMap) -> LaneTable:
     rings = [road_map.areas[i] for i in range(len(road_map.areas))]
     boxes = np.array([[*ring.min(axis=0), *ring.max(axis=0)] for ring in rings]).reshape(-1, 4)
-    return LaneTable(
-        boxes=boxes, chains=_chains(road_map), crossed_m=_where_crossed(road_map, boxes)
-    )
+    return LaneTable(boxes=boxes, chains=_chains(road_map), crossed=_where_crossed(road_map, boxes))
 
 
 lane_table = PerMap(_tabulate)
 
 
-def _chains(road_map: RoadMap) -> Bool[np.ndarray, "chains lanes"]:
+def _chains(road_map: RoadMap) -> Float[np.ndarray, "chains lanes"]:
     count = len(road_map.areas)
     after: list[list[int]] = [[] for _ in range(count)]
     if count:
@@ -128,16 +130,17 @@ def _chains(road_map: RoadMap) -> Bool[np.ndarray, "chains lanes"]:
     one = [(lane,) for lane in range(count)]
     two = [(lane, second) for lane in range(count) for second in after[lane]]
     three = [(*pair, third) for pair in two for third in after[pair[1]]]
-    chains = np.zeros((len(one) + len(two) + len(three), count), dtype=bool)
+    chains = np.zeros((len(one) + len(two) + len(three), count), dtype=np.float32)
     for number, chain in enumerate((*one, *two, *three)):
-        chains[number, list(chain)] = True
+        chains[number, list(chain)] = 1
     return chains
 
 
 def _where_crossed(
     road_map: RoadMap, boxes: Float[np.ndarray, "lanes 4"]
-) -> Float[np.ndarray, "lanes 2"]:
-    crossed = np.tile([np.inf, -np.inf], (len(boxes), 1))
+) -> Bool[np.ndarray, "lanes metres"]:
+    longest = max((path_length(road_map.lanes[i]) for i in range(len(boxes))), default=0.0)
+    crossed = np.zeros((len(boxes), int(longest) + 1), dtype=bool)
     if not len(boxes):
         return crossed
     low, high = boxes[:, :2].min(axis=0), boxes[:, 2:].max(axis=0)
@@ -150,9 +153,11 @@ def _where_crossed(
         heading, arc = along_lanes(road_map, points, covers)
         across = np.abs(np.sin(heading[:, :, None] - heading[:, None])) > math.sin(CROSSING_RAD)
         meets = (across & covers[:, :, None] & covers[:, None]).any(axis=2)
-        first, last = np.where(meets, arc, np.inf), np.where(meets, arc, -np.inf)
-        crossed[:, 0] = np.minimum(crossed[:, 0], first.min(axis=0, initial=np.inf))
-        crossed[:, 1] = np.maximum(crossed[:, 1], last.max(axis=0, initial=-np.inf))
+        crossed[np.nonzero(meets)[1], arc[meets].astype(np.int64)] = True
+    for row in crossed:
+        for here, there in pairwise(np.flatnonzero(row).tolist()):
+            if there - here <= BETWEEN_M:
+                row[here:there] = True
     return crossed
 
 
@@ -165,23 +170,25 @@ def in_several_lanes(
     Corners that no lane covers do not count.
     """
     covers = covering(road_map, box_corners(states, sizes))
-    held = (covers[..., None, :] & lane_table(road_map).chains).any(axis=-1)
-    unknown = ~covers.any(axis=-1)
-    return ~(held | unknown[..., None]).all(axis=-2).any(axis=-1) & ~unknown.all(axis=-1)
+    held = covers.astype(np.float32) @ lane_table(road_map).chains.T > 0
+    unknown = np.asarray(~covers.any(axis=-1))
+    one = np.asarray((held | unknown[..., None]).all(axis=-2)).any(axis=-1)
+    return np.asarray(~one & ~unknown.all(axis=-1))
 
 
 def at_crossing(
     road_map: RoadMap, states: Float[np.ndarray, "*batch 4"], sizes: Float[np.ndarray, "*batch 2"]
 ) -> Bool[np.ndarray, "*batch"]:
-    """Whether a corner or the centre is in a lane between the first and last lane that cross it.
+    """Whether a corner or the centre is in a lane where another one crosses it, or between two.
 
     This stands for nuPlan's polygons of intersections, which these maps do not have.
     """
     points = np.concatenate([box_corners(states, sizes), states[..., None, :2]], axis=-2)
     covers = covering(road_map, points)
     _, arc = along_lanes(road_map, points, covers)
-    first, last = lane_table(road_map).crossed_m.T
-    return np.asarray((covers & (arc >= first) & (arc <= last)).any(axis=(-2, -1)))
+    crossed = lane_table(road_map).crossed
+    there = crossed[np.arange(len(crossed)), arc.astype(np.int64)]
+    return np.asarray((covers & there).any(axis=(-2, -1)))
 
 
 def against_traffic_m(

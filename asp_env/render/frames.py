@@ -1,4 +1,4 @@
-"""One picture of a scene for people: the map, who is there, and what is forecast and planned."""
+"""One picture for people: the map, who is there, and what is forecast and planned."""
 
 import math
 
@@ -11,10 +11,12 @@ from asp_env.data.geometry import box_corners, from_frame
 from asp_env.data.recording import Background
 from asp_env.data.scene import Scene
 from asp_env.errors import AspEnvError
-from asp_env.render.canvas import Canvas, Colour
+from asp_env.render.canvas import SHADE, Canvas, Colour
 from asp_env.render.ground import draw_ground
+from asp_env.render.labels import draw_labels
+from asp_env.render.moment import EGO, Moment, moment_of_scene
 
-EGO: Colour = (77, 148, 255)
+EGO_COLOUR: Colour = (77, 148, 255)
 CLASS_COLOURS: dict[AgentClass, Colour] = {
     AgentClass.CAR: (166, 182, 204),
     AgentClass.VAN: (53, 184, 180),
@@ -29,14 +31,16 @@ CLASS_COLOURS: dict[AgentClass, Colour] = {
     AgentClass.OTHER: (183, 167, 142),
 }
 EGO_EDGE: Colour = (255, 255, 255)
-EDGE: Colour = (14, 17, 22)
 FORECAST: Colour = (255, 146, 43)
 PLAN: Colour = (120, 190, 255)
 TRAIL: Colour = (170, 182, 200)
-TEXT: Colour = (214, 222, 234)
-EGO_SLOT = 0
-MIN_WORDS_PX = 200
-"""Smaller pictures have no room for time, speed and scale."""
+GHOST: Colour = (242, 245, 249)
+ALARM_GAP_M = 1.2
+"""How much larger than the ego the frame is that shows something to be wrong."""
+MIN_BOX_PX = 8.0
+"""Nobody is drawn smaller than this, so that pedestrians are seen."""
+MIN_WEDGE_PX = 9.0
+"""Narrower boxes have no room for a wedge."""
 FIT_MARGIN = 1.06
 """The whole map is shown with this much room about it."""
 
@@ -58,98 +62,114 @@ def draw_frame(
         situation: which of the scene's situations.
         size_px: width and height of the picture.
         extent_m: width of what is shown about the ego; None shows the whole map and stands still.
-        forecast: of this scene; width and strength of a mode tell its probability.
+        forecast: of this scene, or of an earlier tick with the same slots; width and strength of
+            a mode tell its probability.
         plan: (steps, 2 or more) the ego's planned positions, metres, in their first two columns.
-        background: a photograph of the place in place of the map's drivable area.
+        background: a photograph of the place, over the map's drivable area.
 
     Raises:
         AspEnvError: a size is not positive, or there is no such situation.
         DataError: the background picture cannot be read.
     """
-    _check(scene, situation, size_px, extent_m)
-    road_map = scene.maps[int(scene.map_index[situation])]
-    ego = scene.states[situation, EGO_SLOT, -1]
-    centre_m = (float(ego[0]), float(ego[1]))
-    if extent_m is None:
-        left, low, right, high = road_map.extent_m
-        centre_m = ((left + right) / 2, (low + high) / 2)
-        pixels_per_metre = min(size_px[0] / (right - left), size_px[1] / (high - low)) / FIT_MARGIN
-    else:
-        pixels_per_metre = size_px[0] / extent_m
-    canvas = Canvas(*draw_ground(road_map, background, centre_m, pixels_per_metre, size_px))
-    _draw_route(canvas, scene.route[situation, scene.route_valid[situation]])
-    seen = np.flatnonzero(scene.valid[situation, :, -1])
-    _draw_trails(canvas, scene, situation, seen[seen != EGO_SLOT], TRAIL)
-    _draw_trails(canvas, scene, situation, seen[seen == EGO_SLOT], EGO)
-    if forecast is not None:
-        _draw_forecast(canvas, scene, forecast, situation)
-    if plan is not None and len(plan):
-        canvas.stroke(np.concatenate([ego[None, :2], plan[:, :2]])[None], 0.95, 4)
-        canvas.blend(PLAN)
-    _draw_boxes(canvas, scene, situation, seen)
-    if min(size_px) >= MIN_WORDS_PX:
-        _draw_words(canvas, scene, situation)
-    return canvas.image
-
-
-def _check(scene: Scene, situation: int, size_px: tuple[int, int], extent_m: float | None) -> None:
     if not 0 <= situation < len(scene.tick):
         raise AspEnvError(f"situation {situation}: the scene has {len(scene.tick)}")
+    moment = moment_of_scene(scene, situation, forecast=forecast, plan=plan, background=background)
+    return draw_moment(moment, size_px=size_px, extent_m=extent_m).image
+
+
+def draw_moment(moment: Moment, *, size_px: tuple[int, int], extent_m: float | None) -> Canvas:
+    """The picture of a moment, to be drawn on further.
+
+    Raises:
+        AspEnvError: a size is not positive.
+        DataError: the background picture cannot be read.
+    """
     if min(size_px) < 1:
         raise AspEnvError(f"size {size_px}: expected a width and height of at least 1 pixel")
     if extent_m is not None and not 0 < extent_m < math.inf:
         raise AspEnvError(f"extent {extent_m} m: expected a positive number or None")
+    where = _camera(moment, size_px, extent_m)
+    canvas = Canvas(*draw_ground(moment.road_map, moment.background, *where, size_px))
+    if len(moment.route) > 1:
+        canvas.stroke(moment.route[None], 0.3, 5.0)
+        canvas.blend(EGO_COLOUR)
+    seen = np.flatnonzero(moment.valid[:, -1])
+    _draw_trails(canvas, moment, seen[seen != EGO], TRAIL)
+    _draw_trails(canvas, moment, seen[seen == EGO], EGO_COLOUR)
+    _draw_forecasts(canvas, moment)
+    if len(moment.plan):
+        ahead = np.concatenate([moment.states[EGO, None, -1, :2], moment.plan])
+        canvas.stroke(ahead[None], 0.95, 4.0)
+        canvas.blend(PLAN)
+    if moment.logged_ego is not None:
+        _frame(canvas, moment.logged_ego, moment.sizes[EGO], 0.85, 2.0, GHOST)
+    _draw_boxes(canvas, moment, seen)
+    if moment.alarms and moment.valid[EGO, -1]:
+        size = moment.sizes[EGO] + ALARM_GAP_M
+        _frame(canvas, moment.states[EGO, -1], size, 1.0, 3.0, moment.alarms[0][1])
+    draw_labels(canvas, moment.words, moment.alarms)
+    return canvas
 
 
-def _draw_route(canvas: Canvas, route: Shaped[np.ndarray, "p 2"]) -> None:
-    if len(route) > 1:
-        canvas.stroke(route[None], 0.3, 5)
-        canvas.blend(EGO)
+def _camera(
+    moment: Moment, size_px: tuple[int, int], extent_m: float | None
+) -> tuple[tuple[float, float], float]:
+    """The point in the middle, and pixels per metre."""
+    if extent_m is not None:
+        x, y = moment.states[EGO, -1, :2].tolist()
+        return (x, y), size_px[0] / extent_m
+    left, low, right, high = moment.road_map.extent_m
+    scale = min(size_px[0] / (right - left), size_px[1] / (high - low)) / FIT_MARGIN
+    return ((left + right) / 2, (low + high) / 2), scale
 
 
 def _draw_trails(
-    canvas: Canvas, scene: Scene, situation: int, slots: Int[np.ndarray, " s"], colour: Colour
+    canvas: Canvas, moment: Moment, slots: Int[np.ndarray, " s"], colour: Colour
 ) -> None:
     """Where agents came from, the fainter the longer ago."""
-    past = scene.states[situation, slots, :, :2]
-    valid = scene.valid[situation, slots]
+    past, valid = moment.states[slots, :, :2], moment.valid[slots]
     both = valid[:, 1:] & valid[:, :-1]
-    for k in range(scene.history):
+    steps = both.shape[1]
+    for k in range(steps):
         pieces = past[both[:, k], k : k + 2]
         if len(pieces):
-            canvas.stroke(pieces, 0.6 * (k + 1) / scene.history, 2)
+            canvas.stroke(pieces, 0.6 * (k + 1) / steps, 2.0)
     canvas.blend(colour)
 
 
-def _draw_forecast(canvas: Canvas, scene: Scene, forecast: Forecast, situation: int) -> None:
-    rows = np.flatnonzero((forecast.targets[:, 0] == situation) & forecast.valid)
-    starts = scene.states[situation, forecast.targets[rows, 1], -1, :2]
-    probabilities = forecast.probabilities[rows]
+def _draw_forecasts(canvas: Canvas, moment: Moment) -> None:
     # The least probable first, so that the likely ones lie on top.
-    order = np.argsort(probabilities, axis=None, kind="stable")
-    for row, mode in zip(*np.unravel_index(order, probabilities.shape), strict=True):
-        points = forecast.states[rows[row], mode, :, :2]
-        p = float(probabilities[row, mode])
+    order = np.argsort(moment.probabilities, axis=None, kind="stable")
+    for row, mode in zip(*np.unravel_index(order, moment.probabilities.shape), strict=True):
+        slot = moment.slots[row]
+        points = moment.modes[row, mode, moment.steps_gone[row] :]
+        if not (moment.valid[slot, -1] and len(points)):
+            continue
+        p = float(moment.probabilities[row, mode])
         alpha = 0.25 + 0.7 * p
-        canvas.stroke(np.concatenate([starts[row, None], points])[None], alpha, 1 + round(3 * p))
+        start = moment.states[slot, None, -1, :2]
+        canvas.stroke(np.concatenate([start, points])[None], alpha, 1 + 3 * p)
         canvas.dot(points[-1], alpha, 2 + 2.5 * p)
     canvas.blend(FORECAST)
 
 
-def _draw_boxes(canvas: Canvas, scene: Scene, situation: int, seen: Int[np.ndarray, " s"]) -> None:
-    states = scene.states[situation, seen, -1]
+def _draw_boxes(canvas: Canvas, moment: Moment, seen: Int[np.ndarray, " s"]) -> None:
+    states = moment.states[seen, -1]
     near = _near(canvas, states)
     seen, states = seen[near], states[near]
-    sizes = scene.sizes[situation, seen]
+    scale = canvas.frame.pixels_per_metre / canvas.unit
+    sizes = np.maximum(moment.sizes[seen], MIN_BOX_PX / scale).astype(states.dtype)
     boxes = canvas.frame.fixed(box_corners(states, sizes))
     wedges = canvas.frame.fixed(_wedges(states, sizes))
+    wide = sizes[:, 1] * scale >= MIN_WEDGE_PX
     # The ego has the first slot and comes last, on top.
-    for slot, box, wedge in reversed(list(zip(seen.tolist(), boxes, wedges, strict=True))):
-        ego = slot == EGO_SLOT
-        kind = AgentClass(int(scene.classes[situation, slot]))
-        canvas.fill(box, EGO if ego else CLASS_COLOURS[kind])
-        canvas.fill(wedge, EDGE)
-        canvas.outline(box, EGO_EDGE if ego else EDGE)
+    for i in reversed(range(len(seen))):
+        ego = seen[i] == EGO
+        kind = AgentClass(int(moment.classes[seen[i]]))
+        canvas.fill(boxes[i], EGO_COLOUR if ego else CLASS_COLOURS[kind])
+        if wide[i]:
+            canvas.fill(wedges[i], SHADE)
+        canvas.outline(boxes[i], EGO_EDGE if ego else SHADE)
 
 
 def _near(canvas: Canvas, states: Shaped[np.ndarray, "s 4"]) -> Bool[np.ndarray, " s"]:
@@ -173,15 +193,15 @@ def _wedges(
     return from_frame(corners, states[:, None])
 
 
-def _draw_words(canvas: Canvas, scene: Scene, situation: int) -> None:
-    """Time and speed above, a bar of a round length below."""
-    time_s = int(scene.tick[situation]) * scene.dt_s
-    speed_mps = float(scene.states[situation, EGO_SLOT, -1, 3])
-    canvas.text(f"{time_s:.1f} s   {speed_mps:.1f} m/s", 14, 26, TEXT)
-    scale = canvas.frame.pixels_per_metre
-    metres = next((m for m in (1, 2, 5, 10, 20, 50, 100, 200, 500) if m * scale > 60), 1000)
-    row = canvas.frame.height_px - 14
-    end = 14 + round(metres * scale)
-    canvas.image[row - 1 : row + 1, 14 : end + 1] = TEXT
-    canvas.image[row - 6 : row + 1, [14, end]] = TEXT
-    canvas.text(f"{metres} m", 20, row - 7, TEXT)
+def _frame(
+    canvas: Canvas,
+    state: Shaped[np.ndarray, " 4"],
+    size: Shaped[np.ndarray, " 2"],
+    alpha: float,
+    width_px: float,
+    colour: Colour,
+) -> None:
+    """An empty box."""
+    corners = box_corners(state, size)
+    canvas.stroke(np.concatenate([corners, corners[:1]])[None], alpha, width_px)
+    canvas.blend(colour)

@@ -14,7 +14,7 @@ from asp_env.errors import DataError
 from asp_env.render.canvas import SHIFT, Colour, Frame
 
 GROUND: Colour = (22, 26, 32)
-ROAD: Colour = (48, 56, 68)
+ROAD: Colour = (58, 67, 81)
 LINE_COLOURS: dict[int, Colour] = {
     LineType.CURB: (118, 130, 148),
     LineType.SOLID: (150, 160, 175),
@@ -22,6 +22,8 @@ LINE_COLOURS: dict[int, Colour] = {
 }
 """Virtual lines mark nothing on the road and are not drawn."""
 DASH_M = 1.5
+MARKING_M = 0.1
+"""Width of a marking where there is no photograph, if that is more than a pixel."""
 MARGIN_M = 10.0
 PHOTO_STRENGTH = 0.6
 """A photograph is darkened, so that what moves stands out."""
@@ -116,17 +118,17 @@ def _draw(
 ) -> UInt8[np.ndarray, "h w 3"]:
     image = np.empty((frame.height_px, frame.width_px, 3), dtype=np.uint8)
     image[:] = GROUND
-    if background is None:
-        road = _coverage(road_map.drivable, frame)[..., None].astype(np.float32) / 255
-        image[:] = np.rint(image * (1 - road) + np.array(ROAD, dtype=np.float32) * road)
-    else:
+    road = _coverage(road_map.drivable, frame)[..., None].astype(np.float32) / 255
+    image[:] = np.rint(image * (1 - road) + np.array(ROAD, dtype=np.float32) * road)
+    if background is not None:
         _draw_photo(background, frame, image)
+    thickness = 1 if background else max(1, round(MARKING_M * frame.pixels_per_metre))
     for kind, colour in LINE_COLOURS.items():
         lines = [road_map.lines[int(i)] for i in np.flatnonzero(road_map.line_types == kind)]
         if kind == LineType.DASHED:
             lines = [dash for line in lines for dash in _dashes(line)]
         fixed = [frame.fixed(line) for line in lines]
-        cv2.polylines(image, fixed, False, colour, 1, cv2.LINE_AA, SHIFT)
+        cv2.polylines(image, fixed, False, colour, thickness, cv2.LINE_AA, SHIFT)
     return image
 
 

@@ -15,6 +15,7 @@ from asp_env.data.recording import Recording
 from asp_env.data.scenario import Scenario
 from asp_env.errors import AspEnvError
 from asp_env.metrics.boxes import ego_contacts, touching_trailers
+from asp_env.metrics.drivable import log_off_road_m
 from asp_env.metrics.route import route_coordinates
 from asp_env.sim.episodes import Episodes
 from asp_env.sim.world import EGO
@@ -38,6 +39,8 @@ class Cast:
     ticks: int
     """Of the history, the present, and the scenario."""
     route: Float[np.ndarray, "p 2"]
+    log_off_road_m: Float[np.ndarray, " p"]
+    """How far off the road the logged ego itself is near each point of its route."""
 
 
 def cast(recording: Recording, scenario: Scenario, *, dt_s: float, history: int) -> Cast:
@@ -67,6 +70,8 @@ def cast(recording: Recording, scenario: Scenario, *, dt_s: float, history: int)
         )
     seen = recording.tracks_between(first_tick * stride, last_tick * stride)
     start = scenario.start_tick * stride - recording.first_frames[ego]
+    ahead = recording.track(ego)[start::stride]
+    route = route_along(ahead, beyond_m=BEYOND_M)
     return Cast(
         scenario=scenario,
         recording=recording,
@@ -74,7 +79,8 @@ def cast(recording: Recording, scenario: Scenario, *, dt_s: float, history: int)
         first_frame=first_tick * stride,
         stride=stride,
         ticks=history + 1 + scenario.length,
-        route=route_along(recording.track(ego)[start::stride], beyond_m=BEYOND_M),
+        route=route,
+        log_off_road_m=log_off_road_m(recording.road_map, ahead, recording.sizes[ego], route),
     )
 
 
@@ -106,6 +112,7 @@ def _place(data: Episodes, b: int, cast: Cast, history: int) -> float:
     data.tracks[b, :agents] = tracks
     data.route[b, :points] = cast.route
     data.route_valid[b, :points] = True
+    data.log_off_road_m[b, :points] = cast.log_off_road_m
     data.recording[b] = cast.scenario.recording
     data.start_tick[b], data.length[b] = cast.scenario.start_tick, cast.scenario.length
     return _copy_tracks(

@@ -35,6 +35,8 @@ class Episodes:
     """Index of each agent's track in its recording."""
     route: Float[np.ndarray, "b p 2"]
     route_valid: Bool[np.ndarray, "b p"]
+    log_off_road_m: Float[np.ndarray, "b p"]
+    """How far off the road the logged ego itself is near each point of its route."""
     on_route: Float[np.ndarray, "b 3"]
     """The ego's arc length m, offset to the left m, and the route's heading rad there."""
     contacts: Int[np.ndarray, "b a"]
@@ -91,6 +93,7 @@ def no_episodes(num_episodes: int, *, ticks: int, agents: int, points: int) -> E
         tracks=np.full((b, a), -1, dtype=np.int64),
         route=np.zeros((b, p, 2), dtype=np.float32),
         route_valid=np.zeros((b, p), dtype=bool),
+        log_off_road_m=np.zeros((b, p), dtype=np.float32),
         on_route=np.zeros((b, 3)),
         contacts=np.zeros((b, a), dtype=np.int8),
         own_trailer=np.zeros((b, a), dtype=bool),

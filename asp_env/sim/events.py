@@ -8,7 +8,7 @@ from jaxtyping import Bool, Float, Int
 
 from asp_env.data.road_map import RoadMap
 from asp_env.metrics.boxes import AT_FAULT, Contact
-from asp_env.metrics.drivable import drivable_field
+from asp_env.metrics.drivable import beyond_log_m, drivable_field
 
 _AT_FAULT = np.array([kind in AT_FAULT for kind in Contact])
 """By the number of the contact."""
@@ -24,7 +24,10 @@ class Events:
     With a trailer that touches the ego at the first tick, its own, there is none.
     """
     off_road_m: Float[np.ndarray, " b"]
-    """How far the ego's outermost corner lies outside the drivable area."""
+    """How far the ego's outermost corner lies outside the drivable area.
+
+    Less what the logged ego lies outside there, if it is off the road itself: maps have gaps.
+    """
     route_m: Float[np.ndarray, " b"]
     """The ego's arc length along its route, which starts at its first position."""
     route_offset_m: Float[np.ndarray, " b"]
@@ -54,9 +57,11 @@ def outside_now_m(
     map_index: Int[np.ndarray, " b"],
     egos: Float[np.ndarray, "b 4"],
     sizes: Float[np.ndarray, "b 2"],
+    on_route: Float[np.ndarray, "b 3"],
+    log_off_road_m: Float[np.ndarray, "b p"],
 ) -> Float[np.ndarray, " b"]:
-    """How far the outermost corner of each ego lies outside the drivable area of its map, m."""
+    """How far each ego's outermost corner lies outside its map's drivable area, beyond its log."""
     outside = np.zeros(len(egos), dtype=np.float32)
     for number, road_map in enumerate(maps):
         drivable_field(road_map).corners_m(egos, sizes, map_index == number, outside)
-    return outside
+    return beyond_log_m(outside, on_route, log_off_road_m)

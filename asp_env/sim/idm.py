@@ -44,7 +44,7 @@ class IDM:
         )
 
 
-@njit(cache=True)
+@njit(cache=True, error_model="numpy")
 @no_type_check
 def limit_speeds(path, desired, stop_m, lateral, braking, limits):
     """Fills in `speed_limits` of one path."""
@@ -79,13 +79,14 @@ def speed_limits(
     return limits
 
 
-@njit(cache=True)
+@njit(cache=True, error_model="numpy")
 @no_type_check
-def free_ahead(states, sizes, counts_for, me, path, count, arc, reach_m):
+def free_ahead(states, sizes, radii, counts_for, me, path, count, arc, reach_m):
     """(free metres ahead, speed along the path of what ends them); infinite if nothing does.
 
-    A path's points are [x, y, cosine, sine of the box's heading]. Whoever `counts_for` something and whose centre is not behind ends it where the own box, swept
-    along the path with 15 cm to either side, would touch theirs.
+    A path's points are [x, y, cosine, sine of the box's heading]; `radii` are half the diagonals of
+    boxes. Whoever `counts_for` something and whose centre is not behind ends it where the own box,
+    swept along the path with 15 cm to either side, would touch theirs.
     """
     length, width = sizes[me, 0], sizes[me, 1] + 0.3
     x, y = states[me, 0], states[me, 1]
@@ -98,7 +99,7 @@ def free_ahead(states, sizes, counts_for, me, path, count, arc, reach_m):
             continue
         xo, yo = states[o, 0], states[o, 1]
         dx, dy = xo - x, yo - y
-        touch = 0.5 * (math.hypot(length, width) + math.hypot(sizes[o, 0], sizes[o, 1]))
+        touch = radii[me] + radii[o] + 0.15
         within = hit - arc + touch + 5.0  # the path may lie beside the vehicle
         if dx * dx + dy * dy > within * within or dx * cos_me + dy * sin_me < 0.0:
             continue
@@ -106,7 +107,7 @@ def free_ahead(states, sizes, counts_for, me, path, count, arc, reach_m):
         j = first
         while j < hit:
             px, py = path[j, 0], path[j, 1]
-            away = math.hypot(xo - px, yo - py) - touch
+            away = math.sqrt((xo - px) ** 2 + (yo - py) ** 2) - touch
             if away >= 1.0:  # points are 1 m apart: the next ones cannot touch either
                 j += int(away)
                 continue
@@ -123,7 +124,7 @@ def free_ahead(states, sizes, counts_for, me, path, count, arc, reach_m):
     return max(hit - arc - 1.0, 0.0), leader_speed
 
 
-@njit(cache=True)
+@njit(cache=True, error_model="numpy")
 @no_type_check
 def idm_acceleration(speed, wanted, gap, leader_speed, law):
     """m/s² of the intelligent driver model, within the limits of actions."""
@@ -138,7 +139,7 @@ def idm_acceleration(speed, wanted, gap, leader_speed, law):
     return min(max(law[0] * (free - interaction), -MAX_ACCELERATION_MPS2), law[0])
 
 
-@njit(cache=True)
+@njit(cache=True, error_model="numpy")
 @no_type_check
 def pursuit_steering(x, y, heading, speed, length, path, count, arc, offset_m):
     """Steering, rad, that leads the centre to a point of the path ahead (pure pursuit).
@@ -153,16 +154,16 @@ def pursuit_steering(x, y, heading, speed, length, path, count, arc, offset_m):
     px = path[i, 0] + (at - i) * dx - offset_m * dy / norm - x
     py = path[i, 1] + (at - i) * dy + offset_m * dx / norm - y
     left = math.cos(heading) * py - math.sin(heading) * px
-    distance = max(px * px + py * py, 1.0)
-    sin_slip = AXLE_SHARE_OF_LENGTH * length * 2.0 * left / distance
-    sin_slip = min(max(sin_slip, -0.99), 0.99)
-    steering = math.atan(2.0 * sin_slip / math.sqrt(1.0 - sin_slip * sin_slip))
+    along = math.cos(heading) * px + math.sin(heading) * py
+    distance = max(math.hypot(px, py), 1.0)
+    axle = 2.0 * AXLE_SHARE_OF_LENGTH * length
+    steering = math.atan(2.0 * axle * left / max(distance * distance + axle * along, 1.0))
     return min(max(steering, -MAX_STEERING_RAD), MAX_STEERING_RAD)
 
 
-@njit(cache=True)
+@njit(cache=True, error_model="numpy")
 @no_type_check
-def _follow(states, sizes, valid, driven, paths, counts, limits, arcs, law, actions):
+def _follow(states, sizes, radii, valid, driven, paths, counts, limits, arcs, law, actions):
     for b in range(states.shape[0]):
         for a in range(states.shape[1]):
             if not driven[b, a] or not valid[b, a] or counts[b, a] < 2:
@@ -173,7 +174,9 @@ def _follow(states, sizes, valid, driven, paths, counts, limits, arcs, law, acti
             arc, _, _ = project(path, count, x, y, max(arcs[b, a], 0.0), 15.0)
             arcs[b, a] = arc
             reach = max(law[5], law[4] * speed)
-            gap, leader = free_ahead(states[b], sizes[b], valid[b], a, path, count, arc, reach)
+            gap, leader = free_ahead(
+                states[b], sizes[b], radii[b], valid[b], a, path, count, arc, reach
+            )
             wanted = limits[b, a, min(max(int(arc + 0.5), 0), count - 1)]
             actions[b, a, 0] = idm_acceleration(speed, wanted, gap, leader, law)
             actions[b, a, 1] = pursuit_steering(
@@ -196,16 +199,9 @@ def follow_paths(
     actions = np.zeros((*valid.shape, 2), dtype=np.float32)
     step = np.diff(paths, axis=2, append=paths[:, :, -1:])
     norm = np.maximum(np.linalg.norm(step, axis=-1, keepdims=True), 1e-6)
+    turned = np.concatenate([paths, step / norm], axis=-1)
+    radii = 0.5 * np.linalg.norm(sizes, axis=-1)
     _follow(
-        states,
-        sizes,
-        valid,
-        driven,
-        np.concatenate([paths, step / norm], axis=-1),
-        counts,
-        limits,
-        arcs,
-        idm.as_row(),
-        actions,
+        states, sizes, radii, valid, driven, turned, counts, limits, arcs, idm.as_row(), actions
     )
     return actions

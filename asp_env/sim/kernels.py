@@ -11,16 +11,48 @@ from asp_env.sim.episodes import Episodes
 
 @njit(cache=True)
 @no_type_check
-def _write_tick(
-    states, valid, log_states, log_valid, gone, rows, now, driven, obeys, moved, everybody
-):
+def _read_obeying(states, sizes, actions, rows, now, obeys, out):
     at = 0
+    for i in range(len(rows)):
+        b, k = rows[i], now[i]
+        for a in range(obeys.shape[1]):
+            if obeys[i, a]:
+                for field in range(4):
+                    out[field, at] = states[b, k, a, field]
+                out[4, at], out[5, at] = actions[b, a, 0], actions[b, a, 1]
+                out[6, at] = max(sizes[b, a, 0], 0.1)
+                at += 1
+
+
+def read_obeying(
+    data: Episodes,
+    rows: Int[np.ndarray, " r"],
+    now: Int[np.ndarray, " r"],
+    actions: Float[np.ndarray, "b a 2"],
+    obeys: Bool[np.ndarray, "r a"],
+) -> tuple[
+    Float[np.ndarray, "n 4"],
+    Float[np.ndarray, "n 2"],
+    Float[np.ndarray, " n"],
+]:
+    """States, actions and lengths of those who obey, row by row.
+
+    Each field lies together in memory, which halves the time of what is computed of them.
+    """
+    fields = np.empty((7, np.count_nonzero(obeys)), dtype=np.float32)
+    _read_obeying(data.states, data.sizes, actions, rows, now, obeys, fields)
+    return fields[:4].T, fields[4:6].T, fields[6]
+
+
+@njit(cache=True)
+@no_type_check
+def _write_tick(states, valid, log_states, log_valid, gone, rows, now, driven, obeys, moved):
+    at = -1
     for i in range(len(rows)):
         b, k = rows[i], now[i] + 1
         for a in range(valid.shape[2]):
             mine = obeys[i, a]
-            if mine or everybody:
-                at += 1
+            at += mine
             there = mine or (log_valid[b, k, a] and not driven[i, a])
             if gone[b, a] or not there:
                 valid[b, k, a] = False
@@ -29,7 +61,7 @@ def _write_tick(
             valid[b, k, a] = True
             if mine:
                 for field in range(4):
-                    states[b, k, a, field] = moved[at - 1, field]
+                    states[b, k, a, field] = moved[at, field]
             else:
                 for field in range(4):
                     states[b, k, a, field] = log_states[b, k, a, field]
@@ -51,12 +83,11 @@ def write_tick(
         now: the present tick of each.
         driven: who is not replayed.
         obeys: which of those are there to be moved.
-        moved: where to, row by row: of everybody, or only of those that obey.
+        moved: where to, row by row.
     """
-    everybody = len(moved) == obeys.size
     _write_tick(
         *(data.states, data.valid, data.log_states, data.log_valid, data.gone),
-        *(rows, now, driven, obeys, moved, everybody),
+        *(rows, now, driven, obeys, moved),
     )
 
 

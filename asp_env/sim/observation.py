@@ -8,7 +8,7 @@ from gymnasium import spaces
 from jaxtyping import Shaped
 
 from asp_env.errors import AspEnvError, unknown_name
-from asp_env.sim.observed import ActionsPart, PicturePart, RoutePart, StatePart, VectorsPart
+from asp_env.sim.observed import ActionsPart, PicturePart, RoutePart, Spaces, StatePart, VectorsPart
 from asp_env.sim.sight import Sight
 from asp_env.sim.world import Events
 from asp_env.views import VIEWS, PictureView, make_picture_view
@@ -33,7 +33,7 @@ class Part(Protocol):
         ...
 
     @property
-    def spaces(self) -> dict[str, spaces.Box]:
+    def spaces(self) -> Spaces:
         """The space of each part, for one target."""
         ...
 
@@ -74,7 +74,7 @@ class Observer:
         if len(set(names)) < len(names):
             raise AspEnvError(f"observations {', '.join(names)}: name each once")
         boxes = {name: box for part in self._parts for name, box in part.spaces.items()}
-        self.space = spaces.Dict(boxes)
+        self.space = spaces.Dict(list(boxes.items()))
         self._shapes = {name: (box.shape, box.dtype) for name, box in boxes.items()}
 
     def memory(self, count: int) -> Observation:

@@ -4,7 +4,7 @@ Every value is finite and lies within the bounds of its space; what would lie be
 """
 
 import math
-from typing import final, no_type_check
+from typing import Any, final, no_type_check
 
 import numpy as np
 from gymnasium import spaces
@@ -15,7 +15,7 @@ from asp_env.dynamics import MAX_STEERING_RAD, wrap_angle
 from asp_env.sim.sight import Sight
 from asp_env.sim.world import Events
 from asp_env.views import PictureView
-from asp_env.views.vectors import AGENT_FIELDS, LINE_FIELDS, Vectors, VectorView
+from asp_env.views.vectors import AGENT_FIELDS, LINE_FIELDS, VectorBounds, Vectors, VectorView
 
 FARTHEST_M = 1000.0
 """Positions in an ego's frame are shown up to here."""
@@ -44,6 +44,7 @@ ROUTE_STEP_M = 2.0
 """Between the points of the `route` observation; the first lies this far ahead of the ego."""
 
 Arrays = dict[str, np.ndarray]
+Spaces = dict[str, spaces.Box[Any]]
 
 
 @final
@@ -54,7 +55,7 @@ class PicturePart:
         """A part of that name."""
         self._name, self._view = name, view
         self.history = view.history
-        self.spaces = {name: spaces.Box(0, 255, view.shape, dtype=np.uint8)}
+        self.spaces: Spaces = {name: spaces.Box(0, 255, view.shape, dtype=np.uint8)}
 
     def write(self, sight: Sight, events: Events, out: Arrays) -> None:
         """Draws into the memory itself."""
@@ -75,20 +76,23 @@ class VectorsPart:
         self.history = view.history
         shape = view.shape
         agents, lines = (shape.agents, shape.ticks), (shape.lines, shape.points)
-        self.spaces = {
+        self.spaces: Spaces = {
             "agents": _box(*_field_bounds(AGENT_FIELDS), agents),
             "agents_valid": spaces.Box(0, 1, agents, dtype=np.int8),
             "lines": _box(*_field_bounds(LINE_FIELDS), lines),
             "lines_valid": spaces.Box(0, 1, lines, dtype=np.int8),
         }
+        bounds = (self.spaces["agents"], self.spaces["lines"])
+        self._within = VectorBounds(
+            *(bound.reshape(-1) for box in bounds for bound in (box.low, box.high))
+        )
 
     def write(self, sight: Sight, events: Events, out: Arrays) -> None:
         """Writes into the memory itself."""
         del events
         masks = out["agents_valid"].view(np.bool_), out["lines_valid"].view(np.bool_)
-        self._view.draw(sight, Vectors(out["agents"], masks[0], out["lines"], masks[1]))
-        for name in ("agents", "lines"):
-            _clip_to(self.spaces[name], out[name])
+        memory = Vectors(out["agents"], masks[0], out["lines"], masks[1])
+        self._view.draw(sight, memory, self._within)
 
 
 @final
@@ -99,7 +103,7 @@ class ActionsPart:
         """Of that many ticks."""
         self.history = history
         limit = np.array([MAX_SEEN_ACCELERATION_MPS2, MAX_STEERING_RAD])
-        self.spaces = {"actions": _box(-limit, limit, (history,))}
+        self.spaces: Spaces = {"actions": _box(-limit, limit, (history,))}
 
     def write(self, sight: Sight, events: Events, out: Arrays) -> None:
         """Infers those of the targets alone."""
@@ -117,7 +121,7 @@ class StatePart:
     def __init__(self) -> None:
         """The bounds are those of the fields."""
         low, high = np.array(list(STATE_FIELDS.values())).T
-        self.spaces = {"state": _box(low, high, ())}
+        self.spaces: Spaces = {"state": _box(low, high, ())}
 
     def write(self, sight: Sight, events: Events, out: Arrays) -> None:
         """The fields in their order."""
@@ -151,7 +155,7 @@ class RoutePart:
     def __init__(self) -> None:
         """Of `ROUTE_POINTS` points."""
         high = np.full(2, FARTHEST_M)
-        self.spaces = {"route": _box(-high, high, (ROUTE_POINTS,))}
+        self.spaces: Spaces = {"route": _box(-high, high, (ROUTE_POINTS,))}
 
     def write(self, sight: Sight, events: Events, out: Arrays) -> None:
         """Writes into the memory itself."""
@@ -165,11 +169,11 @@ def _field_bounds(names: tuple[str, ...]) -> tuple[np.ndarray, np.ndarray]:
     """Of the fields of agents or lines; all but some lie between 0 and 1."""
     wide = {"x": FARTHEST_M, "y": FARTHEST_M, "cos": 1.0, "sin": 1.0, "speed": FASTEST_MPS}
     sizes = {"length": STATE_FIELDS["length_m"][1], "width": STATE_FIELDS["width_m"][1]}
-    low = [-wide.get(name, 0.0) for name in names]
+    low = [-wide[name] if name in wide else 0.0 for name in names]
     return np.array(low), np.array([wide.get(name, sizes.get(name, 1.0)) for name in names])
 
 
-def _box(low: np.ndarray, high: np.ndarray, leading: tuple[int, ...]) -> spaces.Box:
+def _box(low: np.ndarray, high: np.ndarray, leading: tuple[int, ...]) -> spaces.Box[Any]:
     """A table of float32 whose last axis has these bounds."""
     shape = (*leading, len(low))
     return spaces.Box(
@@ -179,7 +183,7 @@ def _box(low: np.ndarray, high: np.ndarray, leading: tuple[int, ...]) -> spaces.
     )
 
 
-def _clip_to(box: spaces.Box, values: np.ndarray) -> None:
+def _clip_to(box: spaces.Box[Any], values: np.ndarray) -> None:
     """Moves what lies outside a space into it."""
     _clip(values.reshape(len(values), -1), box.low.reshape(-1), box.high.reshape(-1))
 
@@ -200,8 +204,8 @@ def _clip(rows, low, high):
         row = rows[t]
         for i in range(len(low)):
             value, least, most = row[i], low[i], high[i]
-            value = value if value > least else least
-            row[i] = value if value < most else most
+            value = value if value >= least else least
+            row[i] = value if value <= most else most
 
 
 @njit(cache=True)

@@ -16,7 +16,7 @@ from asp_env.metrics.route import route_coordinates
 from asp_env.sim.beginning import cast, place
 from asp_env.sim.episodes import Episodes, no_episodes
 from asp_env.sim.events import Events, outside_now_m
-from asp_env.sim.kernels import read_window, write_tick
+from asp_env.sim.kernels import read_obeying, read_window, write_tick
 from asp_env.sim.world import EGO
 
 Snapshot = tuple[Episodes, list[Scenario | None], list[np.random.Generator]]
@@ -104,33 +104,14 @@ class ReplayWorld:
             data.gone[rows] |= leaving[rows]
         driven = driven[rows]
         obeys = driven & data.valid[rows, now]
-        write_tick(data, rows, now, driven, obeys, self._moved(actions, rows, now, obeys))
+        moved = forward(*read_obeying(data, rows, now, actions, obeys), self.dt_s)
+        write_tick(data, rows, now, driven, obeys, moved)
         data.elapsed[rows] += 1
         # a negative arc length would make the search begin anew everywhere
         near = np.maximum(data.on_route[:, 0], 0.0)
         on_route = route_coordinates(data.route, data.route_valid, self.ego_states(), near)
         data.on_route[rows] = on_route[rows]
         self._judge_contacts()
-
-    def _moved(
-        self,
-        actions: Float[np.ndarray, "b a 2"],
-        rows: Int[np.ndarray, " r"],
-        now: Int[np.ndarray, " r"],
-        obeys: Bool[np.ndarray, "r a"],
-    ) -> Float[np.ndarray, "n 4"]:
-        """The states after the tick of those who obey, or of everybody if those are most."""
-        data = self.episodes
-        if 2 * np.count_nonzero(obeys) > obeys.size:
-            states, chosen, sizes = data.states[rows, now], actions[rows], data.sizes[rows, :, 0]
-        else:
-            row, slot = np.nonzero(obeys)
-            states, chosen = data.states[rows[row], now[row], slot], actions[rows[row], slot]
-            sizes = data.sizes[rows[row], slot, 0]
-        moved = forward(
-            states, chosen.astype(np.float32, copy=False), np.maximum(sizes, 0.1), self.dt_s
-        )
-        return moved.reshape(-1, 4).astype(np.float32, copy=False)
 
     def _judge_contacts(self) -> None:
         """Brings contacts up to now."""
@@ -188,7 +169,13 @@ class ReplayWorld:
         data = self.episodes
         return Events(
             contacts=data.contacts.copy(),
-            off_road_m=outside_now_m(*self.maps(), self.ego_states(), data.sizes[:, EGO]),
+            off_road_m=outside_now_m(
+                *self.maps(),
+                self.ego_states(),
+                data.sizes[:, EGO],
+                data.on_route,
+                data.log_off_road_m,
+            ),
             route_m=data.on_route[:, 0].copy(),
             route_offset_m=data.on_route[:, 1].copy(),
             route_heading_rad=data.on_route[:, 2].copy(),

@@ -2,6 +2,7 @@
 
 import re
 from collections.abc import Mapping, Sequence
+from typing import Any
 
 import numpy as np
 from jaxtyping import Bool
@@ -14,7 +15,7 @@ from asp_env.sim.drivers import Control, Driver, DriverPlug
 from asp_env.sim.drivers.driver import idle, resized, vehicles
 from asp_env.sim.replay import ReplayWorld
 
-TrafficSpec = str | Driver | Mapping[int | str, str | Driver]
+TrafficSpec = str | Driver | Mapping[Any, str | Driver]
 """A driver or its name, or a table from ids, names of classes and `default` to those."""
 
 DEFAULT = "default"
@@ -40,7 +41,7 @@ class Traffic:
         by_id: Mapping[int, int],
     ) -> None:
         """A table of indices into `drivers`."""
-        self._drivers = tuple(drivers)
+        self.drivers = tuple(drivers)
         self._of_class = np.full(len(AgentClass), default)
         for kind, number in by_class.items():
             self._of_class[kind] = number
@@ -60,17 +61,17 @@ class Traffic:
         if len(self._ids):
             at = np.searchsorted(self._ids, ids).clip(max=len(self._ids) - 1)
             number = np.where(self._ids[at] == ids, self._of_id[at], number)
-        self._masks = resized(self._masks, (len(self._drivers), *ids.shape))
-        dealt = driven & (number == np.arange(len(self._drivers))[:, None, None])
+        self._masks = resized(self._masks, (len(self.drivers), *ids.shape))
+        dealt = driven & (number == np.arange(len(self.drivers))[:, None, None])
         self._masks[:, where] = dealt[:, where]
-        for driver, theirs in zip(self._drivers, self._masks, strict=True):
+        for driver, theirs in zip(self.drivers, self._masks, strict=True):
             if theirs.any():
                 driver.reset(world, where, theirs.copy())
 
     def control(self, world: ReplayWorld) -> Control:
         """What all of them say, each of its own agents."""
         merged = idle(world.episodes.ids.shape)
-        for driver, theirs in zip(self._drivers, self._masks, strict=True):
+        for driver, theirs in zip(self.drivers, self._masks, strict=True):
             if theirs.any():
                 control = driver.control(world)
                 np.copyto(merged.actions, control.actions, where=control.driven[..., None])
@@ -102,18 +103,18 @@ def make_traffic(spec: TrafficSpec, *, dt_s: float = DEFAULT_DT_S) -> Driver:
     return _make_table({DEFAULT: "log", **spec}, dt_s)
 
 
-def _parse(text: str) -> dict[int | str, str | Driver]:
+def _parse(text: str) -> dict[str, str]:
     """`idm` stands for itself; `default=idm,17=log` for a table."""
-    table: dict[int | str, str | Driver] = {}
+    table: dict[str, str] = {}
     for pair in _NEXT_PAIR.split(text):
-        key, _, name = pair.partition("=")
+        key, _, name = (part.strip() for part in pair.partition("="))
         if key in table:
             raise AspEnvError(f"traffic {text!r} names {key!r} twice")
-        table[key.strip()] = name.strip()
+        table[key] = name
     return table
 
 
-def _make_table(spec: Mapping[int | str, str | Driver], dt_s: float) -> Traffic:
+def _make_table(spec: Mapping[Any, str | Driver], dt_s: float) -> Traffic:
     drivers: list[Driver] = []
     numbers: dict[str | int, int] = {}
     by_class: dict[AgentClass, int] = {}
@@ -126,10 +127,12 @@ def _make_table(spec: Mapping[int | str, str | Driver], dt_s: float) -> Traffic:
             drivers.append(make_traffic(value, dt_s=dt_s))
         if key == DEFAULT:
             default = numbers[name]
-        elif isinstance(key, int | np.integer) or key.isdigit():
+        elif isinstance(key, str) and not key.isdigit():
+            by_class[_vehicle_class(key)] = numbers[name]
+        elif int(key) >= 0:
             by_id[int(key)] = numbers[name]
         else:
-            by_class[_vehicle_class(key)] = numbers[name]
+            raise AspEnvError(f"traffic for {key}: expected {_KEYS}")
     return Traffic(drivers, default=default, by_class=by_class, by_id=by_id)
 
 

@@ -25,6 +25,17 @@ FIRST_KIND = 4
 
 @njit(cache=True, nogil=True)
 @no_type_check
+def _keep_within(values, low, high):
+    """Moves values into their bounds, NaN to the lower one; without bounds does nothing."""
+    # In this form the compiler makes vectors of it, which takes a fifth of the time of `np.clip`.
+    for i in range(len(low)):
+        value, least, most = values[i], low[i], high[i]
+        value = value if value >= least else least
+        values[i] = value if value <= most else most
+
+
+@njit(cache=True, nogil=True)
+@no_type_check
 def target_poses(states, valid, targets, poses):
     """Writes x, y and heading of every target now; of one that is not there, zeros.
 
@@ -44,7 +55,19 @@ def target_poses(states, valid, targets, poses):
 @njit(cache=True, nogil=True)
 @no_type_check
 def place_agents(
-    states, valid, sizes, classes, groups, ids, targets, frames, own_past, agents, agents_valid
+    states,
+    valid,
+    sizes,
+    classes,
+    groups,
+    ids,
+    targets,
+    frames,
+    own_past,
+    low,
+    high,
+    agents,
+    agents_valid,
 ):
     """Writes the agents of every target.
 
@@ -58,6 +81,8 @@ def place_agents(
         targets: (targets, 2) situation and slot.
         frames: (targets, 4) x, y, cos and sin of the targets now, float64.
         own_past: whether the targets are shown before now.
+        low: (agents · ticks · fields,) the least that is written, or nothing.
+        high: (agents · ticks · fields,) the most.
         agents: (targets, agents, ticks, fields), written.
         agents_valid: (targets, agents, ticks), written.
     """
@@ -96,6 +121,7 @@ def place_agents(
                 row[FIRST_GROUP:] = 0.0
                 row[group] = 1.0
         agents[t, count:], agents_valid[t, count:] = 0.0, False
+        _keep_within(agents[t].reshape(-1), low, high)
 
 
 @njit(cache=True, nogil=True)
@@ -134,7 +160,9 @@ def _choose_agents(states, valid, ids, ego, origin, chosen, distances):
 
 @njit(cache=True, nogil=True)
 @no_type_check
-def place_lines(middles, points, kinds, valid, targets, here, frames, lines, lines_valid):
+def place_lines(
+    middles, points, kinds, valid, targets, here, frames, low, high, lines, lines_valid
+):
     """Writes the lines of those targets that are on one map; of one that is not there, zeros.
 
     Args:
@@ -145,6 +173,8 @@ def place_lines(middles, points, kinds, valid, targets, here, frames, lines, lin
         targets: (targets, 2) situation and slot.
         here: (situations,) whether it is on this map.
         frames: (targets, 4) x, y, cos and sin of the targets now, float64.
+        low: (lines · points · fields,) the least that is written, or nothing.
+        high: (lines · points · fields,) the most.
         lines: (targets, lines, points, fields); those of the targets here are written.
         lines_valid: (targets, lines, points), the same.
     """
@@ -172,6 +202,7 @@ def place_lines(middles, points, kinds, valid, targets, here, frames, lines, lin
                 row[FIRST_KIND:] = 0.0
                 row[kind] = 1.0
         lines[t, len(chosen) :] = 0.0
+        _keep_within(lines[t].reshape(-1), low, high)
         lines_valid[t, : len(chosen)], lines_valid[t, len(chosen) :] = True, False
 
 

@@ -56,6 +56,18 @@ class Vectors(NamedTuple):
     lines_valid: Bool[np.ndarray, "n lines points"]
 
 
+class VectorBounds(NamedTuple):
+    """The least and the most of every number of what one target sees, float32; or nothing."""
+
+    agents_low: Float[np.ndarray, " agent_numbers"]
+    agents_high: Float[np.ndarray, " agent_numbers"]
+    lines_low: Float[np.ndarray, " line_numbers"]
+    lines_high: Float[np.ndarray, " line_numbers"]
+
+
+BOUNDLESS = VectorBounds(*(np.empty(0, dtype=np.float32) for _ in range(4)))
+
+
 @dataclass(frozen=True, slots=True, kw_only=True)
 class VectorShape:
     """The sizes of `Vectors`, without the number of targets."""
@@ -162,13 +174,16 @@ class VectorView:
             raise AspEnvError(f"configuration of the view {name!r}, expected {view.name!r}")
         return view
 
-    def draw(self, scene: Drawable, out: Vectors | None = None) -> Vectors:
+    def draw(
+        self, scene: Drawable, out: Vectors | None = None, within: VectorBounds = BOUNDLESS
+    ) -> Vectors:
         """What each target sees, in the order of `scene.targets`.
 
         Args:
             scene: with at least 15 past ticks.
             out: memory to write into, whose former content does not matter; fresh memory where it
                 is not given.
+            within: what lies outside is moved to the bounds.
 
         Raises:
             AspEnvError: the history is too short, or `out` does not fit.
@@ -197,6 +212,8 @@ class VectorView:
             targets,
             frames,
             self.own_past,
+            within.agents_low,
+            within.agents_high,
             out.agents,
             out.agents_valid,
         )
@@ -210,6 +227,8 @@ class VectorView:
                 targets,
                 scene.map_index == index,
                 frames,
+                within.lines_low,
+                within.lines_high,
                 out.lines,
                 out.lines_valid,
             )

@@ -9,6 +9,7 @@ from hypothesis import given
 from hypothesis.extra.numpy import arrays
 
 from asp_env.data.geometry import (
+    between_states,
     box_corners,
     from_frame,
     path_length,
@@ -53,6 +54,17 @@ def test_states_to_frame() -> None:
     poses = np.array([(10.0, 5.0, math.pi / 2, 0.0), (0.0, 0.0, -3.0, 0.0)])
     expected = [(4, 2, math.pi / 2, 7), (0, 0, 6 - 2 * math.pi, -1)]
     np.testing.assert_allclose(states_to_frame(states, poses), expected, atol=1e-12)
+
+
+def test_between_states() -> None:
+    """A quarter of the way; from 3 rad to -3 rad it turns on by 0.28, not back by 6."""
+    before = np.array([(0, 8, 3, 4), (1, 1, 0.5, 0)], dtype=np.float32)
+    after = np.array([(4, 0, -3, 8), (1, 1, 0.1, 0)], dtype=np.float32)
+    found = between_states(before, after, 0.25)
+    assert found.dtype == np.float32
+    expected = [(1, 6, 3 + (2 * math.pi - 6) / 4, 5), (1, 1, 0.4, 0)]
+    np.testing.assert_allclose(found, expected, rtol=1e-6)
+    assert np.array_equal(between_states(before, after, 0.0), before)
 
 
 def test_box_corners() -> None:

@@ -4,6 +4,7 @@ import dataclasses
 import json
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -165,6 +166,32 @@ def test_what_is_no_rollout(tmp_path: Path, write: Callable[[Path], None]) -> No
     path = tmp_path / "0.npz"
     write(path)
     assert "not a rollout that can be read" in refused(path)
+
+
+@pytest.mark.parametrize(
+    ("changes", "what"),
+    [
+        ({"valid": np.ones((4, 2), dtype=bool)}, "valid: 4 along 'ticks', expected 3"),
+        ({"sizes": np.ones((3, 2), dtype=np.float32)}, "sizes: 3 along 'a', expected 2"),
+        ({"states": np.zeros((3, 2, 4), dtype=np.int32)}, "states: int32"),
+        ({"plans": np.zeros((4, 4, 2), dtype=np.float32)}, "3 ticks, 2 agents, 4 plans"),
+        ({"forecast_slots": np.array([0, 1, 2])}, "forecast_slots: expected numbers from 0 to 1"),
+        ({"forecast_ticks": np.array([0, 1, -1])}, "forecast_ticks: expected numbers from 0 to 2"),
+        ({"classes": np.array([0, 99])}, "classes: expected numbers from 0 to 10"),
+        ({"events": np.zeros((3, 3), dtype=bool)}, "events: 3 along 'kinds', expected 2"),
+        ({"dt_s": float("nan")}, "time step nan"),
+        ({"dt_s": 0.0}, "time step 0.0"),
+    ],
+    ids=lambda value: next(iter(value)) if isinstance(value, dict) else None,
+)
+def test_parts_that_do_not_fit(tmp_path: Path, changes: dict[str, Any], what: str) -> None:
+    """Made or read: one line that names the part."""
+    path = tmp_path / "0.npz"
+    rollout = make_rollout()
+    for name, value in changes.items():
+        object.__setattr__(rollout, name, value)
+    rollout.save(path)
+    assert what in refused(path)
 
 
 def test_missing(tmp_path: Path) -> None:

@@ -44,6 +44,17 @@ def test_slots() -> None:
     np.testing.assert_allclose(scene.sizes[0, 9], [2.2, 0.8])
 
 
+def test_one_situation_alone() -> None:
+    """Of two ticks side by side the second is what it is by itself, but for padding."""
+    both = gather_scene([RECORDING], INDEX.select(np.isin(INDEX.tick, (36, 60))))
+    alone, expected = both.situation(1), scene_at(60)
+    names = ("states", "actions", "valid", "sizes", "classes", "ids")
+    agents = expected.ids.shape[1]
+    trimmed = {name: getattr(alone, name)[:, :agents] for name in names}
+    same(dataclasses.replace(alone, **trimmed), expected)
+    assert len(alone.targets) < len(both.targets)
+
+
 def test_first_target_is_first() -> None:
     """An index that starts with another track puts that one into slot 0."""
     at = INDEX.select(INDEX.tick == 36)

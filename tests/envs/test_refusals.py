@@ -20,7 +20,7 @@ from asp_env.errors import AspEnvError
         ({"dt_s": 0.15}, "does not divide recordings of 25 Hz"),
         ({"reward_weights": {"progres": 2.0}}, "unknown reward weight 'progres'"),
         ({"reward_weights": {"comfort": float("nan")}}, "expected a finite number"),
-        ({"render_mode": "human"}, "expected rgb_array or None"),
+        ({"render_mode": "ansi"}, "expected human, rgb_array or None"),
     ],
     ids=lambda value: next(iter(value)) if isinstance(value, dict) else None,
 )

@@ -20,6 +20,7 @@ from asp_env.errors import AspEnvError
 from asp_env.evaluation.closed_loop import ClosedLoop, Drive, drive
 from asp_env.evaluation.episodes import FORECAST_WITHIN_M, Driven, drive_episodes
 from asp_env.metrics.driving import driving_metrics
+from asp_env.metrics.presets import PDMS
 from asp_env.planning.planner import load_planner
 from asp_env.sim.world import Ending
 from predictors.physical import ConstantVelocity, Oracle
@@ -60,6 +61,7 @@ def _drive(
         scenarios,
         load_planner(planner),
         predictor,
+        preset=PDMS,
         traffic=traffic,
         horizon=15,
         history=HISTORY,
@@ -134,14 +136,26 @@ def test_episodes_side_by_side_equal_episodes_alone(recordings):
     predictor = ConstantVelocity(horizon=15, dt_s=DT_S)
     scenarios = _scenarios(recordings)[:6]
     together = _drive(recordings, scenarios, predictor, traffic="idm")
-    scores = driving_metrics(together.drives)["score"].value
+    scores = driving_metrics(together.drives, PDMS)["score"].value
     for b, each in enumerate(scenarios):
         alone = _drive(recordings, [each], predictor, traffic="idm")
         assert alone.endings.tolist() == together.endings[b : b + 1].tolist()
-        assert driving_metrics(alone.drives)["score"].value[0] == scores[b]
+        assert driving_metrics(alone.drives, PDMS)["score"].value[0] == scores[b]
         one, other = alone.rollouts[0], together.rollouts[b]
         for name in ("states", "valid", "plans", "forecast_states", "forecast_ticks", "events"):
             assert getattr(one, name).tobytes() == getattr(other, name).tobytes(), name
+
+
+def test_simulated_traffic_has_a_realism(recordings):
+    """From 0 to 1 where somebody was simulated; of replayed traffic there is none to speak of."""
+    scenarios = _scenarios(recordings)[:4]
+    predictor = ConstantVelocity(horizon=15, dt_s=DT_S)
+    simulated = _drive(recordings, scenarios, predictor, planner="expert", traffic="idm").realism
+    assert simulated["realism"].valid.any()
+    for each in simulated.values():
+        assert ((each.value[each.valid] > 0) & (each.value[each.valid] < 1)).all()
+    replayed = _drive(recordings, scenarios, predictor, planner="expert").realism
+    assert not any(each.valid.any() for each in replayed.values())
 
 
 def test_only_those_near_a_running_ego_are_forecast(recordings):
@@ -217,7 +231,7 @@ def test_a_blocked_way_is_no_collision(tmp_path):
     for planner in ("sampling", "idm"):
         driven = _drive(recordings, scenarios, ConstantVelocity(horizon=15, dt_s=DT_S), planner)
         assert set(driven.endings.tolist()) <= {Ending.OUT_OF_DATA, Ending.GOAL}
-        metrics = driving_metrics(driven.drives)
+        metrics = driving_metrics(driven.drives, PDMS)
         assert metrics["no at-fault collision"].value.tolist() == [1.0] * len(scenarios)
         assert metrics["no collision"].value.tolist() == [1.0] * len(scenarios)
 
@@ -249,6 +263,7 @@ def test_a_run_writes_its_folder(crossings, tmp_path):
         ({"most": 0}, "0 scenarios: expected at least 1"),
         ({"predictors": ()}, "none given"),
         ({"horizon": 0.1}, "no whole number of ticks"),
+        ({"metrics": "nuplna"}, r"unknown metrics 'nuplna' \(did you mean 'nuplan'"),
         ({"dt": 0.3}, "does not divide recordings of 25 Hz"),
     ],
     ids=lambda value: next(iter(value)) if isinstance(value, dict) else None,

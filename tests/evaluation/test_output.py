@@ -12,7 +12,7 @@ from asp_env.evaluation.output import Row, output_folder, write_manifest, write_
 
 COLUMNS = (
     "data,predictor,trained_on,view,preset,chaining,planner,traffic,latency_ticks,horizon_s,"
-    "selection,subset,metric,value,low,high,n"
+    "selection,subset,metric,value,low,high,n,rules"
 )
 
 
@@ -101,14 +101,15 @@ def test_metrics_are_in_the_contracts_columns(tmp_path):
             low=0.25,
             high=0.75,
             n=2,
+            rules="nuplan 1",
         ),
     ]
     write_metrics(tmp_path, rows)
     lines = (tmp_path / "metrics.csv").read_text().splitlines()
     assert lines == [
         COLUMNS,
-        '"x,y",oracle,,,,,,,,3,,all,FDE,0.333333,,,7',
-        "d,,,,,,idm,log,0,,,left,score,0.5,0.25,0.75,2",
+        '"x,y",oracle,,,,,,,,3,,all,FDE,0.333333,,,7,',
+        "d,,,,,,idm,log,0,,,left,score,0.5,0.25,0.75,2,nuplan 1",
     ]
     with (tmp_path / "metrics.csv").open(newline="") as file:
         assert [row["n"] for row in csv.DictReader(file)] == ["7", "2"]

@@ -2,9 +2,7 @@
 
 import json
 import re
-import shutil
 import time
-from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -20,7 +18,6 @@ from asp_env.evaluation.report.payload import MapTable, pictures_payload
 from tests.builders import make_recording
 from tests.evaluation.runs import make_examples, metric_rows, write_run, write_tables
 
-CHROMIUM, CHROMEDRIVER = shutil.which("chromium"), shutil.which("chromedriver")
 DRIVERS = ["sampling + constant-velocity", "sampling + ffw-asp"]
 
 
@@ -209,27 +206,6 @@ def test_without_plotly_the_extra_is_named(tmp_path: Path, monkeypatch: pytest.M
     monkeypatch.setattr("asp_env.evaluation.report.page.find_spec", lambda _: None)
     with pytest.raises(MissingExtraError, match=r"'plotly'.*asp-env\[report\]"):
         write_report(tmp_path, title="x")
-
-
-@pytest.fixture
-def browser(tmp_path: Path) -> Iterator[webdriver.Chrome]:
-    """A headless Chromium that logs its console and its requests."""
-    if CHROMIUM is None or CHROMEDRIVER is None:
-        pytest.skip("chromium and chromedriver are not installed")
-    options = webdriver.ChromeOptions()
-    options.binary_location = CHROMIUM
-    for switch in (
-        "headless=new", "no-sandbox", "disable-gpu", "disable-quic", "no-first-run",
-        "disable-background-networking", "disable-component-update", "disable-sync",
-        "disable-dev-shm-usage", "window-size=1400,1000", f"user-data-dir={tmp_path / 'profile'}",
-    ):  # fmt: skip
-        options.add_argument(f"--{switch}")
-    options.set_capability("goog:loggingPrefs", {"browser": "ALL", "performance": "ALL"})
-    driver = webdriver.Chrome(options, webdriver.ChromeService(CHROMEDRIVER))
-    try:
-        yield driver
-    finally:
-        driver.quit()
 
 
 def requests(browser: webdriver.Chrome) -> list[str]:

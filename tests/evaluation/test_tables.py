@@ -2,12 +2,16 @@
 
 import io
 
+import pytest
 from rich.console import Console
 from rich.table import Table
 
 from asp_env.evaluation.entrants import short_names
 from asp_env.evaluation.output import Row
 from asp_env.evaluation.tables import driving_table, open_loop_tables
+from asp_env.metrics.presets import PDMS, PRESETS
+
+SHOWN = PDMS.shown
 
 
 def _printed(table: Table) -> list[str]:
@@ -67,6 +71,20 @@ def test_where_nobody_moves_all_are_shown():
     assert "1.00 [0.90, 1.10]" in lines[-1]
 
 
+@pytest.mark.parametrize("preset", PRESETS.values(), ids=PRESETS)
+def test_every_preset_fits(preset):
+    """80 columns, with a score where it has one, and its name and version above."""
+    names = [*(["score"] if preset.weights else []), *preset.shown]
+    rows = [
+        _row(name, 0.5, planner="sampling", predictor="constant-velocity", rules=preset.label)
+        for name in names
+    ]
+    lines = _printed(driving_table(rows, (), preset.shown))
+    assert max(len(line) for line in lines) <= 80
+    assert f"driving by {preset.label}" in lines[0]
+    assert sum(line.count("0.50") for line in lines) == len(names)
+
+
 def test_driving_table_keeps_the_order_and_80_columns():
     """A line for each driver as they came, empty where a metric is missing."""
     rows = [
@@ -74,7 +92,7 @@ def test_driving_table_keeps_the_order_and_80_columns():
         _row("score", 0.5, planner="sampling", predictor="oracle"),
         _row("comfort", 0.25, planner="sampling", predictor="oracle", n=9),
     ]
-    lines = _printed(driving_table(rows))
+    lines = _printed(driving_table(rows, (), SHOWN))
     assert max(len(line) for line in lines) <= 80
     assert lines[-2].split()[0] == "expert"
     assert "0.25" not in lines[-2]
@@ -89,7 +107,7 @@ def test_two_runs_of_one_predictor_are_two_lines():
         _row("score", value, planner="sampling", predictor=f"ffw-asp:runs/{name}")
         for name, value in (("a", 0.25), ("b", 0.75))
     ]
-    lines = _printed(driving_table(rows))
+    lines = _printed(driving_table(rows, (), SHOWN))
     assert "ffw-asp a" in lines[-2]
     assert "0.25" in lines[-2]
     assert "ffw-asp b" in lines[-1]
@@ -99,7 +117,7 @@ def test_two_runs_of_one_predictor_are_two_lines():
 def test_no_interval_without_bounds():
     """One recording: the value alone."""
     rows = [_row("score", 0.9, planner="expert", low=None, high=None)]
-    assert "[" not in _printed(driving_table(rows))[-1]
+    assert "[" not in _printed(driving_table(rows, (), SHOWN))[-1]
 
 
 def test_short_names_are_as_short_as_they_can_be():
@@ -113,7 +131,7 @@ def test_short_names_are_as_short_as_they_can_be():
 def test_who_knows_the_future_is_marked():
     """A star behind the name and a caption that explains it, whatever the plug is called."""
     rows = [_row("score", 0.9, planner="prophet"), _row("score", 0.5, planner="sampling")]
-    lines = _printed(driving_table(rows, ["prophet"]))
+    lines = _printed(driving_table(rows, ["prophet"], SHOWN))
     assert any(line.startswith("prophet *") for line in lines)
     assert "* knows the recorded future" in lines[-1]
     assert not any(line.startswith("sampling *") for line in lines)

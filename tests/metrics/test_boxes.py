@@ -1,4 +1,4 @@
-"""Contacts and time to collision with boxes placed by hand; laws on generated boxes."""
+"""Contacts with boxes placed by hand; laws on generated boxes."""
 
 import math
 
@@ -15,7 +15,6 @@ from asp_env.metrics.boxes import (
     Contact,
     ego_contacts,
     overlaps,
-    time_to_collision,
     touching_trailers,
 )
 
@@ -42,15 +41,6 @@ def contacts(
     found = ego_contacts(states, sizes, np.ones(states.shape[:2], dtype=bool))
     assert found[0, 0] == Contact.NONE  # the ego does not meet itself
     return [Contact(kind) for kind in found[0, 1:]]
-
-
-def seconds(*others: State, ego: State = EGO, touching: tuple[bool, ...] = ()) -> float:
-    """The time to collision of the ego with other cars."""
-    states = placed(*others, ego=ego)
-    valid = np.ones(states.shape[:2], dtype=bool)
-    met = np.array([[False, *(touching or (False,) * len(others))]])
-    (found,) = time_to_collision(states, np.full((*valid.shape, 2), CAR), valid, met)
-    return float(found)
 
 
 @pytest.mark.parametrize("at", [(0.0, 0.0, 0.0, 0.0), (100.0, -30.0, 2.0, 0.0)])
@@ -142,56 +132,11 @@ def test_touching_trailers(ego: AgentClass, other: AgentClass, x: float, expecte
 
 
 def test_the_absent_touch_nobody() -> None:
-    """Neither an invalid other nor an invalid ego has a contact or a time to one."""
+    """Neither an invalid other nor an invalid ego has a contact."""
     states = np.repeat(placed((3.5, 0.0, 0.0, 5.0)), 2, axis=0)
     sizes = np.full((2, 2, 2), CAR)
     valid = np.array([(True, False), (False, True)])
     assert not ego_contacts(states, sizes, valid).any()
-    assert np.isinf(time_to_collision(states, sizes, valid, np.zeros((2, 2), dtype=bool))).all()
-
-
-@pytest.mark.parametrize(
-    ("other", "expected"),
-    [
-        ((13.95, 0.0, 0.0, 0.0), 1.0),  # 9.95 m between bumpers at 10 m/s: 0.995 s
-        ((13.95, 0.0, math.pi, 10.0), 0.5),  # the same, closing at 20 m/s: 0.4975 s
-        ((13.95, 0.0, 0.0, 5.0), 2.0),  # closing at 5 m/s: 1.99 s
-        ((13.95, 0.0, 0.0, 10.0), math.inf),  # equally fast
-        ((33.95, 0.0, 0.0, 0.0), 3.0),  # 29.95 m: 2.995 s
-        ((34.05, 0.0, 0.0, 0.0), math.inf),  # 30.05 m: beyond 3 s
-        ((13.95, 2.05, 0.0, 0.0), math.inf),  # we pass it by 5 cm
-        ((5.0, 4.95, -math.pi / 2, 5.0), 0.4),  # crosses: its nose 1.95 m from our way, 0.39 s
-        ((-8.0, 0.0, 0.0, 30.0), math.inf),  # behind our rear bumper does not count
-        ((-1.9, 5.95, -math.pi / 2, 10.0), math.inf),  # reaches us in 0.295 s, we are gone in 0.1 s
-    ],
-)
-def test_time_to_collision(other: State, expected: float) -> None:
-    """Worked out by hand, rounded up to the next 0.1 s."""
-    assert seconds(other) == pytest.approx(expected)
-
-
-def test_from_the_side_of_a_slow_ego() -> None:
-    """Its nose is 0.95 m above our side at 10 m/s: 0.095 s; with its centre behind us, never."""
-    slow = (0.0, 0.0, 0.0, 1.0)
-    assert seconds((-1.9, 3.95, -math.pi / 2, 10.0), ego=slow) == pytest.approx(0.1)
-    assert seconds((-2.1, 3.95, -math.pi / 2, 10.0), ego=slow) == math.inf
-
-
-def test_first_of_several() -> None:
-    """The soonest counts, whatever the order."""
-    near, far = (13.95, 0.0, 0.0, 0.0), (23.95, 0.0, 0.0, 0.0)
-    assert seconds(near, far) == seconds(far, near) == pytest.approx(1.0)
-    assert seconds(near, far, touching=(True, False)) == pytest.approx(2.0)
-
-
-@pytest.mark.parametrize(("speed", "expected"), [(0.05, math.inf), (0.06, 0.9)])
-def test_standing_ego(speed: float, expected: float) -> None:
-    """A standing ego has no time to collision, even with one that comes at it.
-
-    8.95 m at 10 + 0.06 m/s take 0.8897 s.
-    """
-    oncoming = (12.95, 0.0, math.pi, 10.0)
-    assert seconds(oncoming, ego=(0.0, 0.0, 0.0, speed)) == pytest.approx(expected)
 
 
 def boxes() -> SearchStrategy[Box]:
@@ -227,3 +172,14 @@ def test_a_box_within_a_box(box: Box, share: float) -> None:
     x, y, heading, length, width = box
     assert overlaps(*box, x, y, heading + share, share * length, share * width)
     assert overlaps(*box, x, y, heading, 0.0, width)
+
+
+@given(kinds=st.lists(st.sampled_from(list(Contact)), min_size=2, max_size=2))
+def test_a_contact_that_lasts_keeps_its_kind(kinds: list[Contact]) -> None:
+    """Only where there is one still; a new one is classed anew."""
+    touching, apart = (3.5, 0.0, 0.0, 5.0), (30.0, 0.0, 0.0, 5.0)
+    states = placed(touching, apart)
+    sizes, valid = np.full((1, 3, 2), CAR), np.ones((1, 3), dtype=bool)
+    before = np.array([[Contact.NONE, *kinds]], dtype=np.int8)
+    (found,) = ego_contacts(states, sizes, valid, before)
+    assert found.tolist() == [0, kinds[0] or Contact.FRONT, 0]

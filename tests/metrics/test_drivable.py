@@ -10,7 +10,13 @@ from hypothesis.extra.numpy import arrays
 
 from asp_env.data.road_map import Ragged, RoadMap
 from asp_env.errors import DataError
-from asp_env.metrics.drivable import OFF_ROAD_M, drivable_field, off_road_m
+from asp_env.metrics.drivable import (
+    OFF_ROAD_M,
+    beyond_log_m,
+    drivable_field,
+    log_off_road_m,
+    off_road_m,
+)
 
 
 def map_of(*rings: list[tuple[float, float]]) -> RoadMap:
@@ -101,3 +107,55 @@ def test_nothing_drivable() -> None:
     """A map without drivable area is refused in a line that names it."""
     with pytest.raises(DataError, match="map by hand: no drivable area"):
         outside_m(0.0, 0.0, road_map=map_of())
+
+
+def straight(y_m: float) -> np.ndarray:
+    """(31, 4) a log from x = 2 to 32 at a height, on a square whose edges are x = 20 and y = 0."""
+    states = np.zeros((31, 4))
+    states[:, 0], states[:, 1], states[:, 3] = 2 + np.arange(31), y_m, 5.0
+    return states
+
+
+def test_where_a_log_is_off_the_road() -> None:
+    """It leaves the square ahead: its front passes 20.3 m at x = 18.3, so first at the tick x = 19.
+
+    That is 17 m along its route, so from 12 m on something is excused: within 5 m of a point the
+    furthest. At 12 m that is what the tick at 17 m is off, 21 - 20 m; at 14 m that at 19 m, 3 m.
+    """
+    log = straight(10.0)
+    found = log_off_road_m(SQUARE, log, CAR, log[:, :2])
+    np.testing.assert_allclose(found[[0, 11, 12, 14]], [0, 0, 1, 3], atol=0.1)
+    assert found[30] == 5  # the margin
+    on_road = straight(10.0)[:15]
+    assert not log_off_road_m(SQUARE, on_road, CAR, on_road[:, :2]).any()
+
+
+def test_a_log_at_the_edge_excuses_nothing() -> None:
+    """Up to 0.3 m outside is on the road, and so no gap."""
+    for y_m, excused in ((0.9, 0.0), (0.4, 0.6)):  # its side is 0.1 or 0.6 m outside
+        log = straight(y_m)[:10]
+        found = log_off_road_m(SQUARE, log, CAR, log[:, :2])
+        assert found.max() == pytest.approx(excused, abs=0.1)
+
+
+@pytest.mark.parametrize(
+    ("outside_m", "arc_m", "offset_m", "expected"),
+    [
+        (2.0, 1.0, 0.0, 2.0),  # nothing is excused there
+        (2.0, 2.0, 0.0, 0.5),
+        (2.0, 1.6, 0.0, 0.5),  # the nearest point of the route is the one at 2 m
+        (1.0, 2.0, 0.0, 0.0),
+        (2.0, 2.0, 2.0, 0.5),
+        (2.0, 2.0, -2.1, 2.0),  # too far beside the log's way
+        (2.0, -9.0, 0.0, 2.0),
+        (2.0, 99.0, 0.0, 1.0),  # behind the end as at the end
+    ],
+)
+def test_beyond_the_log(outside_m: float, arc_m: float, offset_m: float, expected: float) -> None:
+    """A log that is 1.5 m off the road at 2 m and 1 m at the route's end, 3 m."""
+    found = beyond_log_m(
+        np.array([outside_m]),
+        np.array([[arc_m, offset_m, 0.0]]),
+        np.array([[0.0, 0.0, 1.5, 1.0]]),
+    )
+    assert found[0] == pytest.approx(expected)

@@ -15,7 +15,8 @@ from asp_env.data.recording import Background
 from asp_env.data.scene import Scene
 from asp_env.errors import AspEnvError, DataError
 from asp_env.render import ground
-from asp_env.render.frames import CLASS_COLOURS, EDGE, EGO, EGO_EDGE, FORECAST, draw_frame
+from asp_env.render.canvas import SHADE
+from asp_env.render.frames import CLASS_COLOURS, EGO_COLOUR, EGO_EDGE, FORECAST, draw_frame
 from asp_env.render.ground import GROUND, PHOTO_STRENGTH, ROAD, draw_ground
 from tests.builders import make_map
 
@@ -80,7 +81,7 @@ def test_places_and_colours() -> None:
     )
     image = draw_frame(scene, **SIZE)
     assert image.shape == (400, 400, 3)
-    assert pixel(image, 0, 0) == EGO
+    assert pixel(image, 0, 0) == EGO_COLOUR
     assert pixel(image, 10, 1) == CLASS_COLOURS[AgentClass.TRUCK]
     assert pixel(image, 0, 10) == CLASS_COLOURS[AgentClass.PEDESTRIAN]
     assert pixel(image, 0, -10) == GROUND  # the road is 7 m wide
@@ -92,12 +93,12 @@ def test_a_box_has_its_length_along_its_heading_and_a_wedge_at_its_front() -> No
     """Heading +y: 4 m up, 2 m wide, dark wedge in the upper half and none in the lower."""
     scene = make_scene((AgentClass.CAR, 50.0, 40.0, np.pi / 2))
     image = draw_frame(scene, **SIZE)
-    assert pixel(image, 0, 1.2) == EDGE
-    assert pixel(image, 0, -1.2) == EGO
-    assert pixel(image, 0.8, -1.8) == EGO
+    assert pixel(image, 0, 1.2) == SHADE
+    assert pixel(image, 0, -1.2) == EGO_COLOUR
+    assert pixel(image, 0.8, -1.8) == EGO_COLOUR
     assert pixel(image, 1.3, 0) == GROUND
     assert pixel(image, 0, 2.3) == GROUND
-    assert pixel(image, 0, -1.97)[0] > (EGO[0] + EGO_EDGE[0]) / 2
+    assert pixel(image, 0, -1.97)[0] > (EGO_COLOUR[0] + EGO_EDGE[0]) / 2
 
 
 def test_equal_arguments_give_equal_bits() -> None:
@@ -187,7 +188,7 @@ def test_the_whole_map_is_shown_without_an_extent() -> None:
     scale = 500 / 200 / 1.06
     for x, y in ((95, -2), (-95, 2), (2, 95), (-2, -95)):
         assert pixel(image, x, y, scale=scale) == ROAD
-    assert pixel(image, 90, 1, scale=scale) == EGO
+    assert pixel(image, 90, 1, scale=scale) == EGO_COLOUR
 
 
 def test_a_photograph_lies_where_its_scale_says(tmp_path: Path) -> None:
@@ -219,3 +220,42 @@ def test_what_cannot_be_drawn_is_refused(tmp_path: Path) -> None:
         draw_frame(scene, extent_m=0.0)
     with pytest.raises(DataError, match="not a picture that can be read"):
         draw_frame(scene, background=Background(path=tmp_path / "no.png", metres_per_pixel=0.1))
+
+
+def test_people_are_never_too_small_to_be_seen() -> None:
+    """At 1 pixel a metre a pedestrian is 8 pixels wide with its dark edge, and has no wedge."""
+    scene = make_scene((AgentClass.CAR, 0.0, 0.0, 0.0), (AgentClass.PEDESTRIAN, 20.0, 0.0, 0.0))
+    image = draw_frame(scene, size_px=(100, 100), extent_m=100.0)
+    people = (image == CLASS_COLOURS[AgentClass.PEDESTRIAN]).all(axis=-1)
+    rows, columns = np.nonzero(people)
+    assert 16 <= len(rows) <= 36
+    assert np.abs(rows - 49.5).max() <= 3
+    assert np.abs(columns - 69.5).max() <= 3
+
+
+def test_the_road_goes_on_beyond_the_photograph(tmp_path: Path) -> None:
+    """A photograph of 10 m by 10 m below the crossing: the road in the north keeps its colour."""
+    path = tmp_path / "00_background.png"
+    assert cv2.imwrite(str(path), np.full((100, 100, 3), 255, dtype=np.uint8))
+    background = Background(path=path, metres_per_pixel=0.1)
+    scene = make_scene((AgentClass.CAR, -20.0, 1.75, 0.0))
+    image = draw_frame(scene, background=background, **SIZE)
+    assert pixel(image, 10, 0) == ROAD
+    scene = make_scene((AgentClass.CAR, 0.0, 1.75, 0.0))
+    image = draw_frame(scene, background=background, **SIZE)
+    assert pixel(image, 5, -3.0)[0] > 150
+
+
+def test_of_an_earlier_forecast_the_rest_is_shown() -> None:
+    """Ten steps of 2 m to the north, said 3 ticks ago: the first point is the fourth, at 8 m."""
+    scene = make_scene((AgentClass.CAR, 50.0, 40.0, np.pi / 2))
+    forecast = forecast_of(scene, (1.0,))
+    late = dataclasses.replace(forecast, tick=forecast.tick - 3)
+    bent = late.states.copy()
+    bent[:, :, :3, 0] += 30.0
+    assert np.array_equal(
+        draw_frame(scene, forecast=late, **SIZE),
+        draw_frame(scene, forecast=dataclasses.replace(late, states=bent), **SIZE),
+    )
+    gone = dataclasses.replace(forecast, tick=forecast.tick - 10)
+    assert np.array_equal(draw_frame(scene, forecast=gone, **SIZE), draw_frame(scene, **SIZE))

@@ -96,12 +96,25 @@ def test_alone_a_vehicle_reaches_the_speed_it_once_had():
 @pytest.mark.parametrize("appears_s", [0.0, 1.0], ids=["parked", "waiting"])
 def test_stops_behind_a_standing_car_at_the_standstill_gap(appears_s):
     """2 m between the bumpers, and up to 1 m more, since gaps are looked for metre by metre."""
-    recording = on_road(car(-90, 10), car(10, 0, appears_s=appears_s))
+    recording = on_road(car(-90, 10), car(-12, 0, appears_s=appears_s))
     simulation = simulate(recording, scenario(length=80), "idm")
     replay(simulation, 80)
     follower = _state(simulation, 2)
     assert follower[3] == pytest.approx(0.0, abs=0.02)
-    assert 1.9 < 10 - follower[0] - CAR_M < 3.1
+    assert 1.9 < -12 - follower[0] - CAR_M < 3.1
+
+
+def test_keeps_the_way_of_the_ego_clear():
+    """Somebody stands behind the crossing, at x = 10 m, and leaves no room there for another one.
+
+    The ego comes up the road at x = 1.75 m: the car halts a metre before its side at least.
+    """
+    recording = on_road(car(-90, 10), car(10, 0, appears_s=1.0))
+    simulation = simulate(recording, scenario(length=70), "idm")
+    replay(simulation, 70)
+    follower = _state(simulation, 2)
+    assert follower[3] == pytest.approx(0.0, abs=0.02)
+    assert -7.0 < follower[0] + CAR_M / 2 < 0.85 - 1.0
 
 
 def test_a_vehicle_that_waits_until_its_log_ends_stays():
@@ -235,8 +248,8 @@ def test_steering_follows_a_circle():
     path = np.stack([20 * np.sin(angle), 20 * (1 - np.cos(angle))], axis=-1)
     slip = math.asin(1.35 / 20)
     # the heading of the box is the course less the slip
-    steering = pursuit_steering(0.0, 0.0, 0.0, 6.0, 4.5, path, len(path), 0.0, 0.0)
+    steering = pursuit_steering(0.0, 0.0, -slip, 6.0, 4.5, path, len(path), 0.0, 0.0)
     assert steering == pytest.approx(math.atan(2 * math.tan(slip)), rel=0.03)
     mirrored = path * [1, -1]
-    other = pursuit_steering(0.0, 0.0, 0.0, 6.0, 4.5, mirrored, len(path), 0.0, 0.0)
+    other = pursuit_steering(0.0, 0.0, slip, 6.0, 4.5, mirrored, len(path), 0.0, 0.0)
     assert other == pytest.approx(-steering)

@@ -15,7 +15,7 @@ DT_S = 0.2
 HISTORY = 15
 
 TRAFFICS = (
-    *("log", "log-actions", "idm", "policy"),
+    *("log", "log-actions", "idm", "hybrid", "policy"),
     *("predictor:constant-turn-rate", "predictor:every=3:mode=sampled:oracle"),
     "default=idm,truck=log-actions,4=policy,6=predictor:constant-velocity",
 )

@@ -88,7 +88,7 @@ NOTES = {
         "Score",
         "%",
         "higher",
-        "No fault times on road times (5 progress + 5 TTC + 2 comfort) / 12, as in NAVSIM's PDMS.",
+        "The score of the preset that judged: its multipliers times its weighted mean, 0 to 100 %.",
     ),
     "score - constant-velocity": _note(
         "Score - CV",
@@ -100,24 +100,59 @@ NOTES = {
         "No fault",
         "%",
         "higher",
-        "Drives in which the ego hit nobody standing, nobody at its front and nobody at its side; "
-        "being hit from behind, or while standing, is no fault.",
+        "Drives in which the ego hit nobody standing, nobody at its front and nobody at its side, "
+        "by the preset's rule; being hit from behind, or while standing, is no fault.",
     ),
     "no collision": _note(
         "No contact", "%", "higher", "Drives in which the ego's box met nobody else's at all."
     ),
     "on road": _note(
-        "On road", "%", "higher", "Drives without a corner over 0.3 m outside the drivable area."
+        "On road",
+        "%",
+        "higher",
+        "Drives without a corner further outside the drivable area than preset and log allow.",
+    ),
+    "on mapped road": _note(
+        "On the map", "%", "higher", "The same where the log's own way off the map excuses nothing."
     ),
     "progress": _note(
         "Progress", "%", "higher", "Way made good, as a share of the recorded ego's."
     ),
-    "TTC": _note("TTC", "%", "higher", "Drives that always kept 0.95 s to any collision."),
+    "making progress": _note(
+        "Makes way", "%", "higher", "Drives over at least a fifth of the recorded ego's way."
+    ),
+    "TTC": _note(
+        "TTC", "%", "higher", "Drives that always kept their time to any collision above 0.95 s."
+    ),
+    "direction": _note(
+        "Direction", "%", "higher", "100 % up to 2 m against the traffic within 1 s, 0 above 6 m."
+    ),
+    "right way": _note(
+        "Right way", "%", "higher", "Drives that stayed within 3.5 m of a way on from their start."
+    ),
+    "speed": _note(
+        "Speed limit", "%", "higher", "1 less the mean overspeed over 2.23 m/s, at least 0."
+    ),
+    "feasible": _note(
+        "Feasible", "%", "higher", "Drives within Waymax's bounds of acceleration and curvature."
+    ),
+    "no hit from behind": _note(
+        "No rear hit", "%", "higher", "Drives in which nobody ran into the ego from behind."
+    ),
     "comfort": _note(
         "Comfort", "%", "higher", "Drives within nuPlan's bounds of acceleration, jerk and yaw."
     ),
     "log divergence": _note(
         "Off the log", "m", "neither", "Mean distance between the ego and the recorded one."
+    ),
+    "realism": _note(
+        "Realism",
+        "%",
+        "higher",
+        "How likely the recorded traffic is under the simulated one, by the weights of WOSAC 2025.",
+    ),
+    "route deviation": _note(
+        "Off the route", "m", "neither", "Mean distance to the way that the recorded ego took."
     ),
 }
 """By name in `metrics.csv`."""

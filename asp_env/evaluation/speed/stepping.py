@@ -20,7 +20,7 @@ HISTORY = 15
 LENGTH = 40
 CROWD_S = 12.0
 STATE_BYTES = 4 * np.dtype(np.float32).itemsize
-TRAFFIC = ("log", "log-actions", "idm", "idm")
+TRAFFIC = ("log", "log-actions", "idm", "hybrid")
 UNIT = "episode-steps/s"
 
 

@@ -22,21 +22,27 @@ MOST_ZONES = 4
 SHIFT = 2**31
 """The key of a pair of paths is the smaller number times this, plus the larger one."""
 
-IN_A, OUT_A, IN_B, OUT_B, IN_FILE, A_FIRST = range(6)
+IN_A, OUT_A, IN_B, OUT_B, IN_FILE, AHEAD_B, A_FIRST = range(7)
 """Columns of a zone: arc lengths of the centres on either path, m, between which the boxes can
-touch; whether the paths then lead the same way; whether the first was there first in the log."""
+touch; whether the paths then lead the same way, and by how much the second's arc length then is the
+larger one at the same place; whether the first was there first in the log."""
+
+COLUMNS = 7
 
 
 @njit(cache=True)
 @no_type_check
 def _touching(path, size, i, other, size_o, last_o, touch):
-    """(first, last) point of the other path where boxes touch, cosine between, clearance at least."""
+    """(first, last) touching point of the other path, the nearest one, cosine, least clearance."""
     x, y, ux, uy = path[i]
     first, last, along, nearest = -1, -1, -1.0, np.inf
+    beside, closest = 0, np.inf
     j, before, skipped = 0, np.inf, 0
     while j <= last_o:
         xo, yo, vx, vy = other[j]
         away = np.hypot(xo - x, yo - y) - touch
+        if away < closest:
+            beside, closest = j, away
         # points are 1 m apart: so near may one of those have been that were skipped
         nearest = min(nearest, 0.5 * (away + before - skipped), away)
         before, skipped = away, max(1, int(away))
@@ -49,7 +55,7 @@ def _touching(path, size, i, other, size_o, last_o, touch):
             last = j
             along = max(along, ux * vx + uy * vy)
         j += 1
-    return first, last, along, min(nearest, before - skipped)
+    return first, last, beside, along, min(nearest, before - skipped)
 
 
 @njit(cache=True)
@@ -59,14 +65,14 @@ def _meet(path, size, last_a, other, size_o, last_o, zones):
     touch = 0.5 * (np.hypot(size[0], size[1]) + np.hypot(size_o[0], size_o[1]))
     count, i, inside, at_end = 0, 0, False, 0.0
     while i <= last_a and count < len(zones):
-        first, last, along, nearest = _touching(path, size, i, other, size_o, last_o, touch)
+        first, last, beside, along, nearest = _touching(path, size, i, other, size_o, last_o, touch)
         zone = zones[count]
         if first >= 0:
             if not inside:
                 inside = True
                 zone[IN_A], zone[IN_B], zone[OUT_B] = i, first, last
                 zone[IN_FILE] = along > ALONG
-            zone[OUT_A] = i
+            zone[OUT_A], zone[AHEAD_B] = i, beside - i
             zone[IN_B], zone[OUT_B] = min(zone[IN_B], first), max(zone[OUT_B], last)
             at_end = along
             i += 1
@@ -110,16 +116,21 @@ def _find(pairs, points, firsts, ends, sizes, arcs, rows, frames, zones, counts)
 
 @njit(cache=True)
 @no_type_check
+def _tell(zone, turned, you, mine, others, k):
+    """Notes a zone down if there is room; how many there are now."""
+    if k < len(mine):
+        mine[k], others[k] = -1 - zone if turned else zone, you
+    return k + 1
+
+
+@njit(cache=True)
+@no_type_check
 def _deal(
     numbers, deciding, arcs, keys, firsts, found, zones, episodes, mine, others, counts
 ):  # fmt: skip
-    """Gives each deciding agent of some episodes the zones that lie ahead, in the slots' order.
-
-    A zone that is told to the second of its pair is numbered -1 - number.
-    """
+    """Gives each deciding agent of some episodes the zones that lie ahead, in the slots' order."""
     for b in episodes:
-        for a in range(numbers.shape[1]):
-            counts[b, a] = 0
+        counts[b] = 0
         for a in range(numbers.shape[1]):
             for o in range(a + 1, numbers.shape[1]):
                 one, two = numbers[b, a], numbers[b, o]
@@ -133,13 +144,12 @@ def _deal(
                     out_o = zones[z, OUT_A] if swapped else zones[z, OUT_B]
                     if arcs[b, a] > out_a or arcs[b, o] > out_o:
                         continue
-                    for me, you, turned in ((a, o, swapped), (o, a, not swapped)):
-                        if not deciding[b, me]:
-                            continue
-                        k = counts[b, me]
-                        if k < mine.shape[2]:
-                            mine[b, me, k], others[b, me, k] = -1 - z if turned else z, you
-                        counts[b, me] += 1
+                    if deciding[b, a]:
+                        counts[b, a] = _tell(z, swapped, o, mine[b, a], others[b, a], counts[b, a])
+                    if deciding[b, o]:
+                        counts[b, o] = _tell(
+                            z, not swapped, a, mine[b, o], others[b, o], counts[b, o]
+                        )
 
 
 class Conflicts:
@@ -152,7 +162,7 @@ class Conflicts:
         self._firsts = np.zeros(0, dtype=np.int64)
         self._counts = np.zeros(0, dtype=np.int64)
         """The pair of `_keys[i]`, which rises, has so many zones from `_firsts[i]` on."""
-        self.zones = np.zeros((0, 6), dtype=np.float32)
+        self.zones = np.zeros((0, COLUMNS), dtype=np.float32)
 
     def __deepcopy__(self, memo: dict[int, Any]) -> "Conflicts":
         """Itself."""
@@ -195,7 +205,7 @@ class Conflicts:
         if not len(new):
             return
         pairs = np.stack([new // SHIFT, new % SHIFT], axis=-1)
-        zones = np.zeros((len(pairs), MOST_ZONES, 6), dtype=np.float32)
+        zones = np.zeros((len(pairs), MOST_ZONES, COLUMNS), dtype=np.float32)
         counts = np.zeros(len(pairs), dtype=np.int64)
         paths = self._paths
         _find(

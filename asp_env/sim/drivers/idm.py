@@ -27,8 +27,8 @@ class IDMDriver:
         """A driver with the given parameters, or the default ones."""
         self.idm = idm or IDM()
         self._paths = Paths(self.idm)
-        self._conflicts = Conflicts(self._paths)
-        self._ahead = Ahead()
+        self.conflicts = Conflicts(self._paths)
+        self.ahead = Ahead()
         self._mine = np.zeros((0, 0), dtype=bool)
         self._numbers = np.zeros((0, 0), dtype=np.int64)
         """Of the agents' paths; -1 for those without."""
@@ -57,7 +57,7 @@ class IDMDriver:
     ) -> None:
         """Takes the paths of the new episodes' agents from their recordings."""
         self._mine = vehicles(world) if mine is None else mine
-        self._fit(world)
+        self._fit()
         episodes, paths = world.episodes, self._paths
         for number in np.unique(episodes.recording[where]).tolist():
             recording = world.recordings[number]
@@ -71,7 +71,7 @@ class IDMDriver:
         self._rows[where] = frames - paths.first_frames[numbers]
         at = paths.rows[numbers] + np.maximum(self._rows[where], 0)
         self._arcs[where] = paths.arcs[np.minimum(at, paths.rows[numbers + 1] - 1)]
-        self._conflicts.deal(self._numbers, self._mine, self._arcs, where, self._ahead)
+        self.conflicts.deal(self._numbers, self._mine, self._arcs, where, self.ahead)
         self._arcs[where] = -1.0
 
     def control(self, world: ReplayWorld) -> Control:
@@ -84,7 +84,7 @@ class IDMDriver:
 
     def drive(self, world: ReplayWorld, some: Bool[np.ndarray, "b a"]) -> Control:
         """The same for some of its agents, while the others are moved by somebody else."""
-        episodes, paths, ahead = world.episodes, self._paths, self._ahead
+        episodes, paths, ahead = world.episodes, self._paths, self.ahead
         rows, now = np.arange(len(world)), world.now
         out = idle(self._mine.shape)
         driven = some & episodes.valid[rows, now]
@@ -92,7 +92,7 @@ class IDMDriver:
             episodes.states, episodes.valid, episodes.sizes, now,
             episodes.elapsed < episodes.length, driven, self._numbers, self._rows, self._strides,
             episodes.elapsed, self._arcs, paths.points, paths.limits, paths.firsts, paths.arcs,
-            paths.rows, self._conflicts.zones, ahead.zones, ahead.others, ahead.counts,
+            paths.rows, self.conflicts.zones, ahead.zones, ahead.others, ahead.counts,
             self.idm.as_row(), world.dt_s, out.actions,
         )  # fmt: skip
         ends = np.where(self._numbers >= 0, paths.ends[self._numbers], np.inf)
@@ -101,7 +101,7 @@ class IDMDriver:
         leaving = driven & (self._arcs >= ends - HALTED_M * halts) & ~waits
         return Control(actions=out.actions, driven=driven & ~leaving, leaving=leaving)
 
-    def _fit(self, world: ReplayWorld) -> None:
+    def _fit(self) -> None:
         shape = self._mine.shape
         self._strides = resized(self._strides, shape[:1])
         for name in ("_numbers", "_rows", "_arcs"):

@@ -7,15 +7,11 @@ from typing import Any, no_type_check
 import numpy as np
 from numba import njit
 
+from asp_env.data.geometry import MIN_STEP_M
 from asp_env.data.recording import Recording
 from asp_env.data.scenario_rules import STANDING_MPS
+from asp_env.sim.beginning import BEYOND_M
 from asp_env.sim.idm import IDM, limit_speeds
-
-BEYOND_M = 60.0
-"""How far a path goes on straight behind the last recorded position."""
-
-STEP_M = 0.5
-"""A position counts where the vehicle got on by this, so that jitter leaves no trace."""
 
 MIN_DESIRED_MPS = 3.0
 """Nobody wants to stand: a vehicle that the log shows waiting wants at least this speed."""
@@ -31,7 +27,7 @@ def _thin(states, kept, arcs):
     for i in range(1, len(states)):
         x, y = states[i, 0], states[i, 1]
         step = math.hypot(x - kept[count - 1, 0], y - kept[count - 1, 1])
-        if step >= STEP_M:
+        if step >= MIN_STEP_M:
             length += step
             kept[count, 0], kept[count, 1], kept[count, 2] = x, y, length
             count += 1

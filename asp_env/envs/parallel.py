@@ -1,0 +1,247 @@
+"""Recorded traffic in which the vehicles are agents, for PettingZoo."""
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import gymnasium
+import numpy as np
+from gymnasium import spaces
+from gymnasium.utils import seeding
+from jaxtyping import Float
+from pettingzoo import ParallelEnv
+
+from asp_env.data.scenario import ScenarioSet
+from asp_env.data.scene import Scene
+from asp_env.dynamics import MAX_ACCELERATION_MPS2, MAX_STEERING_RAD
+from asp_env.envs.episodes import Outcome, ReplayEpisodes, as_actions
+from asp_env.envs.start import OPTIONS
+from asp_env.envs.together import TogetherDriver, Wanted, candidates, viewpoints
+from asp_env.errors import AspEnvError, unknown_name
+from asp_env.render.frames import draw_frame
+
+_LIMITS = np.array([MAX_ACCELERATION_MPS2, MAX_STEERING_RAD], dtype=np.float32)
+
+Observations = dict[str, dict[str, np.ndarray]]
+
+
+class ParallelReplayEnv(ParallelEnv[str, dict[str, np.ndarray], Any]):
+    """Drive many vehicles of a drone recording at once; the rest is replayed or reacts.
+
+    Each agent has the observations, actions, rewards and infos that `ReplayEnv` has for its ego,
+    from its own point of view.
+
+    ## Agents
+    `vehicle_0` is the vehicle of the scenario. The others are those that were there for the whole
+    history when it begins and get on by at least 1 m until it, or their own track, ends. Whoever
+    stands all the while or comes later is traffic. The list `agents` therefore only shrinks.
+    `possible_agents` are those of the episode; before the first `reset`, as many as any scenario
+    can have.
+
+    ## End of an agent
+    As in `ReplayEnv`: terminated by `COLLISION` (one that it answers for), `OFF_ROAD` or `GOAL`,
+    truncated by `OUT_OF_DATA` when its own track ends. It vanishes behind its last observation,
+    a crashed one too: replayed traffic would drive through a wreck. Whoever was hit drives on.
+
+    ## Arguments
+    Those of `ReplayEnv`, and `classes` (names such as `car`), `ids` (track ids, of whatever
+    recording) and `max_agents` (those that start nearest to `vehicle_0`), which say who may be an
+    agent. Scenarios are those whose own vehicle may be one.
+
+    ## Options of `reset`
+    Those of `ReplayEnv`; others are passed over, since PettingZoo's own test gives one.
+    """
+
+    def __init__(
+        self,
+        data: str = "sample:intersection",
+        *,
+        classes: Sequence[str] | None = None,
+        ids: Sequence[int] | None = None,
+        max_agents: int | None = None,
+        render_mode: str | None = None,
+        **options: Any,
+    ) -> None:
+        """See the class documentation for the arguments.
+
+        Raises:
+            AspEnvError: an argument is not understood, or no scenario is left.
+        """
+        if render_mode not in (None, "rgb_array"):
+            raise AspEnvError(f"render mode {render_mode!r}: expected rgb_array or None")
+        if max_agents is not None and max_agents < 1:
+            raise AspEnvError(f"max_agents {max_agents}: expected at least 1")
+        self.metadata = {"name": "asp_env/ParallelReplay-v0", "render_modes": ["rgb_array"]}
+        self.render_mode = render_mode
+        self._episodes = ReplayEpisodes(data, options, 1)
+        self.metadata["render_fps"] = 1 / self._episodes.simulation.world.dt_s
+        self.recordings = self._episodes.recordings
+        self._wanted = tuple(Wanted(classes=classes, ids=ids).among(r) for r in self.recordings)
+        self.scenarios, most = self._scenarios(data)
+        self._most = most if max_agents is None else min(most, max_agents)
+        self._episodes.restrict(self.scenarios, self._most)
+        simulation = self._episodes.simulation
+        simulation.driver = TogetherDriver(simulation.driver)
+        self.possible_agents = [f"vehicle_{number}" for number in range(self._most)]
+        self.agents: list[str] = []
+        self._numbers = {name: number for number, name in enumerate(self.possible_agents)}
+        space: spaces.Space[Any] = self._episodes.observer.space
+        self.observation_spaces: dict[str, Any] = dict.fromkeys(self._numbers, space)
+        self.action_spaces: dict[str, spaces.Space[Any]] = {
+            name: spaces.Box(-1.0, 1.0, (2,), dtype=np.float32) for name in self._numbers
+        }
+        self.state_space = spaces.Box(-np.inf, np.inf, (self._most, 7), dtype=np.float32)
+        self._np_random: np.random.Generator | None = None
+
+    def reset(
+        self, seed: int | None = None, options: dict[str, Any] | None = None
+    ) -> tuple[Observations, dict[str, dict[str, Any]]]:
+        """Starts the scenario that the options ask for, or one drawn with the seed.
+
+        Raises:
+            AspEnvError: what an option asks for does not exist.
+        """
+        if seed is not None or self._np_random is None:
+            self._np_random, _ = seeding.np_random(seed)
+        known = {name: value for name, value in (options or {}).items() if name in OPTIONS}
+        scenario, rng = self._episodes.draw(self._np_random, known)
+        world = self._episodes.simulation.world
+        views = viewpoints(
+            self.recordings[scenario.recording],
+            self._wanted[scenario.recording],
+            scenario,
+            dt_s=world.dt_s,
+            history=world.history,
+            most=self._most,
+        )
+        where = np.arange(self._most) < len(views)
+        padding = [scenario] * (self._most - len(views))
+        self._episodes.begin([*views, *padding], [rng] * self._most, where)
+        self.possible_agents = list(self._numbers)[: len(views)]
+        self.agents = self.possible_agents.copy()
+        return self._observe(), self._infos()
+
+    def step(
+        self, actions: Mapping[str, Any]
+    ) -> tuple[
+        Observations,
+        dict[str, float],
+        dict[str, bool],
+        dict[str, bool],
+        dict[str, dict[str, Any]],
+    ]:
+        """One tick; the actions of all `agents`, moved to the nearest ones in the space.
+
+        Raises:
+            gymnasium.error.ResetNeeded: the episode is over, or none has begun.
+            AspEnvError: an agent's action is missing, has another shape or is not finite.
+        """
+        if not self.agents:
+            raise gymnasium.error.ResetNeeded("no agent is left: call reset before step")
+        given = np.zeros((self._most, 2), dtype=np.float32)
+        for name in self.agents:
+            if name not in actions:
+                raise AspEnvError(f"no action for {name}: expected one for each of env.agents")
+            given[self._numbers[name]] = as_actions(actions[name], (2,))
+        driver = self._episodes.simulation.driver
+        assert isinstance(driver, TogetherDriver)
+        driver.actions = given * _LIMITS
+        outcome = self._episodes.step(given)
+        over = outcome.terminated | outcome.truncated
+        returned = (
+            self._observe(),
+            self._told(outcome.reward),
+            self._told(outcome.terminated),
+            self._told(outcome.truncated),
+            self._infos(outcome),
+        )
+        self._episodes.simulation.world.episodes.gone |= driver.slots_of(over)
+        self.agents = [name for name in self.agents if not over[self._numbers[name]]]
+        return returned
+
+    def scene(self, agent: str) -> Scene:
+        """All that an agent may know now, for a predictor in its loop; it is slot 0.
+
+        Raises:
+            gymnasium.error.ResetNeeded: no episode has begun.
+            AspEnvError: there is no such agent.
+        """
+        if agent not in self.possible_agents:
+            raise unknown_name("agent", agent, self.possible_agents)
+        world = self._episodes.simulation.world
+        if world.scenarios[0] is None:
+            raise gymnasium.error.ResetNeeded("no episode has begun: call reset first")
+        return world.scene().situation(self._numbers[agent])
+
+    def state(self) -> Float[np.ndarray, "agents 7"]:
+        """Of every possible agent x m, y m, heading rad, speed m/s, length m, width m, 1.
+
+        Zeros for those that are not there. Positions are in the recording's frame.
+        """
+        world = self._episodes.simulation.world
+        state = np.zeros(self.state_space.shape or (), dtype=np.float32)
+        rows = [self._numbers[name] for name in self.agents]
+        state[rows, :4] = world.ego_states()[rows]
+        state[rows, 4:6] = world.episodes.sizes[rows, 0]
+        state[rows, 6] = 1.0
+        return state
+
+    def observation_space(self, agent: str) -> spaces.Space[Any]:
+        """The same for all agents."""
+        return self.observation_spaces[agent]
+
+    def action_space(self, agent: str) -> spaces.Space[Any]:
+        """The agent's own, with its own seed."""
+        return self.action_spaces[agent]
+
+    def render(self) -> Any:
+        """An RGB picture uint8 (H, W, 3) of the whole place in mode `rgb_array`, else None."""
+        if self.render_mode is None:
+            return None
+        scene = self.scene((self.agents or self.possible_agents)[0])
+        recording = self._episodes.simulation.world.episodes.recording[0]
+        background = self.recordings[int(recording)].background
+        return draw_frame(scene, extent_m=None, background=background)
+
+    def close(self) -> None:
+        """Nothing is held open."""
+
+    def _scenarios(self, data: str) -> tuple[ScenarioSet, int]:
+        """The scenarios whose own vehicle may be an agent, and the most agents of one of them."""
+        world, found = self._episodes.simulation.world, self._episodes.scenarios
+        kept, most = np.zeros(len(found), dtype=bool), 0
+        for row, scenario in enumerate(found):
+            recording = self.recordings[scenario.recording]
+            wanted = self._wanted[scenario.recording]
+            if wanted[recording.track_ids == scenario.ego_id].any():
+                there = candidates(recording, scenario, dt_s=world.dt_s, history=world.history)
+                most = max(most, int((there & wanted).sum()))
+                kept[row] = True
+        if not most:
+            raise AspEnvError(f"{data}: no scenario's vehicle is of the given classes and ids")
+        return found.select(kept), most
+
+    def _observe(self) -> Observations:
+        rows = np.array([self._numbers[name] for name in self.agents])
+        observed = self._episodes.observe(rows)
+        return {
+            name: {part: value[row] for part, value in observed.items()}
+            for row, name in enumerate(self.agents)
+        }
+
+    def _infos(self, outcome: Outcome | None = None) -> dict[str, dict[str, Any]]:
+        columns = {name: self._told(value) for name, value in self._episodes.info().items()}
+        if outcome is not None:
+            terms = {name: self._told(value) for name, value in outcome.terms.items()}
+            columns["reward_terms"] = {
+                agent: {name: value[agent] for name, value in terms.items()}
+                for agent in self.agents
+            }
+            columns["ending"] = self._told(outcome.ending)
+        return {
+            agent: {name: value[agent] for name, value in columns.items()} for agent in self.agents
+        }
+
+    def _told(self, values: np.ndarray) -> dict[str, Any]:
+        """One plain value for each agent that is there."""
+        plain = values.tolist()
+        return {name: plain[self._numbers[name]] for name in self.agents}

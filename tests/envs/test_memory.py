@@ -1,0 +1,13 @@
+"""Memory does not grow; the long run is `tests.benchmarks.memory`."""
+
+from tests.benchmarks.memory import drive_many, drive_one
+
+
+def test_memory_does_not_grow_with_resets_and_steps(crossing):
+    """Not by 5 MiB over 45 resets and 900 steps, nor over 900 steps of 20 together."""
+    for seen in (
+        drive_one(crossing, resets=50, steps=1000),
+        drive_many(crossing, count=20, steps=1000),
+    ):
+        assert len(seen) == 10
+        assert seen[-1] - seen[0] < 5

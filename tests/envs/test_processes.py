@@ -1,0 +1,65 @@
+"""The same bits in every instance and every process, and behind Gymnasium's vector environments."""
+
+import subprocess
+import sys
+
+import gymnasium
+import numpy as np
+import pytest
+from gymnasium.vector import AsyncVectorEnv
+
+from tests.envs.same import same
+from tests.envs.traces import make, trace, trace_vector
+
+
+def test_two_instances_agree_bit_for_bit(crossing):
+    """Same seed, same 500 actions, with other environments made and stepped in between."""
+    first = make(crossing)
+    expected = trace(first, steps=500)
+    other = make(crossing, traffic="idm", observations=("state",))
+    trace(other, seed=77)
+    second = make(crossing)
+    assert trace(second, steps=500) == expected
+    assert trace(first, steps=60) == trace(second, steps=60)
+    assert trace(first, seed=6, steps=60) != trace(second, steps=60)
+
+
+@pytest.mark.parametrize("traffic", ["log", "idm"])
+def test_another_process_agrees_bit_for_bit(crossing, traffic):
+    """The hashes over 500 steps, alone and batched, are the same in a fresh interpreter."""
+    script = (
+        "import sys; from tests.envs.traces import make, trace, trace_vector;"
+        "print(trace(make(sys.argv[1], traffic=sys.argv[2]), steps=500));"
+        "print(trace_vector(sys.argv[1], steps=500, traffic=sys.argv[2]))"
+    )
+    done = subprocess.run(
+        [sys.executable, "-c", script, crossing, traffic],
+        capture_output=True,
+        text=True,
+        check=True,
+    )
+    expected = [
+        trace(make(crossing, traffic=traffic), steps=500),
+        trace_vector(crossing, steps=500, traffic=traffic),
+    ]
+    assert done.stdout.split() == expected
+
+
+def test_processes_of_gymnasium_agree_with_one(crossing):
+    """`AsyncVectorEnv` over `gymnasium.make` returns what the batched environment does."""
+    options = {"data": crossing, "observations": ("state", "vectors", "route")}
+    one = gymnasium.make_vec(
+        "asp_env/Replay-v0", num_envs=2, vectorization_mode="vector_entry_point", **options
+    )
+    other = gymnasium.make_vec(
+        "asp_env/Replay-v0", num_envs=2, vectorization_mode="async", **options
+    )
+    assert isinstance(other, AsyncVectorEnv)
+    try:
+        same(one.reset(seed=4), other.reset(seed=4))
+        rng = np.random.default_rng(0)
+        for _ in range(60):
+            actions = rng.uniform((0.0, -0.5), (1.0, 0.5), size=(2, 2)).astype(np.float32)
+            same(one.step(actions), other.step(actions))
+    finally:
+        other.close()

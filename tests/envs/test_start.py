@@ -1,0 +1,151 @@
+"""Where an episode begins: scenarios by number, name and tag; any vehicle at any tick."""
+
+import gymnasium
+import numpy as np
+import pytest
+
+from asp_env.data.scenario_filter import ScenarioFilter
+from asp_env.envs.replay import ReplayEnv
+from asp_env.errors import AspEnvError
+from tests.crossing_files import ON_ROAD, write_crossing
+
+
+def _make(data: str, **options) -> ReplayEnv:
+    return ReplayEnv(data, **{"observations": ("state",), **options})
+
+
+def test_a_scenario_by_number_and_by_name(crossing):
+    """Both start the same; the seed decides nothing then."""
+    env = _make(crossing)
+    for number, scenario in enumerate(env.scenarios):
+        by_number = env.reset(seed=number, options={"scenario": number})
+        by_name = env.reset(seed=0, options={"scenario": scenario.name})
+        assert by_number[1] == by_name[1]
+        assert by_number[0]["state"].tobytes() == by_name[0]["state"].tobytes()
+        assert by_name[1]["scenario"] == scenario.name
+
+
+def test_a_seed_is_no_index(crossing):
+    """Seeds beyond the number of scenarios are fine, and neighbouring ones draw others."""
+    env = _make(crossing)
+    drawn = [env.reset(seed=seed)[1]["scenario"] for seed in range(100, 140)]
+    assert len(set(drawn)) == len(env.scenarios)
+    assert drawn[: len(env.scenarios)] != [scenario.name for scenario in env.scenarios]
+
+
+def test_any_vehicle_at_any_tick(crossing):
+    """The motorcycle (6) is there from 4 s to 14 s: drivable from tick 20 + 15 to tick 69."""
+    env = _make(crossing)
+    obs, info = env.reset(options={"ego": 6, "start_tick": 41})
+    assert obs in env.observation_space
+    assert info["scenario"] == "00-6-41"
+    scene = env.scene()
+    assert (scene.ids[0, 0], scene.tick[0]) == (6, 41)
+    row = (41 - 20) * 5
+    assert np.array_equal(scene.states[0, 0, -1], env.recordings[0].track(5)[row])
+    assert env.reset(options={"ego": 6})[1]["scenario"] == "00-6-35"
+    env.reset(options={"ego": 6, "start_tick": 69})
+    assert env.step(np.zeros(2))[2]
+    with pytest.raises(
+        AspEnvError, match="start tick 70: ego 6 of recording 00 can start at ticks 35 to 69"
+    ):
+        env.reset(options={"ego": 6, "start_tick": 70})
+
+
+def test_a_scenario_from_another_tick_or_with_another_ego(crossing):
+    """The recording is that of the scenario; without `ego` its ego drives."""
+    env = _make(crossing)
+    first = env.scenarios[0]
+    info = env.reset(options={"scenario": 0, "start_tick": first.start_tick + 7})[1]
+    assert info["scenario"] == f"{first.recording_name}-{first.ego_id}-{first.start_tick + 7}"
+    info = env.reset(options={"scenario": 0, "ego": 2})[1]
+    assert info["scenario"].startswith(f"{first.recording_name}-2-")
+
+
+@pytest.mark.parametrize(
+    ("options", "what"),
+    [
+        ({"ego": 99}, "ego 99: recording 00 has no such track"),
+        ({"ego": "2"}, "ego '2': expected a whole number"),
+        ({"ego": True}, "ego True: expected a whole number"),
+        ({"ego": 1, "start_tick": 3}, "start tick 3: ego 1 of recording 00 can start"),
+        ({"ego": 1, "start_tick": -1}, "start tick -1: ego 1 .* at ticks 15 to 99"),
+        ({"ego": 1, "start_tick": 100}, "start tick 100: ego 1 .* at ticks 15 to 99"),
+        ({"ego": 1, "start_tick": 20.5}, "start_tick 20.5: expected a whole number"),
+        ({"start_tick": 20}, "start_tick 20 alone: name the scenario or the ego"),
+        ({"scenario": 0, "start_tick": 0}, "start tick 0: ego 1 of recording 00 can start"),
+    ],
+    ids=str,
+)
+def test_what_does_not_exist_is_refused(crossing, options, what):
+    """One line with what there is; the environment can be reset afterwards."""
+    env = _make(crossing)
+    with pytest.raises(AspEnvError, match=what) as caught:
+        env.reset(options=options)
+    assert "\n" not in str(caught.value)
+    env.reset(seed=0)
+
+
+def test_a_pedestrian_is_no_ego(crossing):
+    """The error says what it is."""
+    env = _make(crossing)
+    recorded = env.recordings[0]
+    pedestrian = int(recorded.track_ids[np.flatnonzero(recorded.classes == 8)[0]])
+    with pytest.raises(AspEnvError, match="is of class pedestrian, which cannot be driven"):
+        env.reset(options={"ego": pedestrian})
+
+
+def test_an_ego_of_several_recordings_needs_a_scenario(tmp_path):
+    """Track ids are unique within a recording alone."""
+    env = _make(str(write_crossing(tmp_path, drives=(ON_ROAD, ON_ROAD[:3]))))
+    with pytest.raises(AspEnvError, match="has 2 recordings; name a scenario"):
+        env.reset(options={"ego": 1})
+    of_second = next(each for each in env.scenarios if each.recording == 1)
+    info = env.reset(options={"scenario": of_second.name, "ego": 2})[1]
+    assert info["scenario"].startswith("01-2-")
+
+
+def test_recordings_shorter_than_the_history_are_refused(tmp_path):
+    """Of 2 s nothing can be driven after 3 s of history."""
+    data = str(write_crossing(tmp_path, drives=(ON_ROAD[:3],), seconds=2.0))
+    with pytest.raises(AspEnvError, match="after 3 s of history"):
+        _make(data)
+
+
+def test_scenarios_by_a_filter(crossing):
+    """In words or as an object; what is drawn fits. Words survive a specification as JSON."""
+    everything = _make(crossing).scenarios
+    for wanted in ("left", ScenarioFilter.parse("left")):
+        env = _make(crossing, scenarios=wanted)
+        assert 0 < len(env.scenarios) < len(everything)
+        for seed in range(10):
+            assert "left" in env.reset(seed=seed)[1]["tags"]
+    spec = gymnasium.make(
+        "asp_env/Replay-v0", data=crossing, observations=("state",), scenarios="left"
+    ).spec
+    assert spec is not None
+    assert "left" in spec.to_json()
+
+
+def test_scenarios_of_the_callers_choice(crossing):
+    """A set of scenarios, in its own order."""
+    chosen = _make(crossing).scenarios.select(np.array([4, 3, 2]))
+    env = _make(crossing, scenarios=chosen)
+    for number, scenario in enumerate(chosen):
+        assert env.reset(options={"scenario": number})[1]["scenario"] == scenario.name
+
+
+def test_scenarios_that_do_not_exist_are_refused(crossing, tmp_path):
+    """Unknown tags, none that fits, an empty set, and scenarios of other data or ticks."""
+    everything = _make(crossing).scenarios
+    with pytest.raises(AspEnvError, match=r"'lefts' \(did you mean 'left'"):
+        _make(crossing, scenarios="lefts")
+    with pytest.raises(AspEnvError, match=r"none of the 6 of .* fits"):
+        _make(crossing, scenarios="left,right")
+    with pytest.raises(AspEnvError, match="the set is empty"):
+        _make(crossing, scenarios=everything.select(np.zeros(0, dtype=np.int64)))
+    with pytest.raises(AspEnvError, match=r"15 past ticks of 0.2 s: expected 25 of 0.12 s"):
+        _make(crossing, scenarios=everything, dt_s=0.12)
+    other = _make(str(write_crossing(tmp_path, drives=(ON_ROAD, ON_ROAD)))).scenarios
+    with pytest.raises(AspEnvError, match=r"expected some of .* whose recordings are 00"):
+        _make(crossing, scenarios=other)

@@ -1,0 +1,248 @@
+"""Lanes under vehicles, on a street drawn by hand."""
+
+import math
+from dataclasses import replace
+
+import hypothesis.strategies as st
+import numpy as np
+import pytest
+from hypothesis import given
+
+from asp_env.data.geometry import box_corners, from_frame
+from asp_env.data.road_map import Ragged, RoadMap
+from asp_env.metrics.lanes import (
+    against_traffic_m,
+    at_crossing,
+    covering,
+    in_several_lanes,
+    lane_table,
+    speed_limits,
+)
+from asp_env.metrics.ways import off_ways_m, reachable
+from tests.metrics.streets import (
+    CAR,
+    EAST,
+    LEFT,
+    NEXT_EAST,
+    NORTH,
+    ONWARDS,
+    STREET,
+    WEST,
+    moved_map,
+    street_map,
+)
+
+Pose = tuple[float, float, float]
+BARE = replace(
+    STREET,
+    areas=Ragged.pack([]),
+    two_way=np.zeros(0, dtype=bool),
+    limits_mps=np.zeros(0),
+    limited=np.zeros(0, dtype=bool),
+)
+"""The same street of which only centre lines are known."""
+
+
+def at(x: float, y: float, heading: float = 0.0, speed: float = 5.0) -> np.ndarray:
+    """(1, 4) one state."""
+    return np.array([[x, y, heading, speed]])
+
+
+@pytest.mark.parametrize(
+    ("x", "y", "lanes"),
+    [
+        (10.0, 1.9, {EAST}),
+        (10.0, 2.1, {WEST}),
+        (10.0, -2.1, {NEXT_EAST}),
+        (10.0, 6.1, set()),
+        (50.0, 0.0, {EAST, NORTH}),
+        (50.0, 29.0, {NORTH}),
+        (99.0, 0.0, {EAST}),
+        (101.0, 0.0, {ONWARDS, LEFT}),
+        (110.0, 10.0, {LEFT}),
+        (-0.1, 0.0, set()),
+    ],
+)
+def test_covering(x: float, y: float, lanes: set[int]) -> None:
+    """Rings by hand."""
+    assert set(np.flatnonzero(covering(STREET, np.array([x, y])))) == lanes
+
+
+@pytest.mark.parametrize(
+    ("state", "several"),
+    [
+        (at(20, 0), False),
+        (at(20, 0.9), False),  # its left side at 1.9 m
+        (at(20, 1.1), True),  # two corners over the line to the westbound lane
+        (at(20, -2.0), True),
+        (at(100, 0), False),  # its rear in one lane, its front in the next
+        (at(101, 0.6, math.pi / 4), False),  # turning: its rear still in the lane before
+        (at(100, -2.0), True),  # its rear right is in the lane beside
+        (at(50, 0), False),  # where others cross, one lane has all corners
+        (at(50, 0, math.pi / 2), False),
+        (at(20, -6.5), False),  # half of it beside the map: that half is nowhere
+        (at(20, 40), False),
+    ],
+)
+def test_several_lanes(state: np.ndarray, several: bool) -> None:
+    """A car of 4 by 2 m against lanes of 4 m."""
+    assert in_several_lanes(STREET, state, CAR[None]).tolist() == [several]
+
+
+def test_three_lanes_that_follow_each_other_are_one() -> None:
+    """Chains go over two borders, not over three."""
+    chained = street_map()
+    assert len(lane_table(chained).chains) == 6 + 2  # six lanes, and two pairs
+    bus = np.array([[18.0, 2.5]])
+    short = replace(
+        chained,
+        lanes=Ragged.pack([np.array([(x, 0), (x + 5, 0)]) for x in (0, 5, 10, 15)]),
+        areas=Ragged.pack(
+            [np.array([(x, 2), (x + 5, 2), (x + 5, -2), (x, -2)]) for x in (0, 5, 10, 15)]
+        ),
+        successors=np.array([(0, 1), (1, 2), (2, 3)]),
+        two_way=np.zeros(4, dtype=bool),
+        limits_mps=np.zeros(4),
+        limited=np.zeros(4, dtype=bool),
+    )
+    assert in_several_lanes(short, at(10, 0), bus).tolist() == [True]
+    assert in_several_lanes(short, at(10, 0), np.array([[9.0, 2.5]])).tolist() == [False]
+
+
+@pytest.mark.parametrize(
+    ("state", "crossing"),
+    [
+        (at(50, 0), True),
+        (at(46.5, 0), True),  # its front corners are at 48.5 m, the crossing lane begins at 48
+        (at(45, 0), False),
+        (at(55, 0), False),  # its tail at 53 m, that lane ends at 52
+        (at(50, -20, math.pi / 2), False),  # in the crossing lane, before the first of the others
+        (at(50, -4, math.pi / 2), True),
+        (at(20, 0), False),  # beside parallel and opposite lanes
+        (at(104, 1.5, math.pi / 4), True),  # where the turn leaves the lane onwards, at 45°
+        (at(150, 0), False),
+    ],
+)
+def test_crossing(state: np.ndarray, crossing: bool) -> None:
+    """At and between the metres at which another lane crosses, to 1 m."""
+    assert at_crossing(STREET, state, CAR[None]).tolist() == [crossing]
+
+
+def test_against_the_traffic() -> None:
+    """Each tick's way is laid along the lane that it ends in, and only what is against it counts.
+
+    Eastwards in the westbound lane 3 m; back 1 m with it; 3 m north and 4 m west in the eastbound
+    one are 4 m; on the crossing eastwards is right for one of the lanes; 2 m west onto a point
+    without a lane are nothing; nor are 5 m from there to another one.
+    """
+    xy = np.array([(10, 4), (13, 4), (12, 4), (8, 1), (49, 1), (1, 1), (-1, 1), (-6, 1)])
+    found = against_traffic_m(STREET, xy.astype(float))
+    np.testing.assert_allclose(found, [0, 3, 0, 4, 0, 48, 0, 0])
+
+
+def test_of_overlapping_lanes_the_best_counts() -> None:
+    """On the crossing one may go east and north, and south is against the one, west the other."""
+    for step, metres in (((1, 0), 0), ((0, 1), 0), ((0, -1), 0), ((-1, 0), 0), ((-1, -2), 1)):
+        # southwards is square to the eastbound lane, so no way against it
+        xy = np.array([(50, 0), np.array((50, 0)) + step], dtype=float)
+        assert against_traffic_m(STREET, xy)[1] == pytest.approx(metres)
+
+
+def test_two_way_lanes_have_no_wrong_direction() -> None:
+    """Neither have gaps: without the westbound lane, its place is nobody's."""
+    xy = np.array([(10.0, 4.0), (20.0, 4.0)])
+    assert against_traffic_m(street_map(two_way=(WEST,)), xy).tolist() == [0, 0]
+    assert against_traffic_m(street_map(without=(WEST,)), xy).tolist() == [0, 0]
+    assert against_traffic_m(STREET, xy).tolist() == [0, 10]
+
+
+@pytest.mark.parametrize(
+    ("state", "limit"),
+    [
+        (at(10, 0), 10.0),
+        (at(110, 10, math.pi / 4), 15.0),
+        (at(150, 0), None),  # a lane that tells none
+        (at(102, 0), 15.0),  # the lane onwards tells none, the other does
+        (at(10, 40), None),
+        (at(10, 4), None),  # headed against it
+        (at(10, 4, math.pi), 10.0),
+    ],
+)
+def test_speed_limit(state: np.ndarray, limit: float | None) -> None:
+    """The highest of the lanes that fit the heading; missing otherwise."""
+    found = speed_limits(STREET, state)
+    assert (found.value[0] if found.valid[0] else None) == limit
+
+
+def test_lanes_that_lead_on() -> None:
+    """From the eastbound lane onwards and to the left; nothing from a place without a lane."""
+    assert set(np.flatnonzero(reachable(STREET, at(10, 0)[0]))) == {EAST, ONWARDS, LEFT}
+    assert set(np.flatnonzero(reachable(STREET, at(10, 0, math.pi)[0]))) == set()
+    assert set(np.flatnonzero(reachable(STREET, at(10, 4, math.pi)[0]))) == {WEST}
+    assert set(np.flatnonzero(reachable(STREET, at(10, 40)[0]))) == set()
+
+
+def test_distance_to_the_ways() -> None:
+    """4 m beside the lane, but 1 m from the logged route; on the way to the left 0 m from either.
+
+    (120, 20) lies on the lane to the left, 24 m from the route's end.
+    """
+    route = np.array([(0.0, 3.0), (120.0, 3.0)])
+    states = np.concatenate([at(10, 0), at(20, 4), at(120, 20), at(10, -6)])
+    np.testing.assert_allclose(off_ways_m(STREET, states, route), [0, 1, 0, 6])
+    beside = street_map(without=(EAST,))  # of what the log drove on, nothing is missed
+    np.testing.assert_allclose(off_ways_m(beside, states, route)[:2], [3, 1])
+
+
+def test_a_map_of_centre_lines_tells_nothing() -> None:
+    """No areas, so no lane: nothing is several, crossed, against or limited."""
+    state = at(20, 2)
+    assert covering(BARE, state[:, :2]).shape == (1, 0)
+    assert not in_several_lanes(BARE, state, CAR[None]).any()
+    assert not at_crossing(BARE, state, CAR[None]).any()
+    assert not against_traffic_m(BARE, np.array([(20.0, 4.0), (30.0, 4.0)])).any()
+    assert not speed_limits(BARE, state).valid.any()
+    assert off_ways_m(BARE, state, np.array([(0.0, 0.0), (50.0, 0.0)])).tolist() == [2.0]
+
+
+@given(
+    pose=st.tuples(st.floats(-200, 200), st.floats(-200, 200), st.floats(-3, 3)),
+    x=st.floats(1, 120),
+    y=st.floats(-7, 7),
+    heading=st.floats(-3, 3),
+)
+def test_where_the_street_lies_changes_nothing(
+    pose: Pose, x: float, y: float, heading: float
+) -> None:
+    """Turned and shifted, a box has the same lanes; points on borders are left out."""
+    elsewhere = moved_map(STREET, pose)
+    state = at(x, y, heading)
+    x_m, y_m = from_frame(state[0, :2], np.array(pose))
+    moved = at(x_m, y_m, heading + pose[2])
+    ahead = state[0, :2] + (1, 0)
+    two = [
+        np.stack([state[0, :2], ahead]),
+        np.stack([moved[0, :2], from_frame(ahead, np.array(pose))]),
+    ]
+    borders = _distance_to_borders(STREET, state, two[0])
+    if borders < 1e-6:
+        return
+    for one, other in (
+        (in_several_lanes(STREET, state, CAR[None]), in_several_lanes(elsewhere, moved, CAR[None])),
+        (covering(STREET, two[0]), covering(elsewhere, two[1])),
+    ):
+        np.testing.assert_array_equal(one, other)
+    np.testing.assert_allclose(
+        against_traffic_m(STREET, two[0]), against_traffic_m(elsewhere, two[1]), atol=1e-6
+    )
+
+
+def _distance_to_borders(road_map: RoadMap, state: np.ndarray, points: np.ndarray) -> float:
+    asked = np.concatenate([box_corners(state, CAR[None])[0], points])
+    away = np.inf
+    for i in range(len(road_map.areas)):
+        ring = road_map.areas[i]
+        for a, b in zip(ring, np.roll(ring, -1, axis=0), strict=True):
+            share = np.clip((asked - a) @ (b - a) / ((b - a) @ (b - a)), 0, 1)
+            away = min(away, np.hypot(*(asked - a - share[:, None] * (b - a)).T).min())
+    return float(away)
