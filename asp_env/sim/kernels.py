@@ -93,31 +93,25 @@ def write_tick(
 
 @njit(cache=True)
 @no_type_check
-def _read_window(states, valid, actions, now, out_states, out_valid, out_actions):
-    ticks = out_valid.shape[2]
-    for b in range(len(now)):
-        first = now[b] - ticks + 1
-        for a in range(out_valid.shape[1]):
-            for k in range(ticks):
-                out_valid[b, a, k] = valid[b, first + k, a]
+def _last_ticks(states, valid, now, rows, out_states, out_valid):
+    """Copies the ticks up to now of some episodes, time by agent to agent by time."""
+    agents, ticks = out_valid.shape[1:]
+    for i in range(len(rows)):
+        b = rows[i]
+        first = now[b] + 1 - ticks
+        for k in range(ticks):
+            for a in range(agents):
+                there = valid[b, first + k, a]
+                out_valid[i, a, k] = there
                 for field in range(4):
-                    out_states[b, a, k, field] = states[b, first + k, a, field]
-            for k in range(ticks - 1):
-                out_actions[b, a, k, 0] = actions[b, first + k, a, 0]
-                out_actions[b, a, k, 1] = actions[b, first + k, a, 1]
+                    out_states[i, a, k, field] = states[b, first + k, a, field] if there else 0.0
 
 
-def read_window(
-    data: Episodes, now: Int[np.ndarray, " b"], history: int
-) -> tuple[
-    Float[np.ndarray, "b a ticks 4"],
-    Bool[np.ndarray, "b a ticks"],
-    Float[np.ndarray, "b a ticks-1 2"],
-]:
-    """States, presence and actions of the last `history` ticks and now, agent by agent."""
-    shape = (*data.ids.shape, history + 1)
-    states = np.empty((*shape, 4), dtype=np.float32)
-    valid = np.empty(shape, dtype=bool)
-    actions = np.empty((*shape[:2], history, 2), dtype=np.float32)
-    _read_window(data.states, data.valid, data.actions, now, states, valid, actions)
-    return states, valid, actions
+def last_ticks(
+    data: Episodes, now: Int[np.ndarray, " b"], rows: Int[np.ndarray, " r"], history: int
+) -> tuple[Float[np.ndarray, "r a ticks 4"], Bool[np.ndarray, "r a ticks"]]:
+    """States and presence in some episodes at the last `history` ticks and now, agent by agent."""
+    shape = (len(rows), data.ids.shape[1], history + 1)
+    states, valid = np.empty((*shape, 4), dtype=np.float32), np.empty(shape, dtype=bool)
+    _last_ticks(data.states, data.valid, now, rows, states, valid)
+    return states, valid

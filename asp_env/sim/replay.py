@@ -16,7 +16,7 @@ from asp_env.metrics.route import route_coordinates
 from asp_env.sim.beginning import cast, place
 from asp_env.sim.episodes import Episodes, no_episodes
 from asp_env.sim.events import Events, outside_now_m
-from asp_env.sim.kernels import read_obeying, read_window, write_tick
+from asp_env.sim.kernels import last_ticks, read_obeying, write_tick
 from asp_env.sim.world import EGO
 
 Snapshot = tuple[Episodes, list[Scenario | None], list[np.random.Generator]]
@@ -123,7 +123,9 @@ class ReplayWorld:
         """All that may be known now; targets are all present agents but the ego."""
         data = self.episodes
         self._infer_actions()
-        states, valid, actions = read_window(data, self.now, self.history)
+        states, valid = last_ticks(data, self.now, self._rows, self.history)
+        past = self.now[:, None] + np.arange(-self.history, 0)
+        actions = np.ascontiguousarray(data.actions[self._rows[:, None], past].swapaxes(1, 2))
         others = valid[..., -1].copy()
         others[:, EGO] = False
         seen = np.asarray(valid.any(axis=-1))  # of who comes later, nothing is known yet

@@ -1,13 +1,12 @@
 """What the egos of a world see now: its last ticks, without what an observation does not need."""
 
 from dataclasses import dataclass
-from typing import no_type_check
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
-from numba import njit
 
 from asp_env.data.road_map import RoadMap
+from asp_env.sim.kernels import last_ticks
 from asp_env.sim.replay import ReplayWorld
 from asp_env.sim.world import EGO
 
@@ -46,11 +45,9 @@ def ego_sight(world: ReplayWorld, rows: Int[np.ndarray, " n"] | None = None) -> 
     maps, map_index = world.maps()
     everyone = rows is None
     rows = np.arange(len(world)) if rows is None else rows
-    shape = (len(rows), data.ids.shape[1], world.history + 1)
-    states, valid = np.empty((*shape, 4), dtype=np.float32), np.empty(shape, dtype=bool)
     targets = np.full((len(rows), 2), EGO)
     targets[:, 0] = np.arange(len(rows))
-    _last_ticks(data.states, data.valid, world.now, rows, states, valid)
+    states, valid = last_ticks(data, world.now, rows, world.history)
     sizes, classes, ids, routes, route_valid = (
         column if everyone else column[rows]
         for column in (data.sizes, data.classes, data.ids, data.route, data.route_valid)
@@ -68,19 +65,3 @@ def ego_sight(world: ReplayWorld, rows: Int[np.ndarray, " n"] | None = None) -> 
         map_index=map_index if everyone else map_index[rows],
         dt_s=world.dt_s,
     )
-
-
-@njit(cache=True)
-@no_type_check
-def _last_ticks(states, valid, now, rows, out_states, out_valid):
-    """Copies the ticks up to now of some episodes, time by agent to agent by time."""
-    agents, ticks = out_valid.shape[1:]
-    for i in range(len(rows)):
-        b = rows[i]
-        first = now[b] + 1 - ticks
-        for k in range(ticks):
-            for a in range(agents):
-                there = valid[b, first + k, a]
-                out_valid[i, a, k] = there
-                for field in range(4):
-                    out_states[i, a, k, field] = states[b, first + k, a, field] if there else 0.0
