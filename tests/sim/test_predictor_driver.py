@@ -1,5 +1,7 @@
 """Agents that follow forecasts."""
 
+from types import MappingProxyType
+
 import numpy as np
 import pytest
 
@@ -23,7 +25,7 @@ class Oracles:
     history = 15
     horizon = STEPS
     trained_on = None
-    about: dict[str, str] = {}  # noqa: RUF012
+    about = MappingProxyType[str, str]({})
 
     def __init__(self, *, actions: bool = True, first_mps2: float = 1.0) -> None:
         """Forecasts actions, or states alone."""

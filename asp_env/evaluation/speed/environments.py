@@ -1,5 +1,6 @@
 """Rates of the environments as their users call them, beside a peer where one is installed."""
 
+import importlib
 import importlib.util
 from collections.abc import Sequence
 from typing import Any
@@ -100,7 +101,7 @@ def _highway() -> tuple[float, float]:
 
     The same control rate, a kinematic bicycle, a table of 16 vehicles as observation.
     """
-    import highway_env  # pyright: ignore[reportMissingImports] # noqa: F401 - registers its ids
+    importlib.import_module(PEER)  # registers its environments
 
     config = {
         "action": {"type": "ContinuousAction", "dynamical": False},

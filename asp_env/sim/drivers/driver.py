@@ -1,7 +1,7 @@
 """The socket for drivers, and what all of them need."""
 
 from dataclasses import dataclass
-from typing import Any, Generic, Protocol, TypeVar, runtime_checkable
+from typing import Any, ClassVar, Generic, Protocol, TypeVar, runtime_checkable
 
 import numpy as np
 from jaxtyping import Bool, Float, Shaped
@@ -12,6 +12,7 @@ from asp_env.sim.replay import ReplayWorld
 from asp_env.sim.world import EGO
 
 Value = TypeVar("Value")
+Made = TypeVar("Made", bound="Plain")
 
 LEAVES_BEYOND_M = 10.0
 """Where nobody was ever recorded within this distance, a driven agent leaves the episode."""
@@ -130,11 +131,21 @@ def outside(
     return (x < low_x) | (x > high_x) | (y < low_y) | (y > high_y)
 
 
-def refuse_argument(name: str, argument: str) -> None:
-    """For drivers whose name says it all.
+class Plain:
+    """Drivers whose name says it all: what the registry asks of them."""
 
-    Raises:
-        AspEnvError: there is an argument.
-    """
-    if argument:
-        raise AspEnvError(f"driver {name} takes no argument, {argument!r} was given: use {name}")
+    name: ClassVar[str]
+
+    @classmethod
+    def from_name(cls: type[Made], argument: str, *, dt_s: float) -> Made:
+        """The driver, which takes no argument.
+
+        Raises:
+            AspEnvError: there is one.
+        """
+        del dt_s
+        if argument:
+            raise AspEnvError(
+                f"driver {cls.name} takes no argument, {argument!r} was given: use {cls.name}"
+            )
+        return cls()

@@ -9,7 +9,7 @@ from numba import njit
 
 from asp_env.dynamics import MAX_ACCELERATION_MPS2
 from asp_env.metrics.boxes import overlaps
-from asp_env.sim.drivers.driver import Control, refuse_argument, resized, vehicles
+from asp_env.sim.drivers.driver import Control, Plain, resized, vehicles
 from asp_env.sim.drivers.idm import IDMDriver
 from asp_env.sim.replay import ReplayWorld
 from asp_env.sim.world import EGO
@@ -102,7 +102,7 @@ def _turn(
                     turned[b, a] = _meets(log_states[b], log_valid[b], t, a, sizes[b], o, ways)
 
 
-class HybridDriver:
+class HybridDriver(Plain):
     """Vehicles replay their log until it would lead them into the ego, from then on they are `idm`.
 
     At every tick each looks 2 s ahead: if at a coming tick its logged box overlaps the ego's, which
@@ -112,22 +112,13 @@ class HybridDriver:
     way, so that nobody drives through them.
     """
 
+    name = "hybrid"
+
     def __init__(self) -> None:
         """A driver without agents; `reset` gives it some."""
         self._idm = IDMDriver()
         self._mine = np.zeros((0, 0), dtype=bool)
         self._turned = np.zeros((0, 0), dtype=bool)
-
-    @classmethod
-    def from_name(cls, argument: str, *, dt_s: float) -> "HybridDriver":
-        """The driver; it takes no argument.
-
-        Raises:
-            AspEnvError: there is one.
-        """
-        del dt_s
-        refuse_argument("hybrid", argument)
-        return cls()
 
     def reset(
         self,

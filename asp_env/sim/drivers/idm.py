@@ -6,7 +6,7 @@ from jaxtyping import Bool
 from asp_env.data.clock import frames_per_tick
 from asp_env.sim.drivers.arrivals import barred
 from asp_env.sim.drivers.conflicts import Ahead, Conflicts
-from asp_env.sim.drivers.driver import Control, idle, refuse_argument, resized, vehicles
+from asp_env.sim.drivers.driver import Control, Plain, idle, resized, vehicles
 from asp_env.sim.drivers.paths import Paths
 from asp_env.sim.drivers.yielding import follow_and_yield
 from asp_env.sim.idm import IDM
@@ -16,12 +16,14 @@ HALTED_M = 1.0
 """A vehicle that is to halt has done so within this distance of the place."""
 
 
-class IDMDriver:
+class IDMDriver(Plain):
     """Vehicles follow their logged path, give way, and react to whoever is on it; others replay.
 
     A vehicle wants the highest speed that it had in its log. It leaves behind the path's end; one
     whose log ends with it standing comes to stand there, and leaves when the log has ended.
     """
+
+    name = "idm"
 
     def __init__(self, idm: IDM | None = None) -> None:
         """A driver with the given parameters, or the default ones."""
@@ -37,17 +39,6 @@ class IDMDriver:
         self._strides = np.zeros(0, dtype=np.int64)
         self._arcs = np.zeros((0, 0))
         """How far along its path each agent is; negative where that is to be looked up."""
-
-    @classmethod
-    def from_name(cls, argument: str, *, dt_s: float) -> "IDMDriver":
-        """The driver; it takes no argument.
-
-        Raises:
-            AspEnvError: there is one.
-        """
-        del dt_s
-        refuse_argument("idm", argument)
-        return cls()
 
     def reset(
         self,

@@ -7,23 +7,14 @@ from jaxtyping import Bool
 from numba import njit
 
 from asp_env.dynamics import inverse
-from asp_env.sim.drivers.driver import Control, idle, refuse_argument, resized, vehicles
+from asp_env.sim.drivers.driver import Control, Plain, idle, resized, vehicles
 from asp_env.sim.replay import ReplayWorld
 
 
-class LogDriver:
+class LogDriver(Plain):
     """Everybody moves exactly as recorded."""
 
-    @classmethod
-    def from_name(cls, argument: str, *, dt_s: float) -> "LogDriver":
-        """The driver; it takes no argument.
-
-        Raises:
-            AspEnvError: there is one.
-        """
-        del dt_s
-        refuse_argument("log", argument)
-        return cls()
+    name = "log"
 
     def reset(
         self,
@@ -53,28 +44,19 @@ def _logged(wanted, lasts, mine, valid, now, elapsed, actions, driven, leaving):
                 leaving[b, a] = True
 
 
-class LogActionsDriver:
+class LogActionsDriver(Plain):
     """Vehicles carry out the actions inferred from their log, whatever comes of it.
 
     A vehicle leaves when its log ends.
     """
+
+    name = "log-actions"
 
     def __init__(self) -> None:
         """A driver without agents; `reset` gives it some."""
         self._mine = np.zeros((0, 0), dtype=bool)
         self._actions = np.zeros((0, 0, 0, 2), dtype=np.float32)
         self._lasts = np.zeros((0, 0, 0), dtype=bool)
-
-    @classmethod
-    def from_name(cls, argument: str, *, dt_s: float) -> "LogActionsDriver":
-        """The driver; it takes no argument.
-
-        Raises:
-            AspEnvError: there is one.
-        """
-        del dt_s
-        refuse_argument("log-actions", argument)
-        return cls()
 
     def reset(
         self,

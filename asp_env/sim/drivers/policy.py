@@ -5,38 +5,29 @@ from jaxtyping import Bool
 
 from asp_env.sim.drivers.driver import (
     Control,
+    Plain,
     areas,
     idle,
     outside,
-    refuse_argument,
     resized,
     vehicles,
 )
 from asp_env.sim.replay import ReplayWorld
 
 
-class PolicyDriver:
+class PolicyDriver(Plain):
     """The caller moves its agents by `Simulation.step_agents`.
 
     At a tick at which the caller does not, an agent goes on as it is: no acceleration, no steering.
     One that comes 10 m beyond all recorded positions then leaves.
     """
 
+    name = "policy"
+
     def __init__(self) -> None:
         """A driver without agents; `reset` gives it some."""
         self._mine = np.zeros((0, 0), dtype=bool)
         self._areas = np.zeros((0, 4))
-
-    @classmethod
-    def from_name(cls, argument: str, *, dt_s: float) -> "PolicyDriver":
-        """The driver; it takes no argument.
-
-        Raises:
-            AspEnvError: there is one.
-        """
-        del dt_s
-        refuse_argument("policy", argument)
-        return cls()
 
     def reset(
         self,
