@@ -81,10 +81,19 @@ def test_keys() -> None:
     assert playing.pressed("x") is playing
 
 
-def test_the_player_obeys_its_keys() -> None:
-    """It ends on q, whatever was pressed before."""
-    press("m", "space", "right", "n", "up", "q")
+def test_the_player_obeys_its_keys(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The next picture is of the next film, the one after it at twice the speed; q ends it."""
+    titles, keys, show = [], iter(("n", "up", "q")), Window.show
+
+    def press_at_each(window: Window, image: np.ndarray, title: str | None = None) -> None:
+        titles.append(title)
+        press(next(keys))
+        show(window, image, title)
+
+    monkeypatch.setattr(Window, "show", press_at_each)
     play(Playing(films=(FILM, OTHER)), size_px=SIZE, extent_m=60.0)
+    second = f"{OTHER.title} (2 of 2), speed"
+    assert titles == [f"{FILM.title} (1 of 2), speed 1", f"{second} 1", f"{second} 2"]
 
 
 def test_a_window_closed_by_its_user_stays_closed() -> None:
