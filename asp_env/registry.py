@@ -6,8 +6,8 @@ A plug is a line in the `pyproject.toml` of the package that ships it:
     my-predictor = "my_package.module:MyPredictor"
 
 Groups: `asp_env.predictors`, `asp_env.planners`, `asp_env.drivers` (who moves the traffic),
-`asp_env.sources` (schemes of DATA such as `synthetic:`), `asp_env.commands` (sub-commands of
-`asp-env`).
+`asp_env.sources` (schemes of DATA such as `synthetic:`), `asp_env.worlds` (where the data of such a
+scheme are driven, unless they are replayed), `asp_env.commands` (sub-commands of `asp-env`).
 """
 
 from functools import cache
@@ -16,7 +16,7 @@ from typing import Any, Literal
 
 from asp_env.errors import AspEnvError, unknown_name
 
-Group = Literal["predictors", "planners", "drivers", "sources", "commands"]
+Group = Literal["predictors", "planners", "drivers", "sources", "worlds", "commands"]
 
 
 @cache

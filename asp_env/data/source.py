@@ -79,6 +79,10 @@ class Recordings(Sequence[Any]):  # not of Recording: checking its items at run 
         chosen = [self._files[index] for index in indices]
         return Recordings(self.source, chosen, opened=self._opened)
 
+    def tracks_path(self, index: SupportsIndex) -> Path:
+        """The file with the tracks of one recording, beside which a package may keep more."""
+        return self._files[index].tracks
+
     def hashes(self) -> tuple[str, ...]:
         """Of each recording, a hash of the content of its files and its map.
 
@@ -134,12 +138,18 @@ def load(path: str | Path) -> Recordings:
     return open_data(path)
 
 
-def _resolve(source: str) -> Path:
+def scheme_of(source: str) -> str | None:
+    """What stands before the colon of DATA such as `synthetic:intersection`; None for a folder."""
     match = _SCHEME.match(source)
-    if match is None or Path(source).exists():
+    return None if match is None or Path(source).exists() else match.group(1)
+
+
+def _resolve(source: str) -> Path:
+    scheme = scheme_of(source)
+    if scheme is None:
         path = Path(source).expanduser().absolute()
         return path.resolve() if ".." in path.parts else path  # folders' names are places' names
-    scheme, argument = match.groups()
+    argument = source[len(scheme) + 1 :]
     if scheme == "sample":
         return _sample(argument)
     known = registry.names("sources")

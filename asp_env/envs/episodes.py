@@ -23,6 +23,7 @@ from asp_env.sim.sight import ego_sight
 from asp_env.sim.simulation import Simulation, ending
 from asp_env.sim.traffic import TrafficSpec, make_traffic
 from asp_env.sim.world import Ending, Events
+from asp_env.sim.worlds import world_of
 from asp_env.views import make_picture_view
 
 _ACTION_LIMITS = np.array([MAX_ACCELERATION_MPS2, MAX_STEERING_RAD], dtype=np.float32)
@@ -40,8 +41,8 @@ class ReplayOptions:
     """What the raster shows."""
     raster_px: tuple[int, int] | None = None
     """Height and width of the raster; by default the view's own."""
-    traffic: TrafficSpec = "log"
-    """Who moves the others."""
+    traffic: TrafficSpec | None = None
+    """Who moves the others; by default the world itself."""
     dt_s: float = DEFAULT_DT_S
     """Length of a tick."""
     reward_weights: Mapping[str, float] | None = None
@@ -86,12 +87,14 @@ class ReplayEpisodes:
         self.scenarios = self._starts.scenarios
         raster = make_picture_view(chosen.view, pixels=chosen.raster_px)
         self.observer = Observer(chosen.observations, raster, history)
+        kind = world_of(data)
         self.simulation = Simulation(
             self.recordings,
-            make_traffic(chosen.traffic, dt_s=chosen.dt_s),
+            make_traffic(chosen.traffic, dt_s=chosen.dt_s, default=kind.traffic),
             num_episodes=num_episodes,
             dt_s=chosen.dt_s,
             history=history,
+            kind=kind,
         )
         self._weights = weights_from(chosen.reward_weights or {})
         self._names = np.full(num_episodes, None, dtype=object)
@@ -110,6 +113,7 @@ class ReplayEpisodes:
             num_episodes=num_episodes,
             dt_s=world.dt_s,
             history=world.history,
+            kind=type(world),
         )
         self._names = np.full(num_episodes, None, dtype=object)
         self._tags = np.full(num_episodes, None, dtype=object)

@@ -18,7 +18,7 @@ from asp_env.data.source import Recordings
 from asp_env.envs.episodes import Outcome, ReplayEpisodes, as_actions
 from asp_env.render.live import MODES, Live
 from asp_env.sim.recorded import recorded_future
-from asp_env.sim.replay import ReplayWorld
+from asp_env.sim.scenario_world import ScenarioWorld
 
 NOT_BEGUN = "no episode has begun: call reset first"
 METADATA = {"render_modes": [*MODES], "render_fps": 5}
@@ -297,7 +297,7 @@ way, in its frame, m; beyond the end of the way straight on |
     def _info(self) -> dict[str, Any]:
         return {name: value.tolist()[0] for name, value in self._episodes.info().items()}
 
-    def _world(self) -> ReplayWorld:
+    def _world(self) -> ScenarioWorld:
         if self._start is None:
             raise gymnasium.error.ResetNeeded(NOT_BEGUN)
         return self._episodes.simulation.world

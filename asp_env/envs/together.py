@@ -13,8 +13,8 @@ from asp_env.data.scenario import Scenario
 from asp_env.errors import AspEnvError, unknown_name
 from asp_env.sim.drivers import Control, Driver
 from asp_env.sim.drivers.driver import vehicles
-from asp_env.sim.replay import ReplayWorld
 from asp_env.sim.reward import MIN_GOAL_M
+from asp_env.sim.scenario_world import ScenarioWorld
 from asp_env.sim.world import EGO
 
 
@@ -112,7 +112,7 @@ class TogetherDriver:
 
     def reset(
         self,
-        world: ReplayWorld,
+        world: ScenarioWorld,
         where: Bool[np.ndarray, " b"],
         mine: Bool[np.ndarray, "b a"] | None = None,
     ) -> None:
@@ -126,7 +126,7 @@ class TogetherDriver:
         traffic[1:] = False
         self._traffic.reset(world, where, traffic)
 
-    def control(self, world: ReplayWorld) -> Control:
+    def control(self, world: ScenarioWorld) -> Control:
         """What everybody but the ego does in each row."""
         said = self._traffic.control(world)
         known, agent = self._slots >= 0, self._agents >= 0

@@ -2,7 +2,7 @@
 
 from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import product
 from pathlib import Path
 from typing import Annotated, Any
@@ -36,6 +36,7 @@ from asp_env.planning.planner import Planner, load_planner
 from asp_env.sim.drivers import Driver
 from asp_env.sim.traffic import make_traffic
 from asp_env.sim.world import Ending
+from asp_env.sim.worlds import world_of
 
 EPISODES_AT_ONCE = 64
 
@@ -61,9 +62,10 @@ class Drive:
         "constant-velocity",
     )
     """Predictors by name, each in a run of its own."""
-    traffic: str = "log"
+    traffic: str | None = None
     """Who drives everybody else: a driver such as log, log-actions, idm, hybrid or predictor:NAME,
-    or a table such as default=idm,truck=log,17=predictor:constant-velocity."""
+    or a table such as default=idm,truck=log,17=predictor:constant-velocity. By default as the
+    world has it: log for recordings, own for highway:…"""
     scenarios: Annotated[str, tyro.conf.arg(metavar="FILTER|FILE")] = ""
     """Which: tags and comparisons, such as 'left,!stopping,length>=8', or a scenarios.json."""
     most: int | None = None
@@ -123,7 +125,10 @@ class ClosedLoop:
 
 def drive(config: Drive) -> ClosedLoop:
     """Drives with every predictor, the expert first."""
-    traffic = make_traffic(config.traffic, dt_s=config.dt)  # refused before anything is computed
+    kind = world_of(config.data)
+    config = replace(config, traffic=config.traffic or kind.traffic)
+    # refused before anything is computed
+    traffic = make_traffic(config.traffic, dt_s=config.dt, default=kind.traffic)
     preset = find_preset(config.metrics)
     recordings = open_data(config.data)
     horizon, history = ticks(config.horizon, config.dt), ticks(HISTORY_S, config.dt)
@@ -221,6 +226,7 @@ def _drive_all(
             predictor,
             preset=preset,
             traffic=traffic,
+            kind=world_of(config.data),
             horizon=horizon,
             history=history,
             dt_s=config.dt,
@@ -272,7 +278,7 @@ def _rows(
                 view=run.about.get("view", ""),
                 preset=run.about.get("preset", ""),
                 planner=run.planner,
-                traffic=config.traffic,
+                traffic=config.traffic or "",
                 latency_ticks=0,
                 horizon_s=config.horizon,
                 rules=preset.label,

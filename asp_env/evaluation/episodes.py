@@ -29,6 +29,7 @@ from asp_env.metrics.ttc import time_to_collision
 from asp_env.planning.planner import Plan, Planner
 from asp_env.sim.recorded import recorded_future
 from asp_env.sim.replay import ReplayWorld
+from asp_env.sim.scenario_world import ScenarioWorld
 from asp_env.sim.simulation import Simulation, ending
 from asp_env.sim.traffic import TrafficSpec, make_traffic
 from asp_env.sim.world import EGO, Ending, Events
@@ -68,7 +69,8 @@ def drive_episodes(
     predictor: Predictor,
     *,
     preset: Preset,
-    traffic: TrafficSpec,
+    traffic: TrafficSpec | None,
+    kind: type[ScenarioWorld] = ReplayWorld,
     horizon: int,
     history: int,
     dt_s: float,
@@ -78,9 +80,13 @@ def drive_episodes(
     A planner that is privileged is the logged driver: the world replays its ego. What costs more
     than contacts and the road is measured at the end, of all ticks at once, as `preset` has it.
     """
-    driver = make_traffic(traffic, dt_s=dt_s)
     simulation = Simulation(
-        recordings, driver, num_episodes=len(scenarios), dt_s=dt_s, history=history
+        recordings,
+        make_traffic(traffic, dt_s=dt_s, default=kind.traffic),
+        num_episodes=len(scenarios),
+        dt_s=dt_s,
+        history=history,
+        kind=kind,
     )
     world = simulation.world
     generators = [np.random.default_rng(scenario.seed) for scenario in scenarios]
@@ -104,7 +110,7 @@ def drive_episodes(
 
 
 def _decide(
-    world: ReplayWorld,
+    world: ScenarioWorld,
     running: Bool[np.ndarray, " b"],
     planner: Planner,
     predictor: Predictor,
@@ -131,7 +137,7 @@ def _near(scene: Scene, running: Bool[np.ndarray, " b"]) -> Int[np.ndarray, "t 2
 
 
 def _measure(
-    world: ReplayWorld,
+    world: ScenarioWorld,
     events: Sequence[Events],
     lasted: Bool[np.ndarray, "b t"],
     preset: Preset,
@@ -178,7 +184,7 @@ def _measure(
 
 
 def _collect(
-    world: ReplayWorld,
+    world: ScenarioWorld,
     scenarios: Sequence[Scenario],
     drives: Drives,
     preset: Preset,
@@ -210,7 +216,7 @@ def _collect(
 
 
 def _rollout(
-    world: ReplayWorld,
+    world: ScenarioWorld,
     scenario: Scenario,
     b: int,
     count: int,

@@ -5,11 +5,11 @@ from jaxtyping import Bool
 
 from asp_env.metrics.masked import Masked
 from asp_env.metrics.realism import features, realism
-from asp_env.sim.replay import ReplayWorld
+from asp_env.sim.scenario_world import ScenarioWorld
 from asp_env.sim.world import EGO
 
 
-def traffic_realism(world: ReplayWorld, lasted: Bool[np.ndarray, "b t"]) -> dict[str, Masked]:
+def traffic_realism(world: ScenarioWorld, lasted: Bool[np.ndarray, "b t"]) -> dict[str, Masked]:
     """`realism` (b,) of each episode's traffic, simulated once; missing where all was replayed.
 
     Of the agents present at the first tick, but the ego, those count that ever were elsewhere than

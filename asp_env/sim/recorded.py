@@ -4,10 +4,10 @@ import numpy as np
 
 from asp_env.data.scene import Scene
 from asp_env.data.snippets import Future, SnippetIndex, gather_ticks
-from asp_env.sim.replay import ReplayWorld
+from asp_env.sim.scenario_world import ScenarioWorld
 
 
-def recorded_future(world: ReplayWorld, scene: Scene, horizon: int) -> Future:
+def recorded_future(world: ScenarioWorld, scene: Scene, horizon: int) -> Future:
     """What the recordings say of the coming ticks of the scene's targets, whatever drives them."""
     episodes, b, a = world.episodes, scene.targets[:, 0], scene.targets[:, 1]
     index = SnippetIndex(

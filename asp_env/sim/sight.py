@@ -7,7 +7,7 @@ from jaxtyping import Bool, Float, Int
 
 from asp_env.data.road_map import RoadMap
 from asp_env.sim.kernels import last_ticks
-from asp_env.sim.replay import ReplayWorld
+from asp_env.sim.scenario_world import ScenarioWorld
 from asp_env.sim.world import EGO
 
 
@@ -39,7 +39,7 @@ class Sight:
         return self.states.shape[2] - 1
 
 
-def ego_sight(world: ReplayWorld, rows: Int[np.ndarray, " n"] | None = None) -> Sight:
+def ego_sight(world: ScenarioWorld, rows: Int[np.ndarray, " n"] | None = None) -> Sight:
     """What the egos of some episodes see, by default of all; situation i is episode `rows[i]`."""
     data = world.episodes
     maps, map_index = world.maps()

@@ -2,6 +2,7 @@
 
 import copy
 from collections.abc import Sequence
+from typing import Any
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
@@ -9,7 +10,8 @@ from jaxtyping import Bool, Float, Int
 from asp_env.data.recording import Recording
 from asp_env.data.scenario import Scenario
 from asp_env.sim.drivers import Driver
-from asp_env.sim.replay import ReplayWorld, Snapshot
+from asp_env.sim.replay import ReplayWorld
+from asp_env.sim.scenario_world import ScenarioWorld
 from asp_env.sim.world import EGO, Ending, Events
 
 OFF_ROAD_END_M = 2.0
@@ -29,9 +31,19 @@ class Simulation:
         num_episodes: int,
         dt_s: float,
         history: int,
+        kind: type[ScenarioWorld] = ReplayWorld,
     ) -> None:
-        """Episodes begin with `reset`."""
-        self.world = ReplayWorld(recordings, num_episodes=num_episodes, dt_s=dt_s, history=history)
+        """Episodes begin with `reset`.
+
+        Args:
+            recordings: of the scenarios to come.
+            driver: of the traffic.
+            num_episodes: B.
+            dt_s: length of a tick.
+            history: past ticks that scenes show.
+            kind: of the world, see `asp_env.sim.worlds.world_of`.
+        """
+        self.world = kind(recordings, num_episodes=num_episodes, dt_s=dt_s, history=history)
         self.driver = driver
 
     def reset(
@@ -70,11 +82,11 @@ class Simulation:
             control.leaving & ~driven,
         )
 
-    def snapshot(self) -> tuple[Snapshot, Driver]:
+    def snapshot(self) -> tuple[Any, Driver]:
         """The whole state, the driver's memory included, to be handed to `restore`."""
         return self.world.snapshot(), copy.deepcopy(self.driver)
 
-    def restore(self, snapshot: tuple[Snapshot, Driver]) -> None:
+    def restore(self, snapshot: tuple[Any, Driver]) -> None:
         """Goes back to a snapshot, bit for bit."""
         world, driver = snapshot
         self.world.restore(world)

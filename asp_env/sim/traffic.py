@@ -13,7 +13,8 @@ from asp_env.data.clock import DEFAULT_DT_S
 from asp_env.errors import AspEnvError, DataError
 from asp_env.sim.drivers import Control, Driver, DriverPlug
 from asp_env.sim.drivers.driver import idle, resized, vehicles
-from asp_env.sim.replay import ReplayWorld
+from asp_env.sim.drivers.log import LogDriver
+from asp_env.sim.scenario_world import ScenarioWorld
 
 TrafficSpec = str | Driver | Mapping[Any, str | Driver]
 """A driver or its name, or a table from ids, names of classes and `default` to those."""
@@ -51,7 +52,7 @@ class Traffic:
 
     def reset(
         self,
-        world: ReplayWorld,
+        world: ScenarioWorld,
         where: Bool[np.ndarray, " b"],
         mine: Bool[np.ndarray, "b a"] | None = None,
     ) -> None:
@@ -68,7 +69,7 @@ class Traffic:
             if theirs.any():
                 driver.reset(world, where, theirs.copy())
 
-    def control(self, world: ReplayWorld) -> Control:
+    def control(self, world: ScenarioWorld) -> Control:
         """What all of them say, each of its own agents."""
         merged = idle(world.episodes.ids.shape)
         for driver, theirs in zip(self.drivers, self._masks, strict=True):
@@ -80,18 +81,24 @@ class Traffic:
         return merged
 
 
-def make_traffic(spec: TrafficSpec, *, dt_s: float = DEFAULT_DT_S) -> Driver:
+def make_traffic(
+    spec: TrafficSpec | None, *, dt_s: float = DEFAULT_DT_S, default: str = LogDriver.name
+) -> Driver:
     """The driver, or table of drivers, of all agents that the caller does not move.
 
     Args:
         spec: a driver, or the name of one such as `idm` or `predictor:ssp-asp:RUN`; or a table
             `{"default": "idm", "truck": "log", 17: driver}`, which as text is
-            `default=idm,truck=log,17=policy`. Without a default, the others replay their log.
+            `default=idm,truck=log,17=policy`. None, and a table without a default, leave the
+            others to the world.
         dt_s: the time step of the world to come, for drivers that depend on it.
+        default: the name of the driver that leaves everybody to the world to come.
 
     Raises:
         AspEnvError: a name is unknown, or a key is neither an id, a vehicle's class nor `default`.
     """
+    if spec is None:
+        spec = default
     if isinstance(spec, str):
         if "=" not in spec.partition(":")[0]:
             return _make_driver(spec, dt_s)
@@ -100,7 +107,7 @@ def make_traffic(spec: TrafficSpec, *, dt_s: float = DEFAULT_DT_S) -> Driver:
         if not isinstance(spec, Driver):
             raise AspEnvError(f"traffic {spec!r}: expected the name of a driver or a table of them")
         return spec
-    return _make_table({DEFAULT: "log", **spec}, dt_s)
+    return _make_table({DEFAULT: default, **spec}, dt_s)
 
 
 def _parse(text: str) -> dict[str, str]:

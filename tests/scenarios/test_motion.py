@@ -4,8 +4,8 @@ import numpy as np
 from hypothesis import given
 from hypothesis import strategies as st
 
+from scenarios.noise import measure, savitzky_golay
 from scenarios.synthetic.motion import ease_lane_changes, gaussian, reconstruct
-from scenarios.synthetic.noise import measure, savitzky_golay
 
 
 def straight(speeds: np.ndarray, *, heading: float = 0.0) -> np.ndarray:

@@ -13,7 +13,8 @@ import pytest
 from asp_env import registry
 from asp_env.data.source import load
 from asp_env.errors import AspEnvError, MissingExtraError
-from scenarios.synthetic import Synthesize, open_source, plugs, synthesize
+from scenarios.synthesize import Synthesize
+from scenarios.synthetic import open_source, plugs, synthesize
 
 SAMPLES = Path(__file__).parents[2] / "asp_env" / "samples"
 

@@ -127,7 +127,7 @@ def test_nothing_is_computed_that_nobody_asked_for(monkeypatch):
 
     simulation = simulate(on_road(), scenario())
     monkeypatch.setattr(type(VIEW), "draw", refuse)
-    monkeypatch.setattr("asp_env.sim.replay.ReplayWorld.scene", refuse)
+    monkeypatch.setattr("asp_env.sim.scenario_world.ScenarioWorld.scene", refuse)
     _observe(simulation, "actions", "state")
     monkeypatch.setattr("asp_env.sim.observed.infer_actions", refuse)
     _observe(simulation, "vectors", "route")

@@ -9,7 +9,7 @@ from numba import njit
 
 from asp_env.dynamics import MAX_ACCELERATION_MPS2
 from asp_env.metrics.boxes import overlaps
-from asp_env.sim.replay import ReplayWorld
+from asp_env.sim.scenario_world import ScenarioWorld
 
 SPARE_M = 0.5
 
@@ -50,7 +50,7 @@ def _bar(states, valid, log_states, log_valid, sizes, mine, gone, now, dt, out):
                 )
 
 
-def barred(world: ReplayWorld, mine: Bool[np.ndarray, "b a"]) -> Bool[np.ndarray, "b a"]:
+def barred(world: ScenarioWorld, mine: Bool[np.ndarray, "b a"]) -> Bool[np.ndarray, "b a"]:
     """Whose logged place at the next tick, at which it would appear, is taken.
 
     So is it if somebody stands, or drives more slowly the same way, nearer than the vehicle could

@@ -8,7 +8,7 @@ from jaxtyping import Bool, Float, Shaped
 
 from asp_env.data.classes import PREDICTED, AgentClass
 from asp_env.errors import AspEnvError
-from asp_env.sim.replay import ReplayWorld
+from asp_env.sim.scenario_world import ScenarioWorld
 from asp_env.sim.world import EGO
 
 Value = TypeVar("Value")
@@ -39,7 +39,7 @@ class Driver(Protocol):
 
     def reset(
         self,
-        world: ReplayWorld,
+        world: ScenarioWorld,
         where: Bool[np.ndarray, " b"],
         mine: Bool[np.ndarray, "b a"] | None = None,
     ) -> None:
@@ -53,7 +53,7 @@ class Driver(Protocol):
         """
         ...
 
-    def control(self, world: ReplayWorld) -> Control:
+    def control(self, world: ScenarioWorld) -> Control:
         """What its agents do from now to the next tick; nothing for anybody else."""
         ...
 
@@ -84,7 +84,7 @@ class Shared(Generic[Value]):
         return self
 
 
-def vehicles(world: ReplayWorld) -> Bool[np.ndarray, "b a"]:
+def vehicles(world: ScenarioWorld) -> Bool[np.ndarray, "b a"]:
     """Who can be driven: vehicles and bicycles that are not parked, but not the ego.
 
     Pedestrians, animals, trailers and parked vehicles always replay.
@@ -115,7 +115,7 @@ def resized(array: Shaped[np.ndarray, "..."], shape: tuple[int, ...]) -> Shaped[
     return out
 
 
-def areas(world: ReplayWorld) -> Float[np.ndarray, "b 4"]:
+def areas(world: ScenarioWorld) -> Float[np.ndarray, "b 4"]:
     """Of each episode, smallest x and y and largest x and y beyond which an agent leaves."""
     numbers, index = np.unique(world.episodes.recording, return_inverse=True)
     found = np.array([world.recordings[int(number)].extent_m for number in numbers])
@@ -129,6 +129,19 @@ def outside(
     x, y = states[..., 0], states[..., 1]
     low_x, low_y, high_x, high_y = (area[:, i, None] for i in range(4))
     return (x < low_x) | (x > high_x) | (y < low_y) | (y > high_y)
+
+
+def check_replayed(world: ScenarioWorld, who: str) -> None:
+    """Refuses a world in which those whom nobody drives do not replay their log.
+
+    Raises:
+        AspEnvError: this is one.
+    """
+    if world.traffic != "log":
+        raise AspEnvError(
+            f"traffic {who}: in this world nobody replays a log, its vehicles drive themselves; "
+            f"use {world.traffic}, idm or predictor:NAME, or recordings in a folder as DATA"
+        )
 
 
 class Plain:

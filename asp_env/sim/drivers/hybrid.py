@@ -9,9 +9,9 @@ from numba import njit
 
 from asp_env.dynamics import MAX_ACCELERATION_MPS2
 from asp_env.metrics.boxes import overlaps
-from asp_env.sim.drivers.driver import Control, Plain, resized, vehicles
+from asp_env.sim.drivers.driver import Control, Plain, check_replayed, resized, vehicles
 from asp_env.sim.drivers.idm import IDMDriver
-from asp_env.sim.replay import ReplayWorld
+from asp_env.sim.scenario_world import ScenarioWorld
 from asp_env.sim.world import EGO
 
 HORIZON_S = 2.0
@@ -122,17 +122,22 @@ class HybridDriver(Plain):
 
     def reset(
         self,
-        world: ReplayWorld,
+        world: ScenarioWorld,
         where: Bool[np.ndarray, " b"],
         mine: Bool[np.ndarray, "b a"] | None = None,
     ) -> None:
-        """In the new episodes nobody has turned."""
+        """In the new episodes nobody has turned.
+
+        Raises:
+            AspEnvError: the world replays nobody.
+        """
+        check_replayed(world, self.name)
         self._mine = vehicles(world) if mine is None else mine
         self._turned = resized(self._turned, self._mine.shape)
         self._turned[where] = False
         self._idm.reset(world, where, self._mine)
 
-    def control(self, world: ReplayWorld) -> Control:
+    def control(self, world: ScenarioWorld) -> Control:
         """What the law says for those who have turned; the others replay."""
         episodes = world.episodes
         _turn(

@@ -10,7 +10,7 @@ from asp_env.sim.drivers.driver import Control, Plain, idle, resized, vehicles
 from asp_env.sim.drivers.paths import Paths
 from asp_env.sim.drivers.yielding import follow_and_yield
 from asp_env.sim.idm import IDM
-from asp_env.sim.replay import ReplayWorld
+from asp_env.sim.scenario_world import ScenarioWorld
 
 HALTED_M = 1.0
 """A vehicle that is to halt has done so within this distance of the place."""
@@ -42,7 +42,7 @@ class IDMDriver(Plain):
 
     def reset(
         self,
-        world: ReplayWorld,
+        world: ScenarioWorld,
         where: Bool[np.ndarray, " b"],
         mine: Bool[np.ndarray, "b a"] | None = None,
     ) -> None:
@@ -65,7 +65,7 @@ class IDMDriver(Plain):
         self.conflicts.deal(self._numbers, self._mine, self._arcs, where, self.ahead)
         self._arcs[where] = -1.0
 
-    def control(self, world: ReplayWorld) -> Control:
+    def control(self, world: ScenarioWorld) -> Control:
         """What the law says for the present states."""
         control = self.drive(world, self._mine)
         stays_away = barred(world, self._mine)
@@ -73,7 +73,7 @@ class IDMDriver(Plain):
             actions=control.actions, driven=control.driven, leaving=control.leaving | stays_away
         )
 
-    def drive(self, world: ReplayWorld, some: Bool[np.ndarray, "b a"]) -> Control:
+    def drive(self, world: ScenarioWorld, some: Bool[np.ndarray, "b a"]) -> Control:
         """The same for some of its agents, while the others are moved by somebody else."""
         episodes, paths, ahead = world.episodes, self._paths, self.ahead
         rows, now = np.arange(len(world)), world.now

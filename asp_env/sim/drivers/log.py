@@ -7,8 +7,15 @@ from jaxtyping import Bool
 from numba import njit
 
 from asp_env.dynamics import inverse
-from asp_env.sim.drivers.driver import Control, Plain, idle, resized, vehicles
-from asp_env.sim.replay import ReplayWorld
+from asp_env.sim.drivers.driver import (
+    Control,
+    Plain,
+    check_replayed,
+    idle,
+    resized,
+    vehicles,
+)
+from asp_env.sim.scenario_world import ScenarioWorld
 
 
 class LogDriver(Plain):
@@ -18,13 +25,19 @@ class LogDriver(Plain):
 
     def reset(
         self,
-        world: ReplayWorld,
+        world: ScenarioWorld,
         where: Bool[np.ndarray, " b"],
         mine: Bool[np.ndarray, "b a"] | None = None,
     ) -> None:
-        """Nothing to prepare."""
+        """Nothing to prepare.
 
-    def control(self, world: ReplayWorld) -> Control:
+        Raises:
+            AspEnvError: the world replays nobody.
+        """
+        del where, mine
+        check_replayed(world, self.name)
+
+    def control(self, world: ScenarioWorld) -> Control:
         """Nobody is driven: the world replays."""
         return idle(world.episodes.ids.shape)
 
@@ -60,7 +73,7 @@ class LogActionsDriver(Plain):
 
     def reset(
         self,
-        world: ReplayWorld,
+        world: ScenarioWorld,
         where: Bool[np.ndarray, " b"],
         mine: Bool[np.ndarray, "b a"] | None = None,
     ) -> None:
@@ -77,7 +90,7 @@ class LogActionsDriver(Plain):
         actions = inverse(states[:, :-1], states[:, 1:], lengths, world.dt_s)
         self._actions[where], self._lasts[where] = np.where(lasts[..., None], actions, 0), lasts
 
-    def control(self, world: ReplayWorld) -> Control:
+    def control(self, world: ScenarioWorld) -> Control:
         """The logged actions of this tick; somebody who leaves a gap in its log is gone."""
         episodes = world.episodes
         out = idle(episodes.ids.shape)

@@ -12,7 +12,7 @@ from asp_env.sim.drivers.driver import (
     resized,
     vehicles,
 )
-from asp_env.sim.replay import ReplayWorld
+from asp_env.sim.scenario_world import ScenarioWorld
 
 
 class PolicyDriver(Plain):
@@ -31,7 +31,7 @@ class PolicyDriver(Plain):
 
     def reset(
         self,
-        world: ReplayWorld,
+        world: ScenarioWorld,
         where: Bool[np.ndarray, " b"],
         mine: Bool[np.ndarray, "b a"] | None = None,
     ) -> None:
@@ -40,7 +40,7 @@ class PolicyDriver(Plain):
         self._areas = resized(self._areas, (len(world), 4))
         self._areas[where] = areas(world)[where]
 
-    def control(self, world: ReplayWorld) -> Control:
+    def control(self, world: ScenarioWorld) -> Control:
         """Straight on, for those whom the caller leaves alone."""
         episodes, rows = world.episodes, np.arange(len(world))
         driven = self._mine & episodes.valid[rows, world.now]

@@ -10,7 +10,7 @@ from asp_env.dynamics import clip_actions, inverse
 from asp_env.errors import AspEnvError
 from asp_env.sim.drivers.driver import Control, Shared, areas, outside, resized, vehicles
 from asp_env.sim.recorded import recorded_future
-from asp_env.sim.replay import ReplayWorld
+from asp_env.sim.scenario_world import ScenarioWorld
 
 EVERY_TICKS = 5
 MODES = ("most-probable", "sampled")
@@ -88,7 +88,7 @@ class PredictorDriver:
 
     def reset(
         self,
-        world: ReplayWorld,
+        world: ScenarioWorld,
         where: Bool[np.ndarray, " b"],
         mine: Bool[np.ndarray, "b a"] | None = None,
     ) -> None:
@@ -111,7 +111,7 @@ class PredictorDriver:
         self._areas[where] = areas(world)[where]
         self._made[where] = NEVER
 
-    def control(self, world: ReplayWorld) -> Control:
+    def control(self, world: ScenarioWorld) -> Control:
         """The next action of the latest forecast, which is made now where it is due."""
         episodes, rows, now = world.episodes, np.arange(len(world)), world.now
         elapsed = episodes.elapsed[:, None]
@@ -129,7 +129,7 @@ class PredictorDriver:
             actions=np.where(driven[..., None], actions, 0), driven=driven, leaving=leaving
         )
 
-    def _forecast(self, world: ReplayWorld, targets: Int[np.ndarray, "t 2"]) -> None:
+    def _forecast(self, world: ScenarioWorld, targets: Int[np.ndarray, "t 2"]) -> None:
         predictor = self._predictor.value
         scene = world.scene().with_targets(targets)
         future = recorded_future(world, scene, predictor.horizon) if predictor.privileged else None
@@ -145,7 +145,7 @@ class PredictorDriver:
         )
         self._actions[targets[:, 0], targets[:, 1]] = clip_actions(actions)
 
-    def _modes(self, world: ReplayWorld, forecast: Forecast) -> Int[np.ndarray, " t"]:
+    def _modes(self, world: ScenarioWorld, forecast: Forecast) -> Int[np.ndarray, " t"]:
         if not self.sampled:
             return forecast.most_probable
         episode = forecast.targets[:, 0]
