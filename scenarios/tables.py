@@ -7,8 +7,6 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float
 
-from scenarios.synthetic.motion import FRAME_RATE_HZ
-
 RECORDING_META_COLUMNS = (
     "recordingId", "locationId", "frameRate", "speedLimit", "weekday", "startTime", "duration",
     "numTracks", "numVehicles", "numVRUs", "latLocation", "lonLocation", "xUtmOrigin",
@@ -57,6 +55,7 @@ class Meta:
 
     recording: int
     location: int
+    frame_rate_hz: float
     speed_limit_mps: float
     weekday: str
     start_hour: int
@@ -71,8 +70,8 @@ def write_recording_meta(path: Path, meta: Meta, tracks: list[Track]) -> None:
     """Writes `XX_recordingMeta.csv`."""
     vulnerable = sum(track.kind in VULNERABLE for track in tracks)
     values = (
-        meta.recording, meta.location, FRAME_RATE_HZ, f"{meta.speed_limit_mps:.2f}", meta.weekday,
-        meta.start_hour, f"{meta.num_frames / FRAME_RATE_HZ:.2f}", len(tracks),
+        meta.recording, meta.location, meta.frame_rate_hz, f"{meta.speed_limit_mps:.2f}",
+        meta.weekday, meta.start_hour, f"{meta.num_frames / meta.frame_rate_hz:.2f}", len(tracks),
         len(tracks) - vulnerable, vulnerable, f"{meta.lat_deg:.6f}", f"{meta.lon_deg:.6f}",
         *(f"{value:.2f}" for value in meta.utm_origin_m), f"{meta.metres_per_ortho_pixel:.5f}",
     )  # fmt: skip

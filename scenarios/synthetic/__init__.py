@@ -6,6 +6,6 @@ vehicles with two axles (`motion`) and written as a camera above the place would
 """
 
 from scenarios.synthetic.dataset import synthesize
-from scenarios.synthetic.plugs import Synthesize, open_source
+from scenarios.synthetic.plugs import open_source
 
-__all__ = ["Synthesize", "open_source", "synthesize"]
+__all__ = ["open_source", "synthesize"]

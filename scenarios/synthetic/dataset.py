@@ -1,10 +1,7 @@
 """A folder of recordings in the inD layout."""
 
-import os
 import shutil
 import tempfile
-from collections.abc import Iterator
-from contextlib import contextmanager
 from pathlib import Path
 
 import numpy as np
@@ -15,13 +12,14 @@ from asp_env.errors import AspEnvError, unknown_name
 from scenarios.synthetic.motion import FRAME_RATE_HZ
 from scenarios.synthetic.picture import METRES_PER_ORTHO_PIXEL
 from scenarios.synthetic.place import SITES, Place, make_place
-from scenarios.synthetic.tables import (
+from scenarios.synthetic.traffic import parked_cars, record, tracks_in_view
+from scenarios.tables import (
     Meta,
     write_recording_meta,
     write_tracks,
     write_tracks_meta,
 )
-from scenarios.synthetic.traffic import parked_cars, record, tracks_in_view
+from scenarios.written import written_aside
 
 MAX_SECONDS = 24 * 3600.0
 RECORDINGS_PER_LOCATION = 3
@@ -68,7 +66,7 @@ def synthesize(
             "cannot be made: at least one recording of a second and more, at least one location "
             "and no more than recordings, and a seed of 0 or above"
         )
-    with _written_aside(out) as folder, tempfile.TemporaryDirectory() as scratch:
+    with written_aside(out) as folder, tempfile.TemporaryDirectory() as scratch:
         made: dict[int, Place] = {}
         for recording in with_progress(
             range(recordings),
@@ -130,6 +128,7 @@ def _write_recording(
     meta = Meta(
         recording=recording,
         location=location,
+        frame_rate_hz=FRAME_RATE_HZ,
         speed_limit_mps=place.site.speed_limit_mps,
         weekday=str(rng.choice(_DAYS)),
         start_hour=int(rng.integers(7, 19)),
@@ -145,28 +144,3 @@ def _write_recording(
     write_recording_meta(Path(f"{stem}recordingMeta.csv"), meta, seen)
     write_tracks_meta(Path(f"{stem}tracksMeta.csv"), recording, seen)
     write_tracks(Path(f"{stem}tracks{suffix}"), recording, seen)
-
-
-@contextmanager
-def _written_aside(out: Path) -> Iterator[Path]:
-    """A folder beside `out` that takes its place when all went well, and else disappears."""
-    out = out.absolute()
-    if out.exists() and (not out.is_dir() or any(out.iterdir())):
-        raise AspEnvError(f"{out} is not an empty folder: give one that is, or a new name")
-    try:
-        out.parent.mkdir(parents=True, exist_ok=True)
-        aside = Path(tempfile.mkdtemp(prefix=f".{out.name}-", dir=out.parent))
-    except OSError as error:
-        raise AspEnvError(
-            f"cannot write to {out.parent} ({error.strerror}): give a folder that can be written"
-        ) from error
-    try:
-        yield aside
-        aside.chmod(0o755)
-        if out.exists():
-            out.rmdir()
-        os.rename(aside, out)
-    except OSError as error:
-        raise AspEnvError(f"cannot write {out} ({error.strerror or error})") from error
-    finally:
-        shutil.rmtree(aside, ignore_errors=True)

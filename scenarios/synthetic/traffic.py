@@ -3,13 +3,13 @@
 import numpy as np
 from jaxtyping import Float
 
+from scenarios.noise import measure
 from scenarios.synthetic.demand import RoadUser, demand
 from scenarios.synthetic.motion import FRAME_RATE_HZ, Motion, reconstruct
-from scenarios.synthetic.noise import measure
 from scenarios.synthetic.overlaps import overlapping
 from scenarios.synthetic.place import Place
 from scenarios.synthetic.sumo import Movements, simulate
-from scenarios.synthetic.tables import Track
+from scenarios.tables import Track
 
 WARM_UP_S = 80.0
 """Before the recording begins, so that the place is full when it does."""
