@@ -1,0 +1,186 @@
+"""A folder of highway-env's traffic in the inD layout, with what its vehicles had in mind."""
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from rich.console import Console
+from rich.progress import track as with_progress
+
+from asp_env.errors import AspEnvError, unknown_name
+from scenarios.highway.history import FOLDER, HiddenHistory
+from scenarios.highway.map import ORIGIN_LAT_LON_DEG, ORIGIN_UTM_M, write_road_map
+from scenarios.highway.rounds import KEPT_EVERY, ROUND_S, Round, Seen, simulate_round
+from scenarios.highway.sites import SITES, STEP_S, STEPS_PER_S, Site, network
+from scenarios.noise import measure
+from scenarios.tables import Meta, Track, write_recording_meta, write_tracks, write_tracks_meta
+from scenarios.written import written_aside
+
+MOST_MINUTES = 60.0
+SMOOTHED_FRAMES = 13
+"""What noisy positions are smoothed over: 0.87 s, as in the other synthetic traffic."""
+NO_PICTURE_M = 0.1
+"""Metres per pixel of a picture that there is not; the layout wants a number."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class _Recorded:
+    """The rounds of one recording, one after the other."""
+
+    vehicles: list[Seen]
+    hidden: HiddenHistory
+
+
+def synthesize(
+    out: Path,
+    *,
+    site: str,
+    recordings: int,
+    minutes: float,
+    seed: int,
+    noise: bool = False,
+    progress: bool = False,
+) -> None:
+    """Writes highway-env's traffic in the inD layout, 15 frames a second.
+
+    Each recording is a sequence of rounds of 20 s, which are highway-env's own episodes with the
+    ego as one of the traffic; from one round to the next all vehicles are others.
+
+    Args:
+        out: folder to make; may exist if it is empty.
+        site: `intersection` or `roundabout`.
+        recordings: how many.
+        minutes: length of each, rounded up to whole rounds.
+        seed: same seed, same bytes on the same machine.
+        noise: whether to write measured instead of true tracks; the truth goes to
+            `truth/XX_trueTracks.csv`, which no reader takes for a recording.
+        progress: whether to show a progress bar.
+
+    Raises:
+        AspEnvError: an unknown site, an impossible number, or a folder that cannot be written.
+    """
+    if site not in SITES:
+        raise unknown_name("site", f"highway:{site}", [f"highway:{name}" for name in SITES])
+    if recordings < 1 or not 0.0 < minutes <= MOST_MINUTES or seed < 0:
+        raise AspEnvError(
+            f"{recordings} recordings of {minutes} minutes with seed {seed} cannot be made: at "
+            f"least one recording, at most {MOST_MINUTES:g} minutes, and a seed of 0 or above"
+        )
+    place = SITES[site]
+    rounds = int(np.ceil(minutes * 60.0 / ROUND_S - 1e-9))
+    with written_aside(out) as folder:
+        maps = folder / "maps" / "lanelets" / f"00_{site}"
+        maps.mkdir(parents=True)
+        write_road_map(maps / "location0.osm", network(site), origin_utm_m=ORIGIN_UTM_M)
+        for name in ("data", FOLDER):
+            (folder / name).mkdir()
+        for number in with_progress(
+            range(recordings),
+            f"highway-env {site} traffic",
+            console=Console(stderr=True),
+            disable=not progress,
+        ):
+            rng = np.random.default_rng([seed, [*SITES].index(site), number])
+            recorded = _record(place, rng, rounds)
+            _write(folder, place, recorded, rng, number=number, rounds=rounds, noise=noise)
+
+
+def _record(site: Site, rng: np.random.Generator, rounds: int) -> _Recorded:
+    frames = ROUND_S * STEPS_PER_S
+    vehicles: list[Seen] = []
+    rows, counts, steps = [], [], []
+    for number in range(rounds):
+        found: Round = simulate_round(site, rng, frames=frames)
+        for each in found.hidden:
+            each["track"] += len(vehicles)
+        for seen in found.seen:
+            seen.first_frame += number * frames
+        vehicles += found.seen
+        rows += found.hidden
+        counts += [len(each) for each in found.hidden]
+        steps.append(found.steps)
+    assert frames % KEPT_EVERY == 0
+    return _Recorded(
+        vehicles=vehicles,
+        hidden=HiddenHistory(
+            site=site,
+            rows=np.concatenate(rows),
+            starts=np.concatenate([[0], np.cumsum(counts)]),
+            steps=np.concatenate(steps),
+        ),
+    )
+
+
+def _write(
+    folder: Path,
+    site: Site,
+    recorded: _Recorded,
+    rng: np.random.Generator,
+    *,
+    number: int,
+    rounds: int,
+    noise: bool,
+) -> None:
+    stem = f"{number:02d}"
+    true = [_track(site, seen) for seen in recorded.vehicles]
+    shown = [_measured(rng, track) for track in true] if noise else true
+    lat, lon = ORIGIN_LAT_LON_DEG
+    meta = Meta(
+        recording=number,
+        location=0,
+        frame_rate_hz=float(STEPS_PER_S),
+        speed_limit_mps=site.speed_limit_mps,
+        weekday="monday",
+        start_hour=8,
+        num_frames=rounds * ROUND_S * STEPS_PER_S,
+        lat_deg=lat,
+        lon_deg=lon,
+        utm_origin_m=ORIGIN_UTM_M,
+        metres_per_ortho_pixel=NO_PICTURE_M,
+    )
+    if noise:
+        (folder / "truth").mkdir(exist_ok=True)
+        write_tracks(folder / "truth" / f"{stem}_trueTracks.csv", number, true)
+    write_recording_meta(folder / "data" / f"{stem}_recordingMeta.csv", meta, shown)
+    write_tracks_meta(folder / "data" / f"{stem}_tracksMeta.csv", number, shown)
+    write_tracks(folder / "data" / f"{stem}_tracks.csv", number, shown)
+    recorded.hidden.save(folder / FOLDER / f"{stem}_hidden.npz")
+
+
+def _track(site: Site, seen: Seen) -> Track:
+    """What the layout wants of a vehicle; its velocity points where it goes, not where it faces."""
+    states, slips = np.array(seen.states), np.array(seen.slips)
+    course = states[:, 2] + np.append(slips[1:], slips[-1])  # the slip of the step that follows
+    velocity = states[:, 3:] * np.stack([np.cos(course), np.sin(course)], axis=1)
+    return Track(
+        kind="car",
+        length_m=site.vehicle.LENGTH,
+        width_m=site.vehicle.WIDTH,
+        first_frame=seen.first_frame,
+        xy=states[:, :2],
+        heading_rad=states[:, 2],
+        velocity_mps=velocity,
+        acceleration_mps2=_derivative(velocity),
+    )
+
+
+def _measured(rng: np.random.Generator, track: Track) -> Track:
+    xy, heading = measure(rng, track.xy, np.unwrap(track.heading_rad), SMOOTHED_FRAMES)
+    velocity = _derivative(xy)
+    return Track(
+        kind=track.kind,
+        length_m=track.length_m,
+        width_m=track.width_m,
+        first_frame=track.first_frame,
+        xy=xy,
+        heading_rad=heading,
+        velocity_mps=velocity,
+        acceleration_mps2=_derivative(velocity),
+    )
+
+
+def _derivative(values: np.ndarray) -> np.ndarray:
+    """By time, at each frame; zero of a single one."""
+    if len(values) < 2:
+        return np.zeros_like(values)
+    return np.gradient(values, STEP_S, axis=0)

@@ -1,0 +1,151 @@
+"""The places of highway-env that are driven here, and the traffic that it puts there."""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from functools import cache
+from typing import Any
+
+import numpy as np
+from highway_env.envs import IntersectionEnv, RoundaboutEnv
+from highway_env.envs.common.abstract import AbstractEnv
+
+from scenarios.highway.vehicles import (
+    IntersectionVehicle,
+    Network,
+    Road,
+    RoundaboutVehicle,
+    TrafficVehicle,
+)
+
+STEPS_PER_S = 15
+"""highway-env's own rate."""
+
+STEP_S = 1.0 / STEPS_PER_S
+
+LEAVES_BEFORE_END_M = 20.0
+"""So far before the end of the road vehicles leave, as at highway-env's own intersection."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Site:
+    """One of highway-env's places."""
+
+    name: str
+    environment: type[AbstractEnv]
+    vehicle: type[TrafficVehicle]
+    speed_limit_mps: float
+    config: dict[str, Any]
+    """Where it differs from the environment's own."""
+    populate: Callable[[Any], None]
+    """Puts the first vehicles on the road."""
+    is_exit: Callable[[str, str], bool]
+    """Whether the lanes from one node to another lead away from the place."""
+    spawn: Callable[[Any], None] | None
+    """What may bring another vehicle once a second."""
+
+
+SITES = {
+    site.name: site
+    for site in (
+        Site(
+            name="intersection",
+            environment=IntersectionEnv,
+            vehicle=IntersectionVehicle,
+            speed_limit_mps=10.0,
+            config={"destination": None},
+            populate=lambda env: env._make_vehicles(env.config["initial_vehicle_count"]),
+            is_exit=lambda start, end: start.startswith("il") and end.startswith("o"),
+            spawn=lambda env: env._spawn_vehicle(spawn_probability=env.config["spawn_probability"]),
+        ),
+        Site(
+            name="roundabout",
+            environment=RoundaboutEnv,
+            vehicle=RoundaboutVehicle,
+            speed_limit_mps=20.0,
+            config={},
+            populate=lambda env: env._make_vehicles(),
+            is_exit=lambda _, end: end.endswith("xr"),
+            spawn=None,
+        ),
+    )
+}
+
+
+class _Ego:
+    """In place of an environment's kind of action: its ego is one of the traffic, too."""
+
+    def __init__(self, site: Site) -> None:
+        self.vehicle_class = site.vehicle
+
+
+@cache
+def _environment(site_name: str) -> Any:
+    """highway-env's own environment, which knows how to lay roads and bring vehicles.
+
+    It is never stepped: its clock, its spaces and its copies are of no use here.
+    """
+    site = SITES[site_name]
+    kind = f"{site.vehicle.__module__}.{site.vehicle.__qualname__}"
+    env: Any = site.environment(config={"other_vehicles_type": kind, **site.config})
+    env.action_type = _Ego(site)
+    return env
+
+
+@cache
+def network(site_name: str) -> Network:
+    """The roads of a place, which never change."""
+    env = _environment(site_name)
+    env._make_road()
+    return Network(env.road.network)
+
+
+def empty_road(site: Site, *, steps: int = 0) -> Road:
+    """A road without vehicles.
+
+    Args:
+        site: where.
+        steps: how many steps it has made, by which the intersection times its rules.
+    """
+    env = _environment(site.name)
+    env._make_road()
+    road, env.road = env.road, None
+    road.network, road.steps = network(site.name), steps
+    road.np_random = None  # nothing is drawn while vehicles drive
+    return road
+
+
+def populated_road(site: Site, rng: np.random.Generator) -> Road:
+    """A road as highway-env begins its episodes, with the ego as one of the traffic."""
+    road = empty_road(site)
+    _with(site, road, rng, site.populate)
+    return road
+
+
+def bring_another(site: Site, road: Road, rng: np.random.Generator) -> None:
+    """Brings another vehicle, if the place and chance will have it."""
+    if site.spawn is not None:
+        _with(site, road, rng, site.spawn)
+
+
+def _with(site: Site, road: Road, rng: np.random.Generator, do: Callable[[Any], None]) -> None:
+    env = _environment(site.name)
+    env.road, env.np_random, road.np_random = road, rng, rng
+    try:
+        do(env)
+    finally:
+        env.road, env.controlled_vehicles, road.np_random = None, [], None
+
+
+def clear_leavers(site: Site, road: Road) -> None:
+    """Takes away those who are about to come to the end of the road and drive themselves.
+
+    At highway-env's roundabout they would go on for ever: there it takes nobody away.
+    """
+    road.vehicles = [each for each in road.vehicles if each.steered or not _leaves(site, each)]
+
+
+def _leaves(site: Site, vehicle: TrafficVehicle) -> bool:
+    if not site.is_exit(*vehicle.lane_index[:2]):
+        return False
+    along, _ = vehicle.lane.local_coordinates(vehicle.position)
+    return along >= vehicle.lane.length - LEAVES_BEFORE_END_M

@@ -1,0 +1,164 @@
+"""highway-env's vehicles and roads as needed here: the same laws, without the faults."""
+
+import math
+from typing import Any
+
+import numpy as np
+from highway_env.road.road import RoadNetwork
+from highway_env.vehicle.behavior import IDMVehicle
+from jaxtyping import Float
+
+from asp_env.dynamics import rollout
+
+Road = Any
+"""highway-env's `Road` or `RegulatedRoad`, whose own annotations tell of other vehicles."""
+
+Pose = tuple[float, float, float, float]
+"""[x m, y m, heading rad, speed m/s] in highway-env's axes."""
+
+CELL_M = 4.0
+"""Lanes near a point are looked up by squares of this size."""
+
+
+class TrafficVehicle(IDMVehicle):
+    """Drives itself by highway-env's laws, unless somebody else steers it.
+
+    What is kept of `IDMVehicle`: its decisions and its motion. What is not: copying the whole road
+    to foresee where a steered vehicle goes, and foreseeing the same vehicle once for every other
+    one.
+    """
+
+    track: int = -1
+    """Number in its recording."""
+    steered: bool = False
+    """Whether somebody else decides what it does."""
+
+    def __init__(self, *given: Any, **named: Any) -> None:
+        """As of `IDMVehicle`."""
+        super().__init__(*given, **named)
+        self._coming: list[Pose] = []
+        self._foreseen: tuple[int, Any] = (-1, None)
+
+    def steer(self, acceleration_mps2: float, steering_rad: float, poses: list[Pose]) -> None:
+        """Hands over what somebody else made it do: where it is after each coming sub-step.
+
+        Args:
+            acceleration_mps2: held through them.
+            steering_rad: likewise, in highway-env's axes.
+            poses: one for each sub-step.
+        """
+        self.steered = True
+        self.action = {"acceleration": acceleration_mps2, "steering": steering_rad}
+        self._coming = poses[::-1]
+
+    def release(self) -> None:
+        """Leaves it to itself again; it looks for a way from where it is to where it was going."""
+        if self.steered:
+            self.steered = False
+            if self.route:
+                self.plan_route_to(self.route[-1][1])
+
+    def act(self, action: Any = None) -> None:
+        """Decides what to do, unless that is somebody else's business."""
+        if not self.steered:
+            super().act(action)
+
+    def step(self, dt: float) -> None:
+        """Moves by its own decision, or to where it was steered; that knows no push by others."""
+        if not self.steered:
+            super().step(dt)
+            return
+        x, y, self.heading, self.speed = self._coming.pop()
+        self.position = np.array([x, y])
+        self.impact = None
+        self.timer += dt
+        self.on_state_update()
+        self.target_lane_index = self.lane_index
+
+    def predict_trajectory_constant_speed(self, times: Any) -> Any:
+        """Where the traffic rules expect it: on its route, or, steered, straight on in its curve.
+
+        Once for each time that the rules are enforced, since nobody moves meanwhile.
+        """
+        road: Road = self.road
+        moment = road.steps
+        if self._foreseen[0] != moment:
+            there = super().predict_trajectory_constant_speed
+            self._foreseen = moment, self._in_its_curve(times) if self.steered else there(times)
+        return self._foreseen[1]
+
+    def _in_its_curve(self, times: Float[np.ndarray, " n"]) -> tuple[Any, Any]:
+        step_s = float(times[0])
+        assert np.allclose(np.diff(times), step_s), "steps of equal length"
+        state = np.array([*self.position, self.heading, self.speed])
+        actions = np.tile([0.0, self.action["steering"]], (len(times), 1))
+        states = rollout(
+            state, actions, np.array(self.LENGTH), step_s, integrator="euler", reverse=True
+        )
+        return states[:, :2], states[:, 2]
+
+
+class IntersectionVehicle(TrafficVehicle):
+    """Of the intersection, which sets these for the class of its vehicles: now that is its own."""
+
+    DISTANCE_WANTED = 7
+    COMFORT_ACC_MAX = 6
+    COMFORT_ACC_MIN = -3
+
+
+class RoundaboutVehicle(TrafficVehicle):
+    """Of the roundabout."""
+
+
+class Network(RoadNetwork):
+    """A network that never changes, in which the nearest lane is found without asking all lanes.
+
+    The distance to a lane is at least that to the rectangle around it, so lanes are asked in the
+    order of those until no other can be nearer.
+    """
+
+    def __init__(self, given: RoadNetwork) -> None:
+        """The same lanes."""
+        super().__init__()
+        self.graph = given.graph
+        self.indices: list[Any] = [*self.lanes_dict()]
+        """(from, to, number) of each lane, in the order of `lanes_list`."""
+        self.roads: list[Any] = [*dict.fromkeys(index[:2] for index in self.indices)]
+        self._lanes = self.lanes_list()
+        self._boxes = np.array([_box(lane) for lane in self._lanes])
+        self._near: dict[tuple[int, int], list[tuple[float, int]]] = {}
+
+    def __deepcopy__(self, memo: dict[int, Any]) -> "Network":
+        """Itself."""
+        del memo
+        return self
+
+    def get_closest_lane_index(
+        self, position: Float[np.ndarray, " 2"], heading: float | None = None
+    ) -> Any:
+        """What `RoadNetwork` finds by asking all lanes; of equally near ones the first."""
+        x, y = float(position[0]), float(position[1])
+        cell = (math.floor(x / CELL_M), math.floor(y / CELL_M))
+        near = self._near.get(cell)
+        if near is None:
+            near = self._near[cell] = self._order(cell)
+        best, found = math.inf, 0
+        for least, number in near:
+            if least > best:
+                break
+            distance = float(self._lanes[number].distance_with_heading(position, heading))
+            if distance < best or (distance == best and number < found):
+                best, found = distance, number
+        return self.indices[found]
+
+    def _order(self, cell: tuple[int, int]) -> list[tuple[float, int]]:
+        low = np.array(cell) * CELL_M
+        before, behind = self._boxes[:, :2] - (low + CELL_M), low - self._boxes[:, 2:]
+        least = np.hypot(*np.maximum(0.0, np.maximum(before, behind)).T)
+        return [(float(least[i]), int(i)) for i in np.argsort(least, kind="stable")]
+
+
+def _box(lane: Any) -> tuple[float, float, float, float]:
+    """A rectangle around a lane's centre line, with a margin for what lies between its points."""
+    points = np.array([lane.position(s, 0.0) for s in np.linspace(0.0, lane.length, 200)])
+    return (*(points.min(axis=0) - 0.5), *(points.max(axis=0) + 0.5))
