@@ -1,6 +1,7 @@
 """Does this trajectory predictor make the car drive better?
 
-Importing this package registers the Gymnasium environment `asp_env/Replay-v0`.
+Importing this package registers the Gymnasium environments `asp_env/Replay-v0`,
+`asp_env/HighwayIntersection-v0` and `asp_env/HighwayRoundabout-v0`.
 """
 
 import gymnasium
@@ -21,8 +22,14 @@ __all__ = [
     "sb3_vec_env",
 ]
 
-gymnasium.register(
-    id="asp_env/Replay-v0",
-    entry_point="asp_env.envs.replay:ReplayEnv",
-    vector_entry_point="asp_env.envs.vector:ReplayVectorEnv",
-)
+for _id, _given in (
+    ("Replay", {}),
+    ("HighwayIntersection", {"data": "highway:intersection"}),
+    ("HighwayRoundabout", {"data": "highway:roundabout"}),
+):
+    gymnasium.register(
+        id=f"asp_env/{_id}-v0",
+        entry_point="asp_env.envs.replay:ReplayEnv",
+        vector_entry_point="asp_env.envs.vector:ReplayVectorEnv",
+        kwargs=_given,
+    )
