@@ -31,7 +31,7 @@ ARROWS = {
         *ON_ALL,
     },
     "predictors": {"views", "metrics", "data", "dynamics"} | ON_ALL,
-    "scenarios": {"data", "dynamics"} | ON_ALL,
+    "scenarios": {"sim", "data", "dynamics"} | ON_ALL,
 }
 """For every part, the parts of `asp_env` that it may import besides itself."""
 

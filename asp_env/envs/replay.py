@@ -50,7 +50,7 @@ class EnvSnapshot:
 
 
 class ReplayEnv(gymnasium.Env[dict[str, Any], Any]):
-    """Drive one vehicle of a drone recording; the traffic around it is replayed or reacts.
+    """Drive one vehicle of a recording; the traffic around it is replayed or reacts.
 
     ## Action space
     `Box(-1, 1, (2,), float32)`: acceleration (times 5 m/s²) and steering (times π/4 rad, left
@@ -96,10 +96,11 @@ way, in its frame, m; beyond the end of the way straight on |
 
     ## Arguments
     `data`: a folder in the inD/rounD or INTERACTION layout, `sample:intersection`,
-    `sample:roundabout` or `synthetic:…`. Then those of
+    `sample:roundabout`, `synthetic:…` or `highway:…`, in which highway-env's traffic reacts (the
+    default of `asp_env/HighwayIntersection-v0` and `asp_env/HighwayRoundabout-v0`). Then those of
     `asp_env.envs.episodes.ReplayOptions`: `observations`, `view` and `raster_px` (height, width;
     by default the view's own) of the raster, `traffic` (`log`, `log-actions`, `idm`, … or a table
-    of them), `dt_s` (length of a tick), `reward_weights` by name, where they differ from the
+    of them; by default `log`, or `own` where traffic reacts), `dt_s` (length of a tick), `reward_weights` by name, where they differ from the
     defaults, and `scenarios` (a set of them, or a filter such as `left,length>=8`).
 
     ## Going back

@@ -53,7 +53,8 @@ class Drive:
     """Drive in closed loop: does the predictor make the planner drive better?"""
 
     data: Annotated[tyro.conf.Positional[str], tyro.conf.arg(metavar="DATA")]
-    """A folder in the inD/rounD or INTERACTION layout, `sample:…` or `synthetic:…`."""
+    """A folder in the inD/rounD or INTERACTION layout, `sample:…`, `synthetic:…` or
+    `highway:…`."""
     out: Path
     """Folder to write; must not exist."""
     planner: str = "sampling"

@@ -38,7 +38,8 @@ class Evaluate:
     """Judge predictors in open loop: their forecasts against what happened."""
 
     data: Annotated[tyro.conf.Positional[str], tyro.conf.arg(metavar="DATA")]
-    """A folder in the inD/rounD or INTERACTION layout, `sample:…` or `synthetic:…`."""
+    """A folder in the inD/rounD or INTERACTION layout, `sample:…`, `synthetic:…` or
+    `highway:…`."""
     out: Path
     """Folder to write; must not exist."""
     predictors: Annotated[tuple[str, ...], tyro.conf.arg(metavar="NAME[:RUN] …")] = (

@@ -99,6 +99,7 @@ class HighwayWorld(ScenarioWorld):
             frame = scenarios[b].start_tick * self._stride
             rows, steps = history.at(frame)
             self._begin(b, history, _Kept(rows=rows, steps=steps, frame=frame))
+            self._show_truth(b)
 
     def _history(self, recording: int) -> HiddenHistory:
         if recording not in self._histories:
@@ -112,6 +113,15 @@ class HighwayWorld(ScenarioWorld):
         self._runs[b] = _Run(road=road, frame=kept.frame, history=history)
         tracks = self.episodes.tracks[b]
         self._slots[b] = {int(tracks[a]): a for a in np.flatnonzero(tracks >= 0).tolist()}
+
+    def _show_truth(self, b: int) -> None:
+        """Writes the history as it was; the recording's may be rounded or measured with errors."""
+        run, slots, states = self._runs[b], self._slots[b], self.episodes.states[b]
+        assert run is not None
+        for back in range(self.history + 1):
+            rows, _ = run.history.at(run.frame - back * self._stride)
+            at = [slots[track] for track in rows["track"].tolist()]
+            states[self.history - back, at] = _states_of(rows)
 
     def _move(
         self,
@@ -207,3 +217,8 @@ class HighwayWorld(ScenarioWorld):
             if each is not None:
                 assert scenario is not None
                 self._begin(b, self._history(scenario.recording), each)
+
+
+def _states_of(rows: Rows) -> Float[np.ndarray, "n 4"]:
+    """In our axes."""
+    return mirror_states(np.stack([rows[name] for name in ("x", "y", "heading", "speed")], axis=-1))
