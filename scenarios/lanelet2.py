@@ -1,22 +1,70 @@
-"""Writes lanelets as a lanelet2 map in OSM XML, with coordinates that UTM brings back exactly."""
+"""Lanelets, and how they are written as a lanelet2 map.
 
+A map is OSM XML, with coordinates that UTM brings back exactly.
+"""
+
+from dataclasses import dataclass
 from pathlib import Path
+from typing import Literal
 
 import numpy as np
 import pyproj
 
-from scenarios.synthetic.polylines import Polyline
-from scenarios.synthetic.surface import Border, Lanelet, Marking
+from scenarios.polylines import Polyline
+
+Marking = Literal["curb", "solid", "dashed", "zebra", "virtual"]
+Subtype = Literal["road", "crosswalk", "walkway"]
 
 UTM_ZONE_32 = "EPSG:32632"
 _TAGS: dict[Marking, dict[str, str]] = {
     "curb": {"type": "curbstone", "subtype": "high"},
+    "solid": {"type": "line_thin", "subtype": "solid"},
     "dashed": {"type": "line_thin", "subtype": "dashed"},
     "zebra": {"type": "line_thick", "subtype": "dashed"},
     "virtual": {"type": "virtual"},
 }
 _SAME_M = 0.06
 """Points closer than this become one node."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Border:
+    """One side of a lanelet, or a part of it that is marked in one way."""
+
+    line: Polyline
+    marking: Marking
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Lanelet:
+    """A strip of surface in the direction of travel."""
+
+    subtype: Subtype
+    left: tuple[Border, ...]
+    """Parts that follow each other, each from where the one before ends."""
+    right: tuple[Border, ...]
+    speed_limit_mps: float | None = None
+    """Written in whole km/h; None where there is no limit to tell."""
+
+    @property
+    def left_line(self) -> Polyline:
+        """The whole left side."""
+        return _joined(self.left)
+
+    @property
+    def right_line(self) -> Polyline:
+        """The whole right side."""
+        return _joined(self.right)
+
+    @property
+    def outline(self) -> Polyline:
+        """The closed strip's corners."""
+        return np.concatenate([self.left_line, self.right_line[::-1]])
+
+
+def _joined(borders: tuple[Border, ...]) -> Polyline:
+    first, *others = (border.line for border in borders)
+    return np.concatenate([first, *(line[1:] for line in others)])
 
 
 def to_degrees(points_utm: Polyline) -> Polyline:
@@ -49,12 +97,18 @@ class _Elements:
         return len(self.points) - 1
 
     def way(self, border: Border) -> int:
-        """The number of the way along a border; both directions of a line share one way."""
+        """The number of the way along a border; both directions of a line share one way.
+
+        What only one of them marks is marked.
+        """
         numbers = [self.node(point) for point in border.line]
         key = tuple(n for i, n in enumerate(numbers) if i == 0 or n != numbers[i - 1])
         for direction in (key, key[::-1]):
             if direction in self.ways:
-                return self.ways[direction][0]
+                number, marking = self.ways[direction]
+                if marking == "virtual":
+                    self.ways[direction] = (number, border.marking)
+                return number
         self.ways[key] = (len(self.ways), border.marking)
         return len(self.ways) - 1
 
@@ -65,19 +119,21 @@ def write_map(
     parking: np.ndarray,
     *,
     origin_utm_m: tuple[float, float],
-    speed_limit_mps: float,
 ) -> None:
     """Writes the map of a place.
 
     Args:
         path: the `.osm` file to write.
-        lanelets: strips in the recording's frame.
+        lanelets: strips in the recording's frame, in the order in which they are to be read.
         parking: (lots, 4, 2) corners of places for parked cars.
         origin_utm_m: what to add to the recording's frame to get UTM.
-        speed_limit_mps: of all lanes.
     """
     elements = _Elements()
-    sides = [(elements.way(lanelet.left), elements.way(lanelet.right)) for lanelet in lanelets]
+    sides = [
+        [("left", elements.way(border)) for border in lanelet.left]
+        + [("right", elements.way(border)) for border in lanelet.right]
+        for lanelet in lanelets
+    ]
     rings = [
         elements.way(Border(line=np.concatenate([lot, lot[:1]]), marking="virtual"))
         for lot in parking
@@ -94,25 +150,25 @@ def write_map(
         refs = "".join(f'    <nd ref="{node + 1}"/>\n' for node in key)
         tags = _tag_lines(_TAGS[marking])
         parts.append(f'  <way id="{first_way + number}" version="1">\n{refs}{tags}  </way>\n')
-    for number, (lanelet, (left, right)) in enumerate(zip(lanelets, sides, strict=True)):
-        members = {"left": first_way + left, "right": first_way + right}
+    for number, (lanelet, ways) in enumerate(zip(lanelets, sides, strict=True)):
+        members = [(role, first_way + way) for role, way in ways]
         tags = {
             "type": "lanelet",
             "subtype": lanelet.subtype,
             "location": "urban",
             "one_way": "yes" if lanelet.subtype == "road" else "no",
         }
-        if lanelet.subtype == "road":
-            tags["speed_limit"] = f"{speed_limit_mps * 3.6:.0f} km/h"
+        if lanelet.speed_limit_mps is not None:
+            tags["speed_limit"] = f"{lanelet.speed_limit_mps * 3.6:.0f} km/h"
         parts.append(_relation(first_relation + number, members, tags))
     for number, ring in enumerate(rings, start=first_relation + len(lanelets)):
         tags = {"type": "multipolygon", "subtype": "parking"}
-        parts.append(_relation(number, {"outer": first_way + ring}, tags))
+        parts.append(_relation(number, [("outer", first_way + ring)], tags))
     path.write_text("".join([*parts, "</osm>\n"]))
 
 
-def _relation(number: int, members: dict[str, int], tags: dict[str, str]) -> str:
+def _relation(number: int, members: list[tuple[str, int]], tags: dict[str, str]) -> str:
     lines = "".join(
-        f'    <member type="way" ref="{way}" role="{role}"/>\n' for role, way in members.items()
+        f'    <member type="way" ref="{way}" role="{role}"/>\n' for role, way in members
     )
     return f'  <relation id="{number}" version="1">\n{lines}{_tag_lines(tags)}  </relation>\n'
