@@ -23,8 +23,6 @@ _TAGS: dict[Marking, dict[str, str]] = {
     "zebra": {"type": "line_thick", "subtype": "dashed"},
     "virtual": {"type": "virtual"},
 }
-_SAME_M = 0.06
-"""Points closer than this become one node."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -43,6 +41,8 @@ class Lanelet:
     left: tuple[Border, ...]
     """Parts that follow each other, each from where the one before ends."""
     right: tuple[Border, ...]
+    centre: Polyline | None = None
+    """None where it is to be midway between the sides."""
     speed_limit_mps: float | None = None
     """Written in whole km/h; None where there is no limit to tell."""
 
@@ -60,6 +60,15 @@ class Lanelet:
     def outline(self) -> Polyline:
         """The closed strip's corners."""
         return np.concatenate([self.left_line, self.right_line[::-1]])
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Area:
+    """Ground that vehicles may drive on, along no lane."""
+
+    subtype: Literal["parking", "freespace"]
+    outer: tuple[Border, ...]
+    """Parts of the closed ring around it, in any direction each."""
 
 
 def _joined(borders: tuple[Border, ...]) -> Polyline:
@@ -81,7 +90,8 @@ def _tag_lines(tags: dict[str, str]) -> str:
 class _Elements:
     """Nodes and ways with shared ends, numbered as they come."""
 
-    def __init__(self) -> None:
+    def __init__(self, join_m: float) -> None:
+        self.join_m = join_m
         self.points: list[np.ndarray] = []
         self._cells: dict[tuple[int, int], list[int]] = {}
         self.ways: dict[tuple[int, ...], tuple[int, Marking]] = {}
@@ -90,11 +100,17 @@ class _Elements:
         column, row = (int(value) for value in np.floor(point / 0.1))
         for near in ((column + i, row + j) for i in (-1, 0, 1) for j in (-1, 0, 1)):
             for number in self._cells.get(near, []):
-                if np.hypot(*(self.points[number] - point)) < _SAME_M:
+                if np.hypot(*(self.points[number] - point)) < self.join_m:
                     return number
         self.points.append(point)
         self._cells.setdefault((column, row), []).append(len(self.points) - 1)
         return len(self.points) - 1
+
+    def members(self, lanelet: Lanelet) -> list[tuple[str, int]]:
+        """(role, number) of the ways of a lanelet."""
+        centre = () if lanelet.centre is None else (Border(line=lanelet.centre, marking="virtual"),)
+        roles = {"left": lanelet.left, "right": lanelet.right, "centerline": centre}
+        return [(role, self.way(border)) for role, borders in roles.items() for border in borders]
 
     def way(self, border: Border) -> int:
         """The number of the way along a border; both directions of a line share one way.
@@ -116,28 +132,23 @@ class _Elements:
 def write_map(
     path: Path,
     lanelets: list[Lanelet],
-    parking: np.ndarray,
+    areas: list[Area],
     *,
     origin_utm_m: tuple[float, float],
+    join_m: float,
 ) -> None:
     """Writes the map of a place.
 
     Args:
         path: the `.osm` file to write.
         lanelets: strips in the recording's frame, in the order in which they are to be read.
-        parking: (lots, 4, 2) corners of places for parked cars.
+        areas: in the same frame.
         origin_utm_m: what to add to the recording's frame to get UTM.
+        join_m: points closer than this, at most 0.1 m, become one node.
     """
-    elements = _Elements()
-    sides = [
-        [("left", elements.way(border)) for border in lanelet.left]
-        + [("right", elements.way(border)) for border in lanelet.right]
-        for lanelet in lanelets
-    ]
-    rings = [
-        elements.way(Border(line=np.concatenate([lot, lot[:1]]), marking="virtual"))
-        for lot in parking
-    ]
+    elements = _Elements(join_m)
+    ways = [elements.members(lanelet) for lanelet in lanelets]
+    rings = [[elements.way(border) for border in area.outer] for area in areas]
     first_way = len(elements.points) + 1
     first_relation = first_way + len(elements.ways)
     degrees = to_degrees(np.stack(elements.points) + np.array(origin_utm_m))
@@ -150,8 +161,8 @@ def write_map(
         refs = "".join(f'    <nd ref="{node + 1}"/>\n' for node in key)
         tags = _tag_lines(_TAGS[marking])
         parts.append(f'  <way id="{first_way + number}" version="1">\n{refs}{tags}  </way>\n')
-    for number, (lanelet, ways) in enumerate(zip(lanelets, sides, strict=True)):
-        members = [(role, first_way + way) for role, way in ways]
+    for number, (lanelet, roles) in enumerate(zip(lanelets, ways, strict=True)):
+        members = [(role, first_way + way) for role, way in roles]
         tags = {
             "type": "lanelet",
             "subtype": lanelet.subtype,
@@ -161,9 +172,11 @@ def write_map(
         if lanelet.speed_limit_mps is not None:
             tags["speed_limit"] = f"{lanelet.speed_limit_mps * 3.6:.0f} km/h"
         parts.append(_relation(first_relation + number, members, tags))
-    for number, ring in enumerate(rings, start=first_relation + len(lanelets)):
-        tags = {"type": "multipolygon", "subtype": "parking"}
-        parts.append(_relation(number, [("outer", first_way + ring)], tags))
+    first_area = first_relation + len(lanelets)
+    for number, (area, ring) in enumerate(zip(areas, rings, strict=True), start=first_area):
+        members = [("outer", first_way + way) for way in ring]
+        tags = {"type": "multipolygon", "subtype": area.subtype}
+        parts.append(_relation(number, members, tags))
     path.write_text("".join([*parts, "</osm>\n"]))
 
 

@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float
 
-from scenarios.lanelet2 import Border, Lanelet, to_degrees, write_map
+from scenarios.lanelet2 import Area, Border, Lanelet, to_degrees, write_map
 from scenarios.synthetic.junctions import crossroads, t_junction
 from scenarios.synthetic.picture import draw, write_picture
 from scenarios.synthetic.roundabouts import roundabout, two_lane_roundabout
@@ -20,6 +20,9 @@ SITES: dict[str, tuple[Callable[[np.random.Generator], Site], ...]] = {
     "roundabout": (roundabout, two_lane_roundabout),
 }
 """Kinds of place of a site; locations take them in turn."""
+JOIN_M = 0.06
+"""So near to each other netconvert's lines end that are to meet."""
+
 _NEAR_AACHEN_UTM_M = (294_000.0, 5_628_000.0)
 
 
@@ -53,7 +56,11 @@ class Place:
 
     def write_map(self, path: Path) -> None:
         """Writes the lanelet2 map."""
-        write_map(path, self.strips, self.parking, origin_utm_m=self.origin_utm_m)
+        lots = [np.concatenate([lot, lot[:1]]) for lot in self.parking]
+        areas = [
+            Area(subtype="parking", outer=(Border(line=lot, marking="virtual"),)) for lot in lots
+        ]
+        write_map(path, self.strips, areas, origin_utm_m=self.origin_utm_m, join_m=JOIN_M)
 
 
 def make_place(rng: np.random.Generator, site: Site, folder: Path) -> Place:

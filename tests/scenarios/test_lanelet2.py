@@ -1,5 +1,6 @@
 """Lanelets that are written and read back."""
 
+from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
@@ -7,7 +8,7 @@ import numpy as np
 from asp_env.data.readers.lanelet2 import read_lanelet2
 from asp_env.data.readers.origin import Origin
 from asp_env.data.road_map import LineType, RoadMap
-from scenarios.lanelet2 import Border, Lanelet, Marking, to_degrees, write_map
+from scenarios.lanelet2 import Area, Border, Lanelet, Marking, to_degrees, write_map
 
 ORIGIN_UTM_M = (294_000.0, 5_628_000.0)
 
@@ -17,10 +18,10 @@ def border(marking: Marking, *points: tuple[float, float]) -> Border:
     return Border(line=np.array(points, dtype=np.float64), marking=marking)
 
 
-def read_back(folder: Path, *lanelets: Lanelet) -> RoadMap:
-    """The map that these lanelets give."""
+def read_back(folder: Path, *lanelets: Lanelet, areas: Sequence[Area] = ()) -> RoadMap:
+    """The map that these give."""
     path = folder / "place.osm"
-    write_map(path, list(lanelets), np.zeros((0, 4, 2)), origin_utm_m=ORIGIN_UTM_M)
+    write_map(path, list(lanelets), list(areas), origin_utm_m=ORIGIN_UTM_M, join_m=0.05)
     lat, lon = to_degrees(np.array([ORIGIN_UTM_M]))[0]
     origin = Origin(
         x_m=ORIGIN_UTM_M[0],
@@ -76,3 +77,39 @@ def test_each_lane_has_its_own_limit(tmp_path: Path) -> None:
     road_map = read_back(tmp_path, *lanelets)
     np.testing.assert_allclose(road_map.limits_mps, [10.0, 20.0, 0.0])
     assert road_map.limited.tolist() == [True, True, False]
+
+
+def test_ground_beside_a_lane(tmp_path: Path) -> None:
+    """A triangle with a kerb on one side: drivable, no lane; its other sides are no lines."""
+    lane = Lanelet(
+        subtype="road",
+        left=(border("virtual", (0, 3), (10, 3)),),
+        right=(border("virtual", (0, 0), (10, 0)),),
+    )
+    ground = Area(
+        subtype="freespace",
+        outer=(
+            border("virtual", (0, 0), (10, 0)),
+            border("curb", (4, -3), (0, 0)),
+            border("virtual", (4, -3), (10, 0)),
+        ),
+    )
+    road_map = read_back(tmp_path, lane, areas=[ground])
+    assert len(road_map.lanes) == 1
+    assert len(road_map.drivable) == 2
+    corners = {(round(x, 3), round(y, 3)) for x, y in road_map.drivable[1].tolist()}
+    assert corners == {(0, 0), (10, 0), (4, -3)}
+    assert road_map.line_types.tolist() == [LineType.VIRTUAL, LineType.VIRTUAL, LineType.CURB]
+
+
+def test_a_centre_line_is_as_it_is_told(tmp_path: Path) -> None:
+    """A strip whose left side makes a detour: its lane is straight all the same."""
+    lane = Lanelet(
+        subtype="road",
+        left=(border("curb", (0, 3), (5, 8), (10, 3)),),
+        right=(border("curb", (0, 0), (10, 0)),),
+        centre=np.array([(0.0, 1.5), (10.0, 1.5)]),
+    )
+    road_map = read_back(tmp_path, lane)
+    np.testing.assert_allclose(road_map.lanes[0], [[0, 1.5], [10, 1.5]], atol=1e-4)
+    assert road_map.line_types.tolist() == [LineType.CURB, LineType.CURB]
