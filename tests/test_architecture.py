@@ -112,7 +112,8 @@ def loaded_by(code: str) -> set[str]:
 
 def test_importing_is_cheap() -> None:
     """`import asp_env` loads none of the extras, and no plug."""
-    extras = {"plotly", "sumo", "traci", "sumolib", "predictors", "scenarios", "selenium"}
+    extras = {"plotly", "sumo", "traci", "sumolib", "highway_env", "selenium"}
+    extras |= {"predictors", "scenarios"}
     adapted = set(ADAPTERS.values())
     assert not loaded_by("import asp_env") & (LEARNING | RENDERING | extras | adapted)
 

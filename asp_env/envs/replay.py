@@ -100,8 +100,9 @@ way, in its frame, m; beyond the end of the way straight on |
     default of `asp_env/HighwayIntersection-v0` and `asp_env/HighwayRoundabout-v0`). Then those of
     `asp_env.envs.episodes.ReplayOptions`: `observations`, `view` and `raster_px` (height, width;
     by default the view's own) of the raster, `traffic` (`log`, `log-actions`, `idm`, … or a table
-    of them; by default `log`, or `own` where traffic reacts), `dt_s` (length of a tick), `reward_weights` by name, where they differ from the
-    defaults, and `scenarios` (a set of them, or a filter such as `left,length>=8`).
+    of them; by default `log`, or `own` where traffic reacts), `dt_s` (length of a tick),
+    `reward_weights` by name, where they differ from the defaults, and `scenarios` (a set of them,
+    or a filter such as `left,length>=8`).
 
     ## Going back
     `snapshot()` and `restore()` on `env.unwrapped` bring back the whole state bit for bit, that of

@@ -9,7 +9,7 @@ from rich.progress import track as with_progress
 
 from asp_env.errors import AspEnvError, unknown_name
 from scenarios.highway.history import FOLDER, HiddenHistory
-from scenarios.highway.map import ORIGIN_LAT_LON_DEG, ORIGIN_UTM_M, write_road_map
+from scenarios.highway.road_map import ORIGIN_LAT_LON_DEG, ORIGIN_UTM_M, write_road_map
 from scenarios.highway.rounds import KEPT_EVERY, ROUND_S, Round, Seen, simulate_round
 from scenarios.highway.sites import SITES, STEP_S, STEPS_PER_S, Site, network
 from scenarios.noise import measure

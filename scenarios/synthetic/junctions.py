@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from scenarios.synthetic.polylines import clothoid_like
+from scenarios.polylines import clothoid_like
 from scenarios.synthetic.site import (
     ARM_LENGTH_M,
     SIDEWALK_M,

@@ -14,7 +14,7 @@ import numpy as np
 from jaxtyping import Float
 
 from asp_env.dynamics.bicycle import AXLE_SHARE_OF_LENGTH
-from scenarios.synthetic.polylines import Polyline, arc_lengths
+from scenarios.polylines import Polyline, arc_lengths
 from scenarios.synthetic.sumo import STEP_S
 
 FRAME_RATE_HZ = 25.0

@@ -6,8 +6,8 @@ import cv2
 import numpy as np
 from jaxtyping import UInt8
 
-from scenarios.synthetic.polylines import Polyline, dense
-from scenarios.synthetic.surface import Lanelet
+from scenarios.lanelet2 import Lanelet
+from scenarios.polylines import Polyline, dense
 
 METRES_PER_ORTHO_PIXEL = 0.01
 DOWNSCALE = 12
@@ -52,8 +52,8 @@ def draw(
     for lanelet in lanelets:
         if lanelet.subtype == "crosswalk":
             _zebra(image, lanelet)
-        if lanelet.subtype == "road" and lanelet.left.marking == "dashed":
-            _dashes(image, lanelet.left.line)
+        if lanelet.subtype == "road" and lanelet.left[0].marking == "dashed":
+            _dashes(image, lanelet.left_line)
     for x, y, radius in trees:
         centre = _pixels(np.array([x, y]))
         size = round(radius / METRES_PER_PIXEL * 2**_SUBPIXEL_BITS)
@@ -80,7 +80,7 @@ def _dashes(image: np.ndarray, line: Polyline) -> None:
 
 
 def _zebra(image: np.ndarray, lanelet: Lanelet) -> None:
-    left, right = dense(lanelet.left.line, 0.5), dense(lanelet.right.line, 0.5)
+    left, right = dense(lanelet.left_line, 0.5), dense(lanelet.right_line, 0.5)
     count = min(len(left), len(right)) - 1
     for i in range(0, count, 2):
         stripe = np.stack([left[i], left[i + 1], right[i + 1], right[i]])

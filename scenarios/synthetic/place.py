@@ -7,19 +7,22 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float
 
+from scenarios.lanelet2 import Area, Border, Lanelet, to_degrees, write_map
 from scenarios.synthetic.junctions import crossroads, t_junction
-from scenarios.synthetic.lanelet2 import to_degrees, write_map
 from scenarios.synthetic.picture import draw, write_picture
 from scenarios.synthetic.roundabouts import roundabout, two_lane_roundabout
 from scenarios.synthetic.site import Site
 from scenarios.synthetic.sumo import build_network
-from scenarios.synthetic.surface import Border, Lanelet, lanelets
+from scenarios.synthetic.surface import lanelets
 
 SITES: dict[str, tuple[Callable[[np.random.Generator], Site], ...]] = {
     "intersection": (crossroads, t_junction),
     "roundabout": (roundabout, two_lane_roundabout),
 }
 """Kinds of place of a site; locations take them in turn."""
+JOIN_M = 0.06
+"""So near to each other netconvert's lines end that are to meet."""
+
 _NEAR_AACHEN_UTM_M = (294_000.0, 5_628_000.0)
 
 
@@ -53,13 +56,11 @@ class Place:
 
     def write_map(self, path: Path) -> None:
         """Writes the lanelet2 map."""
-        write_map(
-            path,
-            self.strips,
-            self.parking,
-            origin_utm_m=self.origin_utm_m,
-            speed_limit_mps=self.site.speed_limit_mps,
-        )
+        lots = [np.concatenate([lot, lot[:1]]) for lot in self.parking]
+        areas = [
+            Area(subtype="parking", outer=(Border(line=lot, marking="virtual"),)) for lot in lots
+        ]
+        write_map(path, self.strips, areas, origin_utm_m=self.origin_utm_m, join_m=JOIN_M)
 
 
 def make_place(rng: np.random.Generator, site: Site, folder: Path) -> Place:
@@ -67,7 +68,8 @@ def make_place(rng: np.random.Generator, site: Site, folder: Path) -> Place:
     folder.mkdir(parents=True)
     network = build_network(site, folder)
     shift = np.array([site.half_size_m[0], -site.half_size_m[1]])
-    strips = [_moved(strip, shift) for strip in lanelets(network, site.half_size_m)]
+    limit = site.speed_limit_mps
+    strips = [_moved(strip, shift, limit) for strip in lanelets(network, site.half_size_m)]
     corners = [corner + shift for corner in network.corners]
     parking = site.parking + shift
     east, north = np.array(_NEAR_AACHEN_UTM_M) + np.round(rng.uniform(0.0, 3000.0, 2), 2)
@@ -83,12 +85,13 @@ def make_place(rng: np.random.Generator, site: Site, folder: Path) -> Place:
     )
 
 
-def _moved(strip: Lanelet, shift: np.ndarray) -> Lanelet:
+def _moved(strip: Lanelet, shift: np.ndarray, speed_limit_mps: float) -> Lanelet:
     left, right = (
-        Border(line=border.line + shift, marking=border.marking)
-        for border in (strip.left, strip.right)
+        tuple(Border(line=border.line + shift, marking=border.marking) for border in side)
+        for side in (strip.left, strip.right)
     )
-    return Lanelet(subtype=strip.subtype, left=left, right=right)
+    limit = speed_limit_mps if strip.subtype == "road" else None
+    return Lanelet(subtype=strip.subtype, left=left, right=right, speed_limit_mps=limit)
 
 
 def _trees(

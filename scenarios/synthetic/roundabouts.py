@@ -4,7 +4,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from scenarios.synthetic.polylines import bezier, clothoid_like, polar
+from scenarios.polylines import bezier, clothoid_like, polar
 from scenarios.synthetic.site import (
     ARM_LENGTH_M,
     SIDEWALK_M,

@@ -5,7 +5,7 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Float
 
-from scenarios.synthetic.polylines import Polyline
+from scenarios.polylines import Polyline
 
 SIDEWALK_M = 2.0
 ARM_LENGTH_M = 130.0

@@ -12,7 +12,7 @@ import pandas as pd
 from jaxtyping import Float
 
 from asp_env.errors import AspEnvError, MissingExtraError
-from scenarios.synthetic.polylines import Polyline
+from scenarios.polylines import Polyline
 from scenarios.synthetic.site import Site
 
 STEP_S = 0.1

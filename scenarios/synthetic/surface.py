@@ -1,42 +1,16 @@
 """The road surface as lanelets: strips between a left and a right border, from a network."""
 
 from collections.abc import Callable
-from dataclasses import dataclass
-from typing import Literal
 
 import numpy as np
 
-from scenarios.synthetic.polylines import Polyline, arc_lengths, dense, offset
+from scenarios.lanelet2 import Border, Lanelet, Marking, Subtype
+from scenarios.polylines import Polyline, arc_lengths, dense, offset
 from scenarios.synthetic.sumo import Lane, Network, Turn
-
-Marking = Literal["curb", "dashed", "zebra", "virtual"]
-Subtype = Literal["road", "crosswalk", "walkway"]
 
 WIDENING_M = 1.3
 """How much wider than its lane a right-angled turn is in its middle, on either side."""
 _MEETS_M = 0.3
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Border:
-    """One side of a lanelet."""
-
-    line: Polyline
-    marking: Marking
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Lanelet:
-    """A strip of surface in the direction of travel."""
-
-    subtype: Subtype
-    left: Border
-    right: Border
-
-    @property
-    def outline(self) -> Polyline:
-        """The closed strip's corners."""
-        return np.concatenate([self.left.line, self.right.line[::-1]])
 
 
 def lanelets(network: Network, half_size_m: tuple[float, float]) -> list[Lanelet]:
@@ -74,8 +48,8 @@ def _lane_strip(lane: Lane, lanes: dict[str, Lane], reach: np.ndarray) -> Lanele
         left_is = "curb" if innermost and not _faces_traffic(lane, left, lanes) else "dashed"
     return Lanelet(
         subtype=subtype,
-        left=Border(line=left[part], marking=left_is),
-        right=Border(line=right[part], marking=right_is),
+        left=(Border(line=left[part], marking=left_is),),
+        right=(Border(line=right[part], marking=right_is),),
     )
 
 
@@ -101,8 +75,8 @@ def _right_turn_rad(turn: Turn) -> float:
 def _turn_strip(turn: Turn, network: Network, strips: dict[str, Lanelet]) -> Lanelet:
     begin, end = strips[turn.begin], strips[turn.end]
     angle = _right_turn_rad(turn)
-    left_is = _side(turn, network, strips, lambda lanelet: lanelet.left, -1.0)
-    right_is = _side(turn, network, strips, lambda lanelet: lanelet.right, 1.0)
+    left_is = _side(turn, network, strips, lambda lanelet: lanelet.left[0], -1.0)
+    right_is = _side(turn, network, strips, lambda lanelet: lanelet.right[0], 1.0)
     line = dense(turn.shape, 1.0)
     arc = arc_lengths(line)
     share = arc / arc[-1]
@@ -111,12 +85,12 @@ def _turn_strip(turn: Turn, network: Network, strips: dict[str, Lanelet]) -> Lan
     half = 0.5 * (before + (after - before) * share)
     left = offset(line, half + (0.0 if left_is == "curb" else extra))
     right = offset(line, -half - extra)
-    left[0], right[0] = begin.left.line[-1], begin.right.line[-1]
-    left[-1], right[-1] = end.left.line[0], end.right.line[0]
+    left[0], right[0] = begin.left_line[-1], begin.right_line[-1]
+    left[-1], right[-1] = end.left_line[0], end.right_line[0]
     return Lanelet(
         subtype="road",
-        left=Border(line=left, marking=left_is),
-        right=Border(line=right, marking=right_is),
+        left=(Border(line=left, marking=left_is),),
+        right=(Border(line=right, marking=right_is),),
     )
 
 
@@ -150,6 +124,6 @@ def _starts_inside(turn: Turn, rival: Turn, sign: float) -> bool:
 def _crossing_strip(line: Polyline, width_m: float) -> Lanelet:
     return Lanelet(
         subtype="crosswalk",
-        left=Border(line=offset(line, 0.5 * width_m), marking="zebra"),
-        right=Border(line=offset(line, -0.5 * width_m), marking="zebra"),
+        left=(Border(line=offset(line, 0.5 * width_m), marking="zebra"),),
+        right=(Border(line=offset(line, -0.5 * width_m), marking="zebra"),),
     )

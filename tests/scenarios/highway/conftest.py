@@ -1,0 +1,33 @@
+"""The roads of highway-env's environments."""
+
+from pathlib import Path
+from typing import Any
+
+import pytest
+from highway_env.envs import IntersectionEnv, RoundaboutEnv
+from highway_env.envs.common.abstract import AbstractEnv
+
+from tests.scenarios.highway.maps import Place, read_back
+
+
+def _place(env: AbstractEnv, folder: Path) -> Place:
+    road: Any = env.road  # annotated as None
+    return Place(network=road.network, road_map=read_back(folder, road.network))
+
+
+@pytest.fixture(scope="session")
+def intersection(tmp_path_factory: pytest.TempPathFactory) -> Place:
+    """Four arms of one lane each way, all turns."""
+    return _place(IntersectionEnv(), tmp_path_factory.mktemp("intersection"))
+
+
+@pytest.fixture(scope="session")
+def roundabout(tmp_path_factory: pytest.TempPathFactory) -> Place:
+    """A ring of two lanes with four ways in and four out."""
+    return _place(RoundaboutEnv(), tmp_path_factory.mktemp("roundabout"))
+
+
+@pytest.fixture(scope="session", params=["intersection", "roundabout"])
+def place(request: pytest.FixtureRequest) -> Place:
+    """Each of them."""
+    return request.getfixturevalue(request.param)

@@ -1,0 +1,60 @@
+"""From one pair of axes to the other."""
+
+import numpy as np
+import pytest
+from hypothesis import given
+
+from asp_env.dynamics import forward, wrap_angle
+from asp_env.dynamics.bicycle import Integrator
+from scenarios.highway.axes import mirror_actions, mirror_points, mirror_states
+from tests.dynamics.motions import Motion, motions
+
+
+def test_by_hand() -> None:
+    """Below the origin there is below it here, and what steers right there does so here."""
+    np.testing.assert_array_equal(mirror_points(np.array([[3.0, 4.0]])), [[3.0, -4.0]])
+    down_there = np.array([3.0, 4.0, 0.5 * np.pi, 7.0])
+    np.testing.assert_array_equal(mirror_states(down_there), [3.0, -4.0, -0.5 * np.pi, 7.0])
+    np.testing.assert_array_equal(mirror_actions(np.array([1.0, 0.2])), [1.0, -0.2])
+
+
+def test_headings_are_wrapped() -> None:
+    """highway-env's headings are not: 1.75 turns one way are a quarter of a turn that way."""
+    turned = mirror_states(np.array([0.0, 0.0, 3.5 * np.pi, 1.0]))
+    assert turned[2] == pytest.approx(0.5 * np.pi)
+    assert mirror_states(np.array([0.0, 0.0, -np.pi, 1.0]))[2] == -np.pi
+
+
+def test_the_kind_of_numbers_stays() -> None:
+    """Of float32 float32 is made, and what is given stays as it is."""
+    states = np.ones((2, 3, 4), dtype=np.float32)
+    assert mirror_states(states).dtype == np.float32
+    assert mirror_points(states[..., :2]).dtype == np.float32
+    assert mirror_actions(states[..., :2]).dtype == np.float32
+    assert (states == 1).all()
+
+
+@given(motions())
+def test_twice_is_not_at_all(motion: Motion) -> None:
+    """Each is its own inverse."""
+    again = mirror_states(mirror_states(motion.states))
+    np.testing.assert_array_equal(again[:, [0, 1, 3]], motion.states[:, [0, 1, 3]])
+    np.testing.assert_allclose(wrap_angle(again[:, 2] - motion.states[:, 2]), 0, atol=1e-12)
+    actions = mirror_actions(mirror_actions(motion.actions))
+    np.testing.assert_array_equal(actions, motion.actions)
+    points = mirror_points(mirror_points(motion.states[:, :2]))
+    np.testing.assert_array_equal(points, motion.states[:, :2])
+
+
+@pytest.mark.parametrize("integrator", ["heun", "euler"])
+@given(motions())
+def test_the_motion_model_does_not_mind(integrator: Integrator, motion: Motion) -> None:
+    """A step of the mirrored vehicle is the mirrored step."""
+    states, actions, lengths = motion.states, motion.actions, motion.lengths_m
+    stepped = forward(states, actions, lengths, motion.dt_s, integrator=integrator)
+    mirrored = forward(
+        mirror_states(states), mirror_actions(actions), lengths, motion.dt_s, integrator=integrator
+    )
+    gap = mirrored - mirror_states(stepped)
+    gap[:, 2] = wrap_angle(gap[:, 2])
+    np.testing.assert_allclose(gap, 0, atol=1e-9)
