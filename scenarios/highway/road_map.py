@@ -23,7 +23,7 @@ def write_road_map(path: Path, network: RoadNetwork, *, origin_utm_m: tuple[floa
 
     Args:
         path: the `.osm` file to write.
-        network: the road, with lanes of any kind.
+        network: the road; straight, circular and sine lanes are known to work.
         origin_utm_m: where the frame's origin lies in UTM zone 32.
 
     Raises:
