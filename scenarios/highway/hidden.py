@@ -42,7 +42,7 @@ makes for; the speed it wants, m/s; seconds since it thought of changing lanes; 
 law; (road, lane) of the rest of its route; whether it crashed, and by how much it is pushed at the
 next step, m; whether it gives way, and since how many checks; whether somebody else steers it."""
 
-Rows = Shaped[np.ndarray, " n"]
+Rows = Shaped[np.ndarray, " _"]
 """Of `HIDDEN`, in the order of the road's vehicles."""
 
 

@@ -22,10 +22,10 @@ class HiddenHistory:
     site: Site
     rows: Shaped[np.ndarray, " n"]
     """Of `HIDDEN`, time by time."""
-    starts: Int[np.ndarray, " times+1"]
-    """Time i has the rows `starts[i]:starts[i + 1]`."""
     steps: Int[np.ndarray, " times"]
     """What the road had counted by then."""
+    starts: Int[np.ndarray, " times+1"]
+    """Time i has the rows `starts[i]:starts[i + 1]`."""
 
     def at(self, frame: int) -> tuple[Rows, int]:
         """The vehicles at a frame, and what the road had counted."""

@@ -148,4 +148,4 @@ def _leaves(site: Site, vehicle: TrafficVehicle) -> bool:
     if not site.is_exit(*vehicle.lane_index[:2]):
         return False
     along, _ = vehicle.lane.local_coordinates(vehicle.position)
-    return along >= vehicle.lane.length - LEAVES_BEFORE_END_M
+    return bool(along >= vehicle.lane.length - LEAVES_BEFORE_END_M)

@@ -13,7 +13,7 @@ from asp_env.dynamics import rollout
 Road = Any
 """highway-env's `Road` or `RegulatedRoad`, whose own annotations tell of other vehicles."""
 
-Pose = tuple[float, float, float, float]
+Pose = list[float]
 """[x m, y m, heading rad, speed m/s] in highway-env's axes."""
 
 CELL_M = 4.0

@@ -1,6 +1,10 @@
 """What holds of every driver: those of the registry, and tables of several."""
 
 import copy
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import cache
+from typing import Any
 
 import numpy as np
 import pytest
@@ -11,10 +15,14 @@ from asp_env.data.source import open_data
 from asp_env.errors import AspEnvError
 from asp_env.sim.drivers import Driver, DriverPlug
 from asp_env.sim.drivers.driver import vehicles
+from asp_env.sim.replay import ReplayWorld
+from asp_env.sim.scenario_world import ScenarioWorld
 from asp_env.sim.simulation import Simulation
 from asp_env.sim.traffic import make_traffic
+from asp_env.sim.worlds import world_of
 from tests.builders import make_recording
-from tests.sim.worlds import DT_S, HISTORY, scenario
+from tests.highway_folders import highway_recordings
+from tests.sim.worlds import DT_S, HISTORY, scenario, simulate
 
 ARGUMENTS = {
     "predictor": ("constant-turn-rate", "every=3:mode=sampled:constant-velocity", "oracle")
@@ -26,41 +34,93 @@ NAMES = tuple(
     for name in registry.names("drivers")
     for argument in ARGUMENTS.get(name, ("",))
 )
-TABLE = "default=idm,car=hybrid,truck=log-actions,van=predictor:constant-velocity,3=policy"
-STEPS = 30
+REPLAY_TABLE = "default=idm,car=hybrid,truck=log-actions,van=predictor:constant-velocity,3=policy"
+OWN_TABLE = "default=own,3=policy,20=idm,18=log-actions,4=predictor:constant-velocity"
 
 
-def _made_up() -> tuple[list, list[Scenario]]:
-    recordings = [make_recording(), make_recording(name="01", seed=1, duration_s=16.0)]
-    scenarios = [
-        scenario(1, start=15, length=24),
-        scenario(3, start=20, length=40, recording=1),
-        scenario(7, start=36, length=20),
-        scenario(2, start=15, length=40),
-    ]
-    return recordings, scenarios
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Stage:
+    """Four episodes, and who can drive in them."""
+
+    recordings: Sequence[Any]
+    scenarios: list[Scenario]
+    kind: type[ScenarioWorld] = ReplayWorld
+    steps: int = 30
 
 
-def _sample() -> tuple[list, list[Scenario]]:
+def _made_up() -> Stage:
+    return Stage(
+        recordings=[make_recording(), make_recording(name="01", seed=1, duration_s=16.0)],
+        scenarios=[
+            scenario(1, start=15, length=24),
+            scenario(3, start=20, length=40, recording=1),
+            scenario(7, start=36, length=20),
+            scenario(2, start=15, length=40),
+        ],
+    )
+
+
+def _sample() -> Stage:
     recordings = list(open_data("sample:intersection"))
     found = find_scenarios(recordings, source="sample", dt_s=DT_S, history=HISTORY)
-    return recordings, [found[i] for i in (0, 9, 21, 33)]
+    return Stage(recordings=recordings, scenarios=[found[i] for i in (0, 9, 21, 33)])
 
 
-DATA = {"made up": _made_up(), "sample": _sample()}
-
-every = pytest.mark.parametrize("traffic", [*NAMES, TABLE])
-anywhere = pytest.mark.parametrize("data", DATA.values(), ids=list(DATA))
-
-
-def _begin(recordings, scenarios, traffic) -> Simulation:
-    simulation = Simulation(
-        recordings,
-        make_traffic(traffic),
-        num_episodes=len(scenarios),
-        dt_s=DT_S,
-        history=HISTORY,
+def _highway() -> Stage:
+    return Stage(
+        recordings=highway_recordings("intersection"),
+        scenarios=[
+            scenario(18, start=150, length=10),
+            scenario(2, start=70, length=20, recording=1),
+            scenario(13, start=70, length=12),
+            scenario(16, start=125, length=40, recording=1),
+        ],
+        kind=world_of("highway:"),
+        steps=14,
     )
+
+
+STAGES = {"sample": _sample, "highway": _highway, "made up": _made_up}
+"""From larger scenes to smaller ones."""
+
+REFUSED = {"sample": {"own"}, "made up": {"own"}, "highway": {"log", "hybrid"}}
+"""By whom nobody can be driven there."""
+
+
+@cache
+def _stage(name: str) -> Stage:
+    return STAGES[name]()
+
+
+def _traffics(stage: str) -> list[str]:
+    """Everybody who drives there, and a table of several."""
+    table = OWN_TABLE if stage == "highway" else REPLAY_TABLE
+    return [*(name for name in NAMES if name not in REFUSED[stage]), table]
+
+
+every = pytest.mark.parametrize(
+    ("traffic", "stages"),
+    [
+        pytest.param(
+            traffic, [stage for stage in STAGES if traffic in _traffics(stage)], id=traffic
+        )
+        for traffic in (*NAMES, REPLAY_TABLE, OWN_TABLE)
+    ],
+)
+anywhere = pytest.mark.parametrize(
+    ("stage", "traffic"),
+    [
+        pytest.param(stage, traffic, id=f"{stage}-{traffic}")
+        for stage in STAGES
+        for traffic in _traffics(stage)
+    ],
+)
+
+
+def _begin(stage: Stage, traffic: str | Driver, *numbers: int) -> Simulation:
+    """Some of its episodes, by default all, that have just begun."""
+    scenarios = [stage.scenarios[i] for i in numbers or range(4)]
+    simulation = simulate(stage.recordings, scenarios, traffic, stage.kind)
     simulation.reset(scenarios, [np.random.default_rng(each.ego_id) for each in scenarios])
     return simulation
 
@@ -95,15 +155,23 @@ def test_the_registry_holds_plugs_of_drivers(name):
         plug.from_name("nonsense", dt_s=DT_S)
 
 
-@every
+@pytest.mark.parametrize(
+    ("stage", "traffic"), [(stage, name) for stage in STAGES for name in sorted(REFUSED[stage])]
+)
+def test_who_cannot_drive_there_is_refused(stage, traffic):
+    """In one line that names who can; so are tables that leave somebody to it."""
+    for spec in (traffic, f"default=idm,car={traffic}"):
+        with pytest.raises(AspEnvError, match=rf"^traffic {traffic}: [^\n]* use [^\n]*idm[^\n]*$"):
+            _begin(_stage(stage), spec)
+
+
 @anywhere
-def test_a_driver_says_nothing_of_others(traffic, data):
+def test_a_driver_says_nothing_of_others(stage, traffic):
     """Its actions are finite and within limits, 0 for whom it does not drive, and its own alone."""
-    recordings, scenarios = data
-    simulation = _begin(recordings, scenarios, traffic)
+    simulation = _begin(_stage(stage), traffic)
     world, limits = simulation.world, np.array([5.0, np.pi / 4]) + 1e-6
     logged = traffic.startswith("log-actions") or "log-actions" in traffic
-    for tick in range(STEPS):
+    for tick in range(_stage(stage).steps):
         control = copy.deepcopy(simulation.driver).control(world)
         assert control.actions.shape == (*world.episodes.ids.shape, 2)
         assert control.actions.dtype == np.float32
@@ -116,15 +184,13 @@ def test_a_driver_says_nothing_of_others(traffic, data):
     assert np.isfinite(world.episodes.states).all()
 
 
-@every
 @anywhere
-def test_episodes_do_not_know_of_each_other(traffic, data):
+def test_episodes_do_not_know_of_each_other(stage, traffic):
     """Five at once are bit for bit the five alone."""
-    recordings, scenarios = data
     order = [0, 1, 2, 3, 0]
-    together = _begin(recordings, [scenarios[i] for i in order], traffic)
-    alone = [_begin(recordings, [scenarios[i]], traffic) for i in order]
-    for tick in range(STEPS):
+    together = _begin(_stage(stage), traffic, *order)
+    alone = [_begin(_stage(stage), traffic, i) for i in order]
+    for tick in range(_stage(stage).steps):
         _step(together, tick, order)
         for single, number in zip(alone, order, strict=True):
             _step(single, tick, [number])
@@ -132,15 +198,13 @@ def test_episodes_do_not_know_of_each_other(traffic, data):
         assert _told(together, row) == _told(single, 0)
 
 
-@every
 @anywhere
-def test_a_reset_of_some_disturbs_no_others(traffic, data):
+def test_a_reset_of_some_disturbs_no_others(stage, traffic):
     """Row 1 begins anew with a scenario of another size; it is then as if it were alone."""
-    recordings, scenarios = data
-    disturbed = _begin(recordings, [scenarios[2], scenarios[0], scenarios[1]], traffic)
-    left_alone = _begin(recordings, [scenarios[2], scenarios[0], scenarios[1]], traffic)
-    fresh = _begin(recordings, [scenarios[3]], traffic)
-    for tick in range(STEPS):
+    scenarios = _stage(stage).scenarios
+    disturbed, left_alone = (_begin(_stage(stage), traffic, 2, 0, 1) for _ in range(2))
+    fresh = _begin(_stage(stage), traffic, 3)
+    for tick in range(_stage(stage).steps):
         if tick == 7:
             where = np.array([False, True, False])
             rngs = [np.random.default_rng(scenarios[3].ego_id)] * 3
@@ -154,18 +218,17 @@ def test_a_reset_of_some_disturbs_no_others(traffic, data):
     assert _told(disturbed, 1) == _told(fresh, 0)
 
 
-@every
 @anywhere
-def test_a_snapshot_brings_back_what_a_driver_remembers(traffic, data):
+def test_a_snapshot_brings_back_what_a_driver_remembers(stage, traffic):
     """Taken amid the episodes and restored twice, another reset in between: the same bits."""
-    recordings, scenarios = data
-    simulation = _begin(recordings, scenarios, traffic)
+    scenarios = _stage(stage).scenarios
+    simulation = _begin(_stage(stage), traffic)
     for tick in range(8):
         _step(simulation, tick, [0, 1, 2, 3])
     snapshot = simulation.snapshot()
     runs = []
     for _ in range(3):
-        for tick in range(8, STEPS):
+        for tick in range(8, _stage(stage).steps):
             _step(simulation, tick, [0, 1, 2, 3])
         runs.append([_told(simulation, row) for row in range(4)])
         where = np.array([True, False, False, True])
@@ -175,15 +238,11 @@ def test_a_snapshot_brings_back_what_a_driver_remembers(traffic, data):
 
 
 @every
-def test_a_driver_can_go_on_to_another_world(traffic):
-    """What it remembers of a larger one does not show."""
+def test_a_driver_can_go_on_to_another_world(traffic, stages):
+    """What it remembers of a larger one, or of one that reacts, does not show."""
     driver = make_traffic(traffic)
-    for recordings, scenarios in (DATA["sample"], DATA["made up"]):
-        used = Simulation(
-            recordings, driver, num_episodes=len(scenarios), dt_s=DT_S, history=HISTORY
-        )
-        used.reset(scenarios, [np.random.default_rng(each.ego_id) for each in scenarios])
-        fresh = _begin(recordings, scenarios, traffic)
+    for stage in (*stages, stages[0]):
+        used, fresh = _begin(_stage(stage), driver), _begin(_stage(stage), traffic)
         for tick in range(10):
             _step(used, tick, [0, 1, 2, 3])
             _step(fresh, tick, [0, 1, 2, 3])
@@ -191,10 +250,9 @@ def test_a_driver_can_go_on_to_another_world(traffic):
 
 
 @every
-def test_a_copy_shares_what_never_changes(traffic):
+def test_a_copy_shares_what_never_changes(traffic, stages):
     """Neither recordings nor predictors nor paths are copied: no object of theirs is met."""
-    recordings, scenarios = DATA["made up"]
-    simulation = _begin(recordings, scenarios, traffic)
+    simulation = _begin(_stage(stages[-1]), traffic)
     memo: dict[int, object] = {}
     copy.deepcopy(simulation.driver, memo)
     kinds = {type(each).__name__ for each in memo.values()}

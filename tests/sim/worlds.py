@@ -7,6 +7,8 @@ import numpy as np
 from asp_env.data.classes import AgentClass
 from asp_env.data.recording import Recording
 from asp_env.data.scenario import Scenario
+from asp_env.sim.replay import ReplayWorld
+from asp_env.sim.scenario_world import ScenarioWorld
 from asp_env.sim.simulation import Simulation
 from asp_env.sim.traffic import TrafficSpec, make_traffic
 from tests.builders import Drive, make_recording
@@ -56,12 +58,18 @@ def simulate(
     recordings: Sequence[Recording] | Recording,
     scenarios: Sequence[Scenario] | Scenario,
     traffic: TrafficSpec = "log",
+    kind: type[ScenarioWorld] = ReplayWorld,
 ) -> Simulation:
     """Episodes that have just begun."""
     recordings = [recordings] if isinstance(recordings, Recording) else recordings
     scenarios = [scenarios] if isinstance(scenarios, Scenario) else scenarios
     simulation = Simulation(
-        recordings, make_traffic(traffic), num_episodes=len(scenarios), dt_s=DT_S, history=HISTORY
+        recordings,
+        make_traffic(traffic),
+        num_episodes=len(scenarios),
+        dt_s=DT_S,
+        history=HISTORY,
+        kind=kind,
     )
     simulation.reset(scenarios, [np.random.default_rng(each.seed) for each in scenarios])
     return simulation

@@ -1,0 +1,120 @@
+"""Recordings and episodes of every world, for what holds of all of them."""
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from functools import cache
+from typing import Any
+
+import pytest
+
+from asp_env.data.scenario import Scenario, find_scenarios
+from asp_env.sim.replay import ReplayWorld
+from asp_env.sim.scenario_world import ScenarioWorld
+from asp_env.sim.simulation import Simulation
+from asp_env.sim.worlds import world_of
+from tests.builders import make_recording
+from tests.highway_folders import highway_data, highway_recordings, highway_scenarios
+from tests.sim.worlds import DT_S, HISTORY, TRAFFICS, scenario, simulate
+
+OWN_TRAFFICS = (
+    *("own", "idm", "log-actions", "policy"),
+    *("predictor:constant-turn-rate", "predictor:every=3:mode=sampled:oracle"),
+    "default=own,3=policy,20=idm,18=log-actions,4=predictor:constant-velocity",
+)
+"""Every driver that runs no network in a world whose vehicles drive themselves, and a table."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Place:
+    """Four episodes of different lengths with different numbers of agents."""
+
+    data: str | None
+    """DATA's scheme, if the world is that of one."""
+    kind: Callable[[], type[ScenarioWorld]]
+    recordings: Callable[[], Sequence[Any]]
+    scenarios: Callable[[], list[Scenario]]
+    found: Callable[[], list[Scenario]]
+    """What the table of scenarios offers, or some of it."""
+    traffics: tuple[str, ...]
+    steps: int
+    """Two of the four are over by then."""
+
+    def simulate(
+        self, scenarios: Sequence[Scenario] | Scenario, traffic: str | None = None
+    ) -> Simulation:
+        """Episodes that have just begun, by default with everybody left to the world."""
+        name = self.traffics[0] if traffic is None else traffic
+        return simulate(self.recordings(), scenarios, name, self.kind())
+
+
+@cache
+def _recordings() -> list[Any]:
+    return [
+        make_recording(),
+        make_recording(name="01", seed=1, duration_s=16.0),
+        make_recording(name="02", seed=2, duration_s=24.0),
+    ]
+
+
+def _replayed() -> Place:
+    return Place(
+        data=None,
+        kind=lambda: ReplayWorld,
+        recordings=_recordings,
+        scenarios=lambda: [
+            scenario(1, start=15, length=24),
+            scenario(3, start=20, length=40, recording=1),
+            scenario(7, start=36, length=20),
+            scenario(2, start=30, length=70, recording=2),
+        ],
+        found=lambda: list(
+            find_scenarios(_recordings(), source="made-up", dt_s=DT_S, history=HISTORY)
+        ),
+        traffics=TRAFFICS,
+        steps=26,
+    )
+
+
+def _highway(site: str, scenarios: Sequence[Scenario]) -> Place:
+    return Place(
+        data="highway",
+        kind=lambda: world_of(highway_data(site)),
+        recordings=lambda: highway_recordings(site),
+        scenarios=lambda: [*scenarios],
+        found=lambda: list(highway_scenarios(site))[::4],  # stepping them takes its time
+        traffics=OWN_TRAFFICS,
+        steps=14,
+    )
+
+
+PLACES = {
+    "replay": _replayed(),
+    "highway intersection": _highway(
+        "intersection",
+        [
+            scenario(18, start=150, length=11),  # turns left, gives way
+            scenario(2, start=70, length=20, recording=1),  # amid crashes
+            scenario(13, start=70, length=12),
+            scenario(16, start=125, length=40, recording=1),
+        ],
+    ),
+    "highway roundabout": _highway(
+        "roundabout",
+        [
+            scenario(7, start=115, length=9),
+            scenario(4, start=35, length=20, recording=1),
+            scenario(2, start=20, length=12),
+            scenario(9, start=130, length=40, recording=1),
+        ],
+    ),
+}
+
+everywhere = pytest.mark.parametrize("place", PLACES.values(), ids=list(PLACES))
+every_traffic = pytest.mark.parametrize(
+    ("place", "traffic"),
+    [
+        pytest.param(place, traffic, id=f"{name}-{traffic}")
+        for name, place in PLACES.items()
+        for traffic in place.traffics
+    ],
+)
