@@ -13,6 +13,7 @@ from examples import (
     own_predictor,
     picture,
     step_the_environment,
+    traffic_that_reacts,
     train_ppo_raster,
     train_ppo_vectors,
 )
@@ -36,6 +37,15 @@ def test_random_actions_bring_every_episode_to_a_named_end() -> None:
 def test_an_own_predictor_drives_the_planner() -> None:
     """With forecasts of its own the planner gets somewhere."""
     assert own_predictor.main() > 0.2
+
+
+def test_a_car_that_stops_is_hit_by_a_replay_alone(tmp_path: Path) -> None:
+    """Of highway-env's vehicles those behind brake, as they do not in their recording."""
+    hits = traffic_that_reacts.main(tmp_path / "highway", minutes=1 / 3)
+    (replayed, scenarios), (reacting, same) = hits["replayed"], hits["reacting"]
+    assert scenarios == same
+    assert replayed > scenarios / 2
+    assert reacting == 0
 
 
 def test_the_picture_of_the_readme_can_be_drawn(tmp_path: Path) -> None:
