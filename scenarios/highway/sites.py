@@ -9,6 +9,7 @@ import numpy as np
 from highway_env.envs import IntersectionEnv, RoundaboutEnv
 from highway_env.envs.common.abstract import AbstractEnv
 
+from scenarios.highway.roads import RegulatedTrafficRoad, TrafficRoad
 from scenarios.highway.vehicles import (
     IntersectionVehicle,
     Network,
@@ -33,6 +34,7 @@ class Site:
     name: str
     environment: type[AbstractEnv]
     vehicle: type[TrafficVehicle]
+    road: type[TrafficRoad]
     speed_limit_mps: float
     config: dict[str, Any]
     """Where it differs from the environment's own."""
@@ -51,6 +53,7 @@ SITES = {
             name="intersection",
             environment=IntersectionEnv,
             vehicle=IntersectionVehicle,
+            road=RegulatedTrafficRoad,
             speed_limit_mps=10.0,
             config={"destination": None},
             populate=lambda env: env._make_vehicles(env.config["initial_vehicle_count"]),
@@ -61,6 +64,7 @@ SITES = {
             name="roundabout",
             environment=RoundaboutEnv,
             vehicle=RoundaboutVehicle,
+            road=TrafficRoad,
             speed_limit_mps=20.0,
             config={},
             populate=lambda env: env._make_vehicles(),
@@ -96,7 +100,8 @@ def network(site_name: str) -> Network:
     """The roads of a place, which never change."""
     env = _environment(site_name)
     env._make_road()
-    return Network(env.road.network)
+    road, env.road = env.road, None
+    return Network(road.network)
 
 
 def empty_road(site: Site, *, steps: int = 0) -> Road:
@@ -106,11 +111,9 @@ def empty_road(site: Site, *, steps: int = 0) -> Road:
         site: where.
         steps: how many steps it has made, by which the intersection times its rules.
     """
-    env = _environment(site.name)
-    env._make_road()
-    road, env.road = env.road, None
-    road.network, road.steps = network(site.name), steps
-    road.np_random = None  # nothing is drawn while vehicles drive
+    # given a generator only since highway-env would make one, which takes long
+    road: Road = site.road(network(site.name), np_random=np.random.default_rng(0))
+    road.steps, road.np_random = steps, None  # nothing is drawn while vehicles drive
     return road
 
 

@@ -1,6 +1,7 @@
 """highway-env's vehicles and roads as needed here: the same laws, without the faults."""
 
 import math
+from collections.abc import Callable
 from typing import Any
 
 import numpy as np
@@ -15,6 +16,9 @@ Road = Any
 
 Pose = list[float]
 """[x m, y m, heading rad, speed m/s] in highway-env's axes."""
+
+REMEMBERED = 256
+"""Places of which a lane remembers where along it they lie."""
 
 CELL_M = 4.0
 """Lanes near a point are looked up by squares of this size."""
@@ -124,8 +128,11 @@ class Network(RoadNetwork):
         self.indices: list[Any] = [*self.lanes_dict()]
         """(from, to, number) of each lane, in the order of `lanes_list`."""
         self.roads: list[Any] = [*dict.fromkeys(index[:2] for index in self.indices)]
-        self._lanes = self.lanes_list()
+        self._lanes: list[Any] = self.lanes_list()
         self._boxes = np.array([_box(lane) for lane in self._lanes])
+        self._reaches = dict(zip(self.indices, map(_reach, self._lanes), strict=True))
+        for lane in self._lanes:
+            lane.local_coordinates = _remembering(lane.local_coordinates)
         self._near: dict[tuple[int, int], list[tuple[float, int]]] = {}
 
     def __deepcopy__(self, memo: dict[int, Any]) -> "Network":
@@ -151,6 +158,16 @@ class Network(RoadNetwork):
                 best, found = distance, number
         return self.indices[found]
 
+    def near(self, index: Any, vehicles: list[TrafficVehicle]) -> list[TrafficVehicle]:
+        """Of some vehicles those who may be on a lane, in their order."""
+        left, low, right, high = self._reaches[index]
+        found = []
+        for vehicle in vehicles:
+            x, y = vehicle.position.tolist()
+            if left <= x <= right and low <= y <= high:
+                found.append(vehicle)
+        return found
+
     def _order(self, cell: tuple[int, int]) -> list[tuple[float, int]]:
         low = np.array(cell) * CELL_M
         before, behind = self._boxes[:, :2] - (low + CELL_M), low - self._boxes[:, 2:]
@@ -158,7 +175,35 @@ class Network(RoadNetwork):
         return [(float(least[i]), int(i)) for i in np.argsort(least, kind="stable")]
 
 
+def _remembering(locate: Callable[[Any], Any]) -> Callable[[Any], Any]:
+    """The same function; vehicles ask it again and again while nobody moves."""
+    known: dict[bytes, Any] = {}
+
+    def local_coordinates(position: Float[np.ndarray, " 2"]) -> tuple[float, float]:
+        key = position.tobytes()
+        found = known.get(key)
+        if found is None:
+            if len(known) >= REMEMBERED:
+                known.clear()
+            found = known[key] = locate(position)
+        return found
+
+    return local_coordinates
+
+
 def _box(lane: Any) -> tuple[float, float, float, float]:
-    """A rectangle around a lane's centre line, with a margin for what lies between its points."""
-    points = np.array([lane.position(s, 0.0) for s in np.linspace(0.0, lane.length, 200)])
-    return (*(points.min(axis=0) - 0.5), *(points.max(axis=0) + 0.5))
+    """A rectangle around a lane's centre line."""
+    return _around(lane, along_m=0.0, across_m=0.0)
+
+
+def _reach(lane: Any) -> tuple[float, float, float, float]:
+    """A rectangle around all that highway-env takes for on a lane when it looks for neighbours."""
+    return _around(lane, along_m=float(lane.VEHICLE_LENGTH), across_m=lane.width / 2 + 1.0)
+
+
+def _around(lane: Any, *, along_m: float, across_m: float) -> tuple[float, float, float, float]:
+    """With a margin for what lies between its points."""
+    way = np.linspace(-along_m, lane.length + along_m, 200)
+    points = np.array([lane.position(s, side) for s in way for side in (-across_m, across_m)])
+    low, high = points.min(axis=0) - 0.5, points.max(axis=0) + 0.5
+    return (*low.tolist(), *high.tolist())

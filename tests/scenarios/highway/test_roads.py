@@ -1,0 +1,102 @@
+"""What is left undone on these roads changes nothing: highway-env's own do the same."""
+
+from typing import Any
+
+import numpy as np
+import pytest
+from highway_env.vehicle.behavior import IDMVehicle
+
+from scenarios.highway.sites import SITES, STEP_S, Site, empty_road, network
+from scenarios.highway.vehicles import REMEMBERED, Network
+
+
+class IntersectionCar(IDMVehicle):
+    """highway-env's own vehicle as its intersection wants it."""
+
+    DISTANCE_WANTED = 7
+    COMFORT_ACC_MAX = 6
+    COMFORT_ACC_MIN = -3
+
+
+def their_road(site: Site) -> Any:
+    """highway-env's own road without vehicles."""
+    kind = f"{site.vehicle.__module__}.{site.vehicle.__qualname__}"
+    env: Any = site.environment(config={"other_vehicles_type": kind})
+    env._make_road()
+    return env.road
+
+
+def fill(site: Site, road: Any, kind: type[IDMVehicle], seed: int) -> None:
+    """A crowd anywhere on the road, some of it beside its lane and on its way into others."""
+    rng = np.random.default_rng(seed)
+    lanes = road.network.lanes_dict()
+    exits = [end for start, end, _ in lanes if site.is_exit(start, end)]
+    for number in rng.choice(len(lanes), size=25):
+        index = [*lanes][number]
+        lane: Any = lanes[index]
+        along, across = rng.uniform(0.0, lane.length), rng.normal()
+        heading = lane.heading_at(along) + rng.normal() * 0.3
+        vehicle = kind(road, lane.position(along, across), heading, rng.uniform(0.0, 15.0))
+        vehicle.plan_route_to(rng.choice(exits))
+        vehicle.DELTA = rng.uniform(3.5, 4.5)
+        road.vehicles.append(vehicle)
+
+
+def told(road: Any) -> list[tuple[Any, ...]]:
+    """All that the vehicles of a road differ in."""
+    return [
+        (*v.position.tolist(), v.heading, v.speed, v.crashed, v.target_lane_index, v.target_speed)
+        for v in road.vehicles
+    ]
+
+
+@pytest.mark.parametrize("name", SITES)
+@pytest.mark.parametrize("seed", range(3))
+def test_a_crowd_goes_on_as_on_highway_envs_own_road(name: str, seed: int) -> None:
+    """Through 3 s of giving way, changing lanes and hitting each other, bit for bit."""
+    site = SITES[name]
+    ours, theirs = empty_road(site), their_road(site)
+    fill(site, ours, site.vehicle, seed)
+    fill(site, theirs, IntersectionCar if name == "intersection" else IDMVehicle, seed)
+    assert told(ours) == told(theirs)
+    before = told(ours)
+    yielded = False
+    for _ in range(45):
+        for road in (ours, theirs):
+            road.act()
+            road.step(STEP_S)
+        assert told(ours) == told(theirs)
+        yielded |= any(vehicle.target_speed == 0 for vehicle in ours.vehicles)
+    changed = [a[5] != b[5] for a, b in zip(before, told(ours), strict=True)]
+    assert any(changed), "somebody makes for another lane"
+    assert any(vehicle.crashed for vehicle in ours.vehicles), "somebody hits somebody"
+    assert yielded == (name == "intersection"), "somebody gives way where there are rules"
+
+
+@pytest.mark.parametrize("name", SITES)
+def test_nobody_on_a_lane_is_left_out_of_those_near_it(name: str) -> None:
+    """By highway-env's own word for being on it, 1 m beside it included."""
+    road = empty_road(SITES[name])
+    rng = np.random.default_rng(0)
+    vehicle = SITES[name].vehicle
+    road.vehicles = [
+        vehicle(road, place, 0.0, 0.0) for place in rng.uniform(-60.0, 60.0, size=(200, 2))
+    ]
+    left_out = 0
+    for index, lane in road.network.lanes_dict().items():
+        on_it = [each for each in road.vehicles if lane.on_lane(each.position, margin=1)]
+        near = road.network.near(index, road.vehicles)
+        assert [each for each in near if each in on_it] == on_it
+        left_out += len(road.vehicles) - len(near)
+    assert left_out > 100 * len(road.network.indices)
+
+
+def test_what_a_lane_remembers_is_of_the_place_and_not_of_the_array() -> None:
+    """The array of a vehicle's position changes in place."""
+    known: Network = network("roundabout")
+    lane: Any = known.get_lane(known.indices[0])
+    fresh: Any = their_road(SITES["roundabout"]).network.get_lane(known.indices[0])
+    place = np.array([10.0, 20.0])
+    for _ in range(REMEMBERED + 2):
+        assert lane.local_coordinates(place) == fresh.local_coordinates(place)
+        place += 0.1
