@@ -159,6 +159,10 @@ class Network(RoadNetwork):
 
 
 def _box(lane: Any) -> tuple[float, float, float, float]:
-    """A rectangle around a lane's centre line, with a margin for what lies between its points."""
+    """A rectangle around a lane's centre line.
+
+    Its margin is for what lies between the points, and for sine lanes, from which distances are
+    measured as if they went on beyond their ends.
+    """
     points = np.array([lane.position(s, 0.0) for s in np.linspace(0.0, lane.length, 200)])
-    return (*(points.min(axis=0) - 0.5), *(points.max(axis=0) + 0.5))
+    return (*(points.min(axis=0) - 1.0), *(points.max(axis=0) + 1.0))
