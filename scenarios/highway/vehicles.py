@@ -107,7 +107,11 @@ class IntersectionVehicle(TrafficVehicle):
 
 
 class RoundaboutVehicle(TrafficVehicle):
-    """Of the roundabout."""
+    """Of the roundabout, with what highway-env's class says before its intersection changes it."""
+
+    DISTANCE_WANTED = 10.0
+    COMFORT_ACC_MAX = 3.0
+    COMFORT_ACC_MIN = -5.0
 
 
 class Network(RoadNetwork):

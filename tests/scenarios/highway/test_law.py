@@ -6,6 +6,7 @@ from highway_env.envs import IntersectionEnv, RoundaboutEnv
 from highway_env.road.road import RoadNetwork
 from highway_env.vehicle.behavior import IDMVehicle
 
+from asp_env.data.scenario import Scenario, find_scenarios
 from asp_env.dynamics import wrap_angle
 from asp_env.sim.worlds import world_of
 from scenarios.highway.rounds import step_road
@@ -18,28 +19,45 @@ from scenarios.highway.sites import (
     populated_road,
 )
 from tests.highway_folders import SITE_NAMES, highway_recordings, highway_scenarios
-from tests.sim.worlds import replay, simulate
+from tests.sim.worlds import DT_S, HISTORY
 
 every_site = pytest.mark.parametrize("site", SITE_NAMES)
 
 
-@every_site
-def test_left_to_itself_everything_goes_on_as_recorded(site):
-    """Nobody is driven, the egos neither: presence is the log's, states are within its rounding."""
-    scenarios = list(highway_scenarios(site))[1 :: 6 if site == "intersection" else 2]
-    simulation = simulate(highway_recordings(site), scenarios, "own", world_of("highway:"))
-    replay(simulation, max(each.length for each in scenarios))
-    world = simulation.world
+def goes_on(site: str, scenarios: list[Scenario], dt_s: float, history: int) -> int:
+    """Leaves episodes to themselves and compares them with the log; how many states of it."""
+    recordings, kind = highway_recordings(site), world_of("highway:")
+    count = len(scenarios)
+    world = kind(recordings, num_episodes=count, dt_s=dt_s, history=history)
+    world.reset(scenarios, [np.random.default_rng(0)] * count)
+    actions = np.zeros((*world.episodes.ids.shape, 2), dtype=np.float32)
+    nobody = np.zeros(world.episodes.ids.shape, dtype=bool)
+    for _ in range(max(each.length for each in scenarios)):
+        world.step(actions, nobody)
     data, compared = world.episodes, 0
     for b, scenario in enumerate(scenarios):
-        ticks = world.history + 1 + scenario.length
+        ticks = history + 1 + scenario.length
         there = data.log_valid[b, :ticks]
         assert np.array_equal(data.valid[b, :ticks], there)
         away = (data.states[b, :ticks] - data.log_states[b, :ticks])[there]
         away[:, 2] = wrap_angle(away[:, 2])
         assert np.abs(away).max() < 1e-4
         compared += len(away)
-    assert compared > 2000
+    return compared
+
+
+@every_site
+def test_left_to_itself_everything_goes_on_as_recorded(site):
+    """Nobody is driven, the egos neither: presence is the log's, states are within its rounding."""
+    scenarios = list(highway_scenarios(site))[1 :: 6 if site == "intersection" else 2]
+    assert goes_on(site, scenarios, DT_S, HISTORY) > 2000
+
+
+@every_site
+def test_a_tick_may_be_longer(site):
+    """The same with 0.4 s, in the middle of which vehicles come and leave."""
+    found = find_scenarios(highway_recordings(site), source=site, dt_s=0.4, history=5)
+    assert goes_on(site, list(found)[::10], 0.4, 5) > 300
 
 
 class _AsTraffic:
