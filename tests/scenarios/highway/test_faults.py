@@ -4,7 +4,6 @@ import copy
 import json
 import subprocess
 import sys
-from collections.abc import Iterator
 from typing import Any
 
 import numpy as np
@@ -27,11 +26,10 @@ every_site = pytest.mark.parametrize("site", SITE_NAMES)
 
 
 @pytest.fixture(autouse=True)
-def _classes_as_they_were(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
+def _classes_as_they_were(monkeypatch: pytest.MonkeyPatch) -> None:
     """What highway-env's intersection writes into its class is undone behind each test."""
     for name in NAMES:
         monkeypatch.setattr(IDMVehicle, name, getattr(IDMVehicle, name))
-    return
 
 
 def test_an_intersection_changes_no_roundabout():
@@ -78,7 +76,7 @@ def test_spaces_stay_the_same_objects(site):
         assert (env.observation_space is observation_space) == stays
 
 
-def _theirs_alone(speed_mps: float, **config: Any) -> tuple[RoundaboutEnv, Vehicle]:
+def _theirs_alone(speed_mps: float, **config: Any) -> tuple[Any, Vehicle]:
     """Nobody but one vehicle that goes straight on, on highway-env's empty roundabout."""
     env = RoundaboutEnv(config=config)
     vehicle = Vehicle(env.road, [0.0, -200.0], heading=0.0, speed=speed_mps)
@@ -130,7 +128,7 @@ def _copies(monkeypatch: pytest.MonkeyPatch) -> list[str]:
 @every_site
 def test_nothing_is_copied_in_a_step(site, monkeypatch):
     """(e) highway-env copies the road with all vehicles to foresee where a steered one goes."""
-    theirs = IntersectionEnv(config={"action": {"type": "ContinuousAction"}})
+    theirs: Any = IntersectionEnv(config={"action": {"type": "ContinuousAction"}})
     ours = make(highway_data(site))
     ours.reset(seed=0)
     copied = _copies(monkeypatch)
