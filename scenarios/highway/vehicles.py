@@ -111,7 +111,11 @@ class IntersectionVehicle(TrafficVehicle):
 
 
 class RoundaboutVehicle(TrafficVehicle):
-    """Of the roundabout."""
+    """Of the roundabout, with what highway-env's class says before its intersection changes it."""
+
+    DISTANCE_WANTED = 10.0
+    COMFORT_ACC_MAX = 3.0
+    COMFORT_ACC_MIN = -5.0
 
 
 class Network(RoadNetwork):
@@ -202,8 +206,11 @@ def _reach(lane: Any) -> tuple[float, float, float, float]:
 
 
 def _around(lane: Any, *, along_m: float, across_m: float) -> tuple[float, float, float, float]:
-    """With a margin for what lies between its points."""
+    """With a margin for what lies between its points.
+
+    And for sine lanes, from which distances are measured as if they went on beyond their ends.
+    """
     way = np.linspace(-along_m, lane.length + along_m, 200)
     points = np.array([lane.position(s, side) for s in way for side in (-across_m, across_m)])
-    low, high = points.min(axis=0) - 0.5, points.max(axis=0) + 0.5
+    low, high = points.min(axis=0) - 1.0, points.max(axis=0) + 1.0
     return (*low.tolist(), *high.tolist())

@@ -102,7 +102,7 @@ PLACES = {
         "roundabout",
         [
             scenario(7, start=115, length=9),
-            scenario(4, start=35, length=20, recording=1),
+            scenario(4, start=28, length=20, recording=1),  # amid a change of lanes, then a crash
             scenario(2, start=20, length=12),
             scenario(9, start=130, length=40, recording=1),
         ],

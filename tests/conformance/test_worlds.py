@@ -55,8 +55,8 @@ def test_every_world_of_the_registry_is_here():
 def test_it_is_a_world(place):
     """The plug has all that the socket asks for; its first traffic is that of nobody else."""
     world = place.kind()(place.recordings(), num_episodes=1, dt_s=DT_S, history=HISTORY)
-    assert isinstance(world, World)
     assert world.traffic == place.traffics[0]
+    assert isinstance(world, World)
 
 
 @every_traffic

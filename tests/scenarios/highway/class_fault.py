@@ -1,0 +1,62 @@
+"""Run in a process of its own, in which highway-env may spoil its classes."""
+
+import hashlib
+import json
+import sys
+
+import numpy as np
+from highway_env.envs import IntersectionEnv, RoundaboutEnv
+from highway_env.vehicle.behavior import IDMVehicle
+
+from scenarios.highway.rounds import simulate_round, step_road
+from scenarios.highway.sites import SITES, populated_road
+from tests.scenarios.highway.environments import make
+
+NAMES = ("DISTANCE_WANTED", "COMFORT_ACC_MAX", "COMFORT_ACC_MIN")
+
+
+def parameters() -> list[float]:
+    """Those of the class of all vehicles that drive themselves."""
+    return [float(getattr(IDMVehicle, name)) for name in NAMES]
+
+
+def theirs() -> str:
+    """A hash of where vehicles are in an episode of highway-env's roundabout."""
+    env = RoundaboutEnv()
+    env.reset(seed=8)
+    seen = []
+    for _ in range(5):
+        env.step(1)
+        seen += [each.position for each in env.road.vehicles]
+    return hashlib.sha256(np.array(seen).tobytes()).hexdigest()
+
+
+def ours() -> str:
+    """The same of our roundabout."""
+    road = populated_road(SITES["roundabout"], np.random.default_rng(8))
+    for _ in range(75):
+        step_road(road)
+    return hashlib.sha256(np.array([each.position for each in road.vehicles]).tobytes()).hexdigest()
+
+
+def told() -> list:
+    """What may not change."""
+    return [parameters(), theirs(), ours()]
+
+
+def main() -> None:
+    """Before anything, after our intersection, after highway-env's."""
+    out = [told()]
+    simulate_round(SITES["intersection"], np.random.default_rng(0), frames=60)
+    env = make(sys.argv[1])
+    env.reset(seed=0)
+    for _ in range(5):
+        env.step(np.zeros(2))
+    out.append(told())
+    IntersectionEnv()
+    out.append(told())
+    sys.stdout.write(json.dumps(out))
+
+
+if __name__ == "__main__":
+    main()

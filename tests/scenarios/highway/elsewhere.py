@@ -1,0 +1,55 @@
+"""What another process is asked to do: go on from a snapshot."""
+
+import hashlib
+import pickle
+import sys
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from asp_env.data.source import Recordings, open_data
+from asp_env.sim.simulation import Simulation
+from asp_env.sim.traffic import make_traffic
+from asp_env.sim.worlds import world_of
+from tests.sim.worlds import DT_S, HISTORY
+
+
+def open_world(recordings: Recordings, episodes: int) -> Simulation:
+    """Room for episodes of highway-env's traffic that have not begun."""
+    return Simulation(
+        recordings,
+        make_traffic("own"),
+        num_episodes=episodes,
+        dt_s=DT_S,
+        history=HISTORY,
+        kind=world_of("highway:"),
+    )
+
+
+def drive(simulation: Simulation, tick: int) -> None:
+    """One tick in which egos drive, and leave themselves to the world in every third."""
+    count = len(simulation.world)
+    actions = np.random.default_rng(tick).uniform((-2.0, -0.1), (2.0, 0.1), (count, 2))
+    simulation.step(actions.astype(np.float32), np.full(count, tick % 3 > 0))
+
+
+def go_on(simulation: Simulation, snapshot: Any, first: int, last: int) -> str:
+    """A hash of all states of all ticks, the last ones of which come after a snapshot."""
+    simulation.world.restore(snapshot)
+    for tick in range(first, last):
+        drive(simulation, tick)
+    data = simulation.world.episodes
+    return hashlib.sha256(data.states.tobytes() + data.valid.tobytes()).hexdigest()
+
+
+def main(path: Path) -> None:
+    """Prints what becomes of the snapshots in a file."""
+    for data, snapshots, last in pickle.loads(path.read_bytes()):
+        simulation = open_world(open_data(data), len(snapshots[0][1][1]))
+        for tick, snapshot in snapshots:
+            sys.stdout.write(go_on(simulation, snapshot, tick, last) + "\n")
+
+
+if __name__ == "__main__":
+    main(Path(sys.argv[1]))

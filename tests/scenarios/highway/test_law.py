@@ -1,0 +1,164 @@
+"""The law of the world: nothing changes because it is ours."""
+
+import numpy as np
+import pytest
+from highway_env.envs import IntersectionEnv, RoundaboutEnv
+from highway_env.road.road import RoadNetwork
+from highway_env.vehicle.behavior import IDMVehicle
+
+from asp_env.data.scenario import Scenario, find_scenarios
+from asp_env.dynamics import wrap_angle
+from asp_env.sim.worlds import world_of
+from scenarios.highway.rounds import step_road
+from scenarios.highway.sites import (
+    SITES,
+    STEPS_PER_S,
+    bring_another,
+    clear_leavers,
+    network,
+    populated_road,
+)
+from tests.highway_folders import SITE_NAMES, highway_recordings, highway_scenarios
+from tests.sim.worlds import DT_S, HISTORY
+
+every_site = pytest.mark.parametrize("site", SITE_NAMES)
+
+
+def goes_on(site: str, scenarios: list[Scenario], dt_s: float, history: int) -> int:
+    """Leaves episodes to themselves and compares them with the log; how many states of it."""
+    recordings, kind = highway_recordings(site), world_of("highway:")
+    count = len(scenarios)
+    world = kind(recordings, num_episodes=count, dt_s=dt_s, history=history)
+    world.reset(scenarios, [np.random.default_rng(0)] * count)
+    actions = np.zeros((*world.episodes.ids.shape, 2), dtype=np.float32)
+    nobody = np.zeros(world.episodes.ids.shape, dtype=bool)
+    for _ in range(max(each.length for each in scenarios)):
+        world.step(actions, nobody)
+    data, compared = world.episodes, 0
+    for b, scenario in enumerate(scenarios):
+        ticks = history + 1 + scenario.length
+        there = data.log_valid[b, :ticks]
+        assert np.array_equal(data.valid[b, :ticks], there)
+        away = (data.states[b, :ticks] - data.log_states[b, :ticks])[there]
+        away[:, 2] = wrap_angle(away[:, 2])
+        assert np.abs(away).max() < 1e-4
+        compared += len(away)
+    return compared
+
+
+@every_site
+def test_left_to_itself_everything_goes_on_as_recorded(site):
+    """Nobody is driven, the egos neither: presence is the log's, states are within its rounding."""
+    scenarios = list(highway_scenarios(site))[1 :: 6 if site == "intersection" else 2]
+    assert goes_on(site, scenarios, DT_S, HISTORY) > 2000
+
+
+@every_site
+def test_a_tick_may_be_longer(site):
+    """The same with 0.4 s, in the middle of which vehicles come and leave."""
+    found = find_scenarios(highway_recordings(site), source=site, dt_s=0.4, history=5)
+    assert goes_on(site, list(found)[::10], 0.4, 5) > 300
+
+
+class _AsTraffic:
+    """highway-env's ego as one of its vehicles that drive themselves."""
+
+    vehicle_class = IDMVehicle
+
+
+def _theirs(site: str, seed: int, seconds: int) -> list[list[tuple]]:
+    """Every step of an episode of highway-env's own environment, whose ego drives itself."""
+    kinds = {"intersection": IntersectionEnv, "roundabout": RoundaboutEnv}
+    env = kinds[site](config={"destination": None} if site == "intersection" else {})
+    env.np_random, env.action_type = np.random.default_rng(seed), _AsTraffic()
+    env._reset()
+    env.controlled_vehicles, told = [], []
+    for _ in range(seconds):
+        for _ in range(STEPS_PER_S):
+            env.road.act()
+            env.road.step(1 / STEPS_PER_S)
+            told.append(_told(env.road))
+        if site == "intersection":
+            env._clear_vehicles()
+            env._spawn_vehicle(spawn_probability=env.config["spawn_probability"])
+        else:  # where it takes away nobody
+            env.road.vehicles = [each for each in env.road.vehicles if not _at_the_end(each)]
+        told.append(_told(env.road))
+    return told
+
+
+def _at_the_end(vehicle: IDMVehicle) -> bool:
+    along, _ = vehicle.lane.local_coordinates(vehicle.position)
+    return vehicle.lane_index[1].endswith("xr") and along >= vehicle.lane.length - 20.0
+
+
+def _ours(site: str, seed: int, seconds: int) -> list[list[tuple]]:
+    rng, told = np.random.default_rng(seed), []
+    road = populated_road(SITES[site], rng)
+    for _ in range(seconds):
+        for _ in range(STEPS_PER_S):
+            step_road(road)
+            told.append(_told(road))
+        clear_leavers(SITES[site], road)
+        bring_another(SITES[site], road, rng)
+        told.append(_told(road))
+    return told
+
+
+def _told(road) -> list[tuple]:
+    """All that vehicles are and want, exactly."""
+    return [
+        (
+            *each.position.tolist(), float(each.heading), float(each.speed),
+            float(each.action["steering"]), float(each.action["acceleration"]),
+            each.lane_index, tuple(map(str, each.target_lane_index)), float(each.target_speed),
+            float(each.timer), each.DELTA, str(each.route), each.crashed,
+            getattr(each, "is_yielding", False),
+        )
+        for each in road.vehicles
+    ]  # fmt: skip
+
+
+@pytest.mark.parametrize(("site", "seed"), [("intersection", 5), ("roundabout", 8)])
+def test_a_round_is_what_highway_env_makes_of_the_same_generator(site, seed, monkeypatch):
+    """Bit for bit, with nearest lanes found faster and predictions remembered.
+
+    Amid it vehicles give way at the intersection, and crash at the roundabout.
+    """
+    for name in ("DISTANCE_WANTED", "COMFORT_ACC_MAX", "COMFORT_ACC_MIN"):
+        monkeypatch.setattr(IDMVehicle, name, getattr(IDMVehicle, name))  # to be put back
+    theirs, ours = _theirs(site, seed, seconds=12), _ours(site, seed, seconds=12)
+    assert theirs == ours
+    assert any(vehicle[-1 if site == "intersection" else -2] for step in ours for vehicle in step)
+
+
+@every_site
+def test_the_nearest_lane_is_the_one_that_all_lanes_are_asked_for(site):
+    """At 3000 poses all over the place and along the lanes, on, beside, before and behind them."""
+    fast, slow, rng = network(site), RoadNetwork(), np.random.default_rng(0)
+    slow.graph, lanes = fast.graph, fast.lanes_list()
+    for number in range(3000):
+        lane = lanes[rng.integers(len(lanes))]
+        if number % 3:
+            place = lane.position(rng.uniform(-40, lane.length + 40), rng.normal(0, 3))
+        else:
+            place = rng.uniform(-200, 200, 2)
+        heading = None if number % 10 == 0 else rng.uniform(-4, 4)
+        expected = slow.get_closest_lane_index(place, heading)
+        assert fast.get_closest_lane_index(place, heading) == expected
+
+
+@every_site
+def test_of_equally_near_lanes_it_is_the_first(site):
+    """Where lanes begin or end together, and in the middle between two."""
+    fast, slow = network(site), RoadNetwork()
+    slow.graph, lanes, ties = fast.graph, fast.lanes_list(), 0
+    for lane in lanes:
+        for along in (0.0, lane.length):
+            for aside in (0.0, -2.0, 2.0):
+                place, heading = lane.position(along, aside), lane.heading_at(along)
+                expected = slow.get_closest_lane_index(place, heading)
+                assert fast.get_closest_lane_index(place, heading) == expected
+                away = sorted(each.distance_with_heading(place, heading) for each in lanes)
+                ties += away[0] == away[1]
+    assert ties > 10
