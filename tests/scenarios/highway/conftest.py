@@ -6,8 +6,20 @@ from typing import Any
 import pytest
 from highway_env.envs import IntersectionEnv, RoundaboutEnv
 from highway_env.envs.common.abstract import AbstractEnv
+from highway_env.vehicle.behavior import IDMVehicle
 
 from tests.scenarios.highway.maps import Place, read_back
+
+
+@pytest.fixture(autouse=True)
+def _as_highway_env_begins(monkeypatch: pytest.MonkeyPatch) -> None:
+    """highway-env's vehicles as they are in a new process: its intersection changes their class."""
+    for name, value in (
+        ("DISTANCE_WANTED", 5.0 + IDMVehicle.LENGTH),
+        ("COMFORT_ACC_MAX", 3.0),
+        ("COMFORT_ACC_MIN", -5.0),
+    ):
+        monkeypatch.setattr(IDMVehicle, name, value)
 
 
 def _place(env: AbstractEnv, folder: Path) -> Place:

@@ -120,13 +120,11 @@ def _told(road) -> list[tuple]:
 
 
 @pytest.mark.parametrize(("site", "seed"), [("intersection", 5), ("roundabout", 8)])
-def test_a_round_is_what_highway_env_makes_of_the_same_generator(site, seed, monkeypatch):
+def test_a_round_is_what_highway_env_makes_of_the_same_generator(site, seed):
     """Bit for bit, with nearest lanes found faster and predictions remembered.
 
     Amid it vehicles give way at the intersection, and crash at the roundabout.
     """
-    for name in ("DISTANCE_WANTED", "COMFORT_ACC_MAX", "COMFORT_ACC_MIN"):
-        monkeypatch.setattr(IDMVehicle, name, getattr(IDMVehicle, name))  # to be put back
     theirs, ours = _theirs(site, seed, seconds=12), _ours(site, seed, seconds=12)
     assert theirs == ours
     assert any(vehicle[-1 if site == "intersection" else -2] for step in ours for vehicle in step)
