@@ -11,13 +11,13 @@ from asp_env.data.clock import frames_per_tick
 from asp_env.data.scenario import Scenario
 from asp_env.data.source import Recordings
 from asp_env.dynamics import forward
-from asp_env.errors import AspEnvError
+from asp_env.errors import AspEnvError, DataError
 from asp_env.sim.kernels import read_obeying
 from asp_env.sim.scenario_world import ScenarioWorld
 from asp_env.sim.world import EGO
 from scenarios.highway.axes import mirror_actions, mirror_states
 from scenarios.highway.hidden import Rows, read_vehicles, revive
-from scenarios.highway.history import HiddenHistory, hidden_path, load_history
+from scenarios.highway.history import WANTED, HiddenHistory, hidden_path, load_history
 from scenarios.highway.rounds import KEPT_EVERY, step_road
 from scenarios.highway.sites import STEP_S, STEPS_PER_S, clear_leavers, empty_road
 from scenarios.highway.vehicles import Road, TrafficVehicle
@@ -104,8 +104,14 @@ class HighwayWorld(ScenarioWorld):
 
     def _history(self, recording: int) -> HiddenHistory:
         if recording not in self._histories:
-            path = hidden_path(self._folder.tracks_path(recording))
-            self._histories[recording] = load_history(path)
+            tracks = self._folder.tracks_path(recording)
+            history = load_history(path := hidden_path(tracks))
+            if not history.fits(self._folder[recording]):
+                raise DataError(
+                    f"{path} does not tell of the vehicles in {tracks}: expected both as they were "
+                    f"{WANTED}"
+                )
+            self._histories[recording] = history
         return self._histories[recording]
 
     def _begin(self, b: int, history: HiddenHistory, kept: _Kept) -> None:
