@@ -8,7 +8,7 @@ import pytest
 
 from asp_env.cli import main
 from asp_env.data.rollout import Rollout
-from tests.highway_folders import SITE_NAMES, highway_data
+from tests.highway_folders import highway_data
 
 PREDICTORS = ("constant-velocity", "constant-turn-rate")
 
@@ -18,10 +18,9 @@ def _rows(folder: Path) -> list[dict[str, str]]:
         return list(csv.DictReader(file))
 
 
-@pytest.mark.parametrize("site", SITE_NAMES)
-def test_drives_from_end_to_end(site, tmp_path):
+def test_drives_from_end_to_end(tmp_path):
     """The expert is first, keeps to its log and ends at its goal; everybody meets `own` traffic."""
-    out, data = tmp_path / "out", highway_data(site)
+    out, data = tmp_path / "out", highway_data("intersection")
     given = ["drive", data, "--out", str(out), "--most", "2", "--predictors", *PREDICTORS]
     assert main(given) == 0
     told = json.loads((out / "manifest.json").read_text())
