@@ -39,7 +39,7 @@ def open_source(argument: str) -> Path:
             ),
         )
     folder = Path(argument).expanduser()
-    if not folder.is_dir():
+    if not argument or not folder.is_dir():
         raise unknown_name("highway site or folder", argument, SITES)
     if not (folder / FOLDER).is_dir():
         raise AspEnvError(

@@ -139,12 +139,17 @@ def _with(site: Site, road: Road, rng: np.random.Generator, do: Callable[[Any], 
         env.road, env.controlled_vehicles, road.np_random = None, [], None
 
 
-def clear_leavers(site: Site, road: Road) -> None:
+def clear_leavers(site: Site, road: Road, *, ego: int | None = None) -> None:
     """Takes away those who are about to come to the end of the road and drive themselves.
 
-    At highway-env's roundabout they would go on for ever: there it takes nobody away.
+    At highway-env's roundabout they would go on for ever: there it takes nobody away. An ego stays
+    in any case, as there: without one an episode makes no sense.
     """
-    road.vehicles = [each for each in road.vehicles if each.steered or not _leaves(site, each)]
+    road.vehicles = [
+        each
+        for each in road.vehicles
+        if each.steered or each.track == ego or not _leaves(site, each)
+    ]
 
 
 def _leaves(site: Site, vehicle: TrafficVehicle) -> bool:

@@ -11,12 +11,13 @@ from asp_env.data.clock import frames_per_tick
 from asp_env.data.scenario import Scenario
 from asp_env.data.source import Recordings
 from asp_env.dynamics import forward
-from asp_env.errors import AspEnvError
+from asp_env.errors import AspEnvError, DataError
 from asp_env.sim.kernels import read_obeying
 from asp_env.sim.scenario_world import ScenarioWorld
+from asp_env.sim.world import EGO
 from scenarios.highway.axes import mirror_actions, mirror_states
 from scenarios.highway.hidden import Rows, read_vehicles, revive
-from scenarios.highway.history import HiddenHistory, hidden_path, load_history
+from scenarios.highway.history import WANTED, HiddenHistory, hidden_path, load_history
 from scenarios.highway.rounds import KEPT_EVERY, step_road
 from scenarios.highway.sites import STEP_S, STEPS_PER_S, clear_leavers, empty_road
 from scenarios.highway.vehicles import Road, TrafficVehicle
@@ -50,8 +51,8 @@ class HighwayWorld(ScenarioWorld):
     Whom nobody drives is driven by highway-env: its intelligent driver model, its lane changes, its
     rules of the road. Who is driven obeys the same bicycle model as in every world, so that an
     action means the same; highway-env's own vehicle has its axles at its bumpers. Vehicles come
-    where and when they were recorded to come, unless somebody is within 15 m; they leave at the end
-    of the road. Left to itself, an episode goes on exactly as it was recorded.
+    where and when they were recorded to come, unless somebody is within 15 m; all but the ego leave
+    at the end of the road. Left to itself, an episode goes on exactly as it was recorded.
     """
 
     traffic = "own"
@@ -103,8 +104,14 @@ class HighwayWorld(ScenarioWorld):
 
     def _history(self, recording: int) -> HiddenHistory:
         if recording not in self._histories:
-            path = hidden_path(self._folder.tracks_path(recording))
-            self._histories[recording] = load_history(path)
+            tracks = self._folder.tracks_path(recording)
+            history = load_history(path := hidden_path(tracks))
+            if not history.fits(self._folder[recording]):
+                raise DataError(
+                    f"{path} does not tell of the vehicles in {tracks}: expected both as they were "
+                    f"{WANTED}"
+                )
+            self._histories[recording] = history
         return self._histories[recording]
 
     def _begin(self, b: int, history: HiddenHistory, kept: _Kept) -> None:
@@ -165,7 +172,7 @@ class HighwayWorld(ScenarioWorld):
             step_road(road)
             run.frame += 1
             if run.frame % STEPS_PER_S == 0:
-                clear_leavers(run.history.site, road)
+                clear_leavers(run.history.site, road, ego=int(self.episodes.tracks[b, EGO]))
                 away = [slot for slot in slots.values() if driven[slot] or gone[slot]]
                 self._let_in(run, {int(self.episodes.tracks[b, slot]) for slot in away})
 

@@ -75,14 +75,14 @@ def _replayed() -> Place:
     )
 
 
-def _highway(site: str, scenarios: Sequence[Scenario]) -> Place:
+def _highway(site: str, scenarios: Sequence[Scenario], traffics: tuple[str, ...]) -> Place:
     return Place(
         data="highway",
         kind=lambda: world_of(highway_data(site)),
         recordings=lambda: highway_recordings(site),
         scenarios=lambda: [*scenarios],
-        found=lambda: list(highway_scenarios(site))[::4],  # stepping them takes its time
-        traffics=OWN_TRAFFICS,
+        found=lambda: list(highway_scenarios(site))[::6],  # stepping them takes its time
+        traffics=traffics,
         steps=14,
     )
 
@@ -97,6 +97,7 @@ PLACES = {
             scenario(13, start=70, length=12),
             scenario(16, start=125, length=40, recording=1),
         ],
+        (OWN_TRAFFICS[0], OWN_TRAFFICS[-1]),
     ),
     "highway roundabout": _highway(
         "roundabout",
@@ -106,6 +107,7 @@ PLACES = {
             scenario(2, start=20, length=12),
             scenario(9, start=130, length=40, recording=1),
         ],
+        OWN_TRAFFICS,
     ),
 }
 

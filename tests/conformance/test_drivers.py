@@ -35,7 +35,7 @@ NAMES = tuple(
     for argument in ARGUMENTS.get(name, ("",))
 )
 REPLAY_TABLE = "default=idm,car=hybrid,truck=log-actions,van=predictor:constant-velocity,3=policy"
-OWN_TABLE = "default=own,3=policy,20=idm,18=log-actions,4=predictor:constant-velocity"
+OWN_TABLE = "default=own,3=policy,8=idm,2=log-actions,4=predictor:constant-velocity"
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -68,12 +68,12 @@ def _sample() -> Stage:
 
 def _highway() -> Stage:
     return Stage(
-        recordings=highway_recordings("intersection"),
+        recordings=highway_recordings("roundabout"),
         scenarios=[
-            scenario(18, start=150, length=10),
-            scenario(2, start=70, length=20, recording=1),
-            scenario(13, start=70, length=12),
-            scenario(16, start=125, length=40, recording=1),
+            scenario(7, start=115, length=10),
+            scenario(4, start=28, length=20, recording=1),
+            scenario(2, start=20, length=12),
+            scenario(9, start=130, length=40, recording=1),
         ],
         kind=world_of("highway:"),
         steps=14,

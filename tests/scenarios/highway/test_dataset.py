@@ -1,0 +1,243 @@
+"""Folders of highway-env's traffic: the command, the source, the same bytes, and damage."""
+
+import pickle
+import shutil
+import subprocess
+import sys
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pandas as pd
+import pytest
+
+from asp_env import registry
+from asp_env.cli import main
+from asp_env.data.scenario import find_scenarios
+from asp_env.data.source import open_data
+from asp_env.errors import AspEnvError, DataError
+from asp_env.sim.worlds import world_of
+from scenarios.highway import plugs
+from scenarios.highway.history import hidden_path, load_history
+from tests.highway_folders import SITE_NAMES, highway_data, highway_folder, highway_recordings
+from tests.scenarios.highway.environments import make
+from tests.scenarios.test_synthesize import contents, stand_in
+from tests.sim.worlds import DT_S, HISTORY, replay, scenario, simulate
+
+every_site = pytest.mark.parametrize("site", SITE_NAMES)
+
+
+def command(out: Path, **options: Any) -> list[str]:
+    """What makes 20 s of the roundabout with seed 7, unless the options say otherwise."""
+    chosen = {"site": "highway:roundabout", "recordings": 1, "minutes": 0.3, "seed": 7, **options}
+    return ["synthesize", str(out), *(str(x) for k, v in chosen.items() for x in (f"--{k}", v))]
+
+
+@pytest.fixture(scope="module")
+def short(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """One round at the roundabout."""
+    out = tmp_path_factory.mktemp("short") / "out"
+    assert main(command(out)) == 0
+    return out
+
+
+@every_site
+def test_it_reads_back_without_a_fault(site, capsys):
+    """Four rounds: what `inspect` counts is there, everybody on the road, nothing repaired."""
+    assert main(["inspect", str(highway_folder(site))]) == 0
+    told = capsys.readouterr().out
+    assert "Repairs: none" in told
+    assert "Faults: none" in told
+    for recording in highway_recordings(site):
+        assert recording.num_frames == 600
+        assert recording.frame_rate_hz == 15.0
+        assert np.array_equal(recording.track_ids, np.arange(len(recording)))
+        assert (recording.sizes == [5.0, 2.0]).all()
+
+
+def test_the_command_makes_what_the_source_opens(short, tmp_path, capsys):
+    """A tenth of a minute is a whole round; progress goes to stderr."""
+    capsys.readouterr()
+    out = tmp_path / "out"
+    assert main(command(out, minutes=0.1)) == 0
+    assert capsys.readouterr().out == ""
+    assert contents(out) == contents(short)
+    (recording,) = open_data(f"highway:{out}")
+    assert recording.num_frames == 300
+    assert len(contents(out)) == 5
+
+
+def test_same_seed_same_bytes_in_another_process(short, tmp_path):
+    """Another process writes the same files, another seed other ones."""
+    again, other = tmp_path / "again", tmp_path / "other"
+    script = "import sys; from asp_env.cli import main; sys.exit(main(sys.argv[1:]))"
+    subprocess.run([sys.executable, "-c", script, *command(again)], check=True, capture_output=True)
+    assert contents(again) == contents(short)
+    assert main(command(other, seed=8)) == 0
+    theirs = contents(short)
+    assert contents(other).keys() == theirs.keys()
+    same = {name for name, value in contents(other).items() if value == theirs[name]}
+    assert same == {"maps/lanelets/00_roundabout/location0.osm", "data/00_recordingMeta.csv"}
+
+
+@pytest.mark.parametrize(
+    ("options", "what"),
+    [
+        ({"site": "highway:motorway"}, "known are highway:intersection, highway:roundabout"),
+        ({"locations": 3}, "is a single place"),
+        ({"recordings": 0}, "cannot be made"),
+        ({"seed": -1}, "cannot be made"),
+        ({"minutes": "nan"}, "cannot be made"),
+        ({"minutes": 61}, "cannot be made"),
+    ],
+)
+def test_what_makes_no_sense_is_refused(tmp_path, options, what, capsys):
+    """One line, status 2, and nothing is written."""
+    assert main(command(tmp_path / "out", **options)) == 2
+    told = capsys.readouterr()
+    assert what in told.err
+    assert told.err.count("\n") == 1
+    assert not list(tmp_path.iterdir())
+
+
+def test_a_folder_with_something_in_it_is_refused(short, capsys):
+    """What is there stays as it is."""
+    before = contents(short)
+    assert main(command(short)) == 2
+    assert "is not an empty folder" in capsys.readouterr().err
+    assert contents(short) == before
+
+
+def _npz(path: Path, **changes: Any) -> None:
+    with np.load(path) as found:
+        kept = dict(found)
+    np.savez(path, **(kept | changes))
+
+
+def _truncate(path: Path) -> None:
+    path.write_bytes(path.read_bytes()[:2000])
+
+
+def _flip(path: Path) -> None:
+    data = bytearray(path.read_bytes())
+    data[len(data) // 2 : len(data) // 2 + 40] = bytes(40)
+    path.write_bytes(data)
+
+
+def _array(path: Path) -> None:
+    with path.open("wb") as file:
+        np.save(file, np.zeros(3))
+
+
+def _rows(path: Path) -> np.ndarray:
+    return load_history(path).rows
+
+
+DAMAGE: dict[str, tuple[Callable[[Path], object], str]] = {
+    "missing": (Path.unlink, "is missing"),
+    "truncated": (_truncate, "is damaged"),
+    "empty": (lambda path: path.write_bytes(b""), "is damaged"),
+    "flipped": (_flip, "is damaged"),
+    "pickle": (lambda path: path.write_bytes(pickle.dumps({"rows": []})), "is damaged"),
+    "objects": (lambda path: _npz(path, rows=np.array([{}, None])), "is damaged"),
+    "array": (_array, "is damaged"),
+    "another site": (lambda path: _npz(path, site=np.array("motorway")), "of another version"),
+    "other fields": (lambda path: _npz(path, rows=np.zeros(415)), "of another version"),
+    "floats": (lambda path: _npz(path, starts=np.zeros(101)), "of another version"),
+    "a number": (lambda path: _npz(path, starts=np.array(3)), "of another version"),
+    "less": (lambda path: _npz(path, rows=_rows(path)[:-1]), "of another version"),
+    "other vehicles": (lambda path: _npz(path, rows=_rows(path)[::-1]), "does not tell of"),
+}
+
+
+@pytest.mark.parametrize("kind", DAMAGE)
+def test_damage_is_told_in_one_line(short, tmp_path, kind):
+    """Which file, what is wrong, what was expected."""
+    shutil.copytree(short, tmp_path / "copy")
+    harm, what = DAMAGE[kind]
+    harm(tmp_path / "copy" / "hidden" / "00_hidden.npz")
+    env = make(f"highway:{tmp_path / 'copy'}")
+    with pytest.raises(DataError, match=rf"00_hidden\.npz.*{what}.*asp-env synthesize") as told:
+        env.reset(seed=0)
+    assert "\n" not in str(told.value)
+
+
+def test_the_history_of_another_recording_is_refused(tmp_path):
+    """Two hidden histories have changed places."""
+    shutil.copytree(highway_folder("roundabout"), tmp_path / "copy")
+    hidden = tmp_path / "copy" / "hidden"
+    (hidden / "00_hidden.npz").rename(hidden / "aside")
+    (hidden / "01_hidden.npz").rename(hidden / "00_hidden.npz")
+    (hidden / "aside").rename(hidden / "01_hidden.npz")
+    env = make(f"highway:{tmp_path / 'copy'}")
+    with pytest.raises(
+        DataError, match=r"^\S+00_hidden.npz does not tell of the vehicles in [^\n]+$"
+    ):
+        env.reset(options={"scenario": 0})
+
+
+def test_what_was_never_made_here_is_refused(short, tmp_path):
+    """Unknown names, folders without `hidden`, recordings in memory: one line each."""
+    for name in ("nowhere", "", str(tmp_path / "nothing"), str(short / "data" / "00_tracks.csv")):
+        with pytest.raises(AspEnvError, match=r"^unknown highway site or folder [^\n]*roundabout$"):
+            open_data(f"highway:{name}")
+    shutil.copytree(short, tmp_path / "copy")
+    shutil.rmtree(tmp_path / "copy" / "hidden")
+    with pytest.raises(AspEnvError, match=r"^highway:[^\n]*hidden is missing[^\n]*replayed[^\n]*$"):
+        open_data(f"highway:{tmp_path / 'copy'}")
+    with pytest.raises(AspEnvError, match=r"^recordings in memory: expected those of `highway:…`$"):
+        world_of("highway:")(list(open_data(short)), num_episodes=1, dt_s=DT_S, history=HISTORY)
+
+
+def test_the_source_is_made_once(tmp_path, monkeypatch):
+    """The second call finds what the first one made, whose name holds the version."""
+    assert registry.find("sources", "highway") is plugs.open_source
+    monkeypatch.setenv("ASP_ENV_CACHE", str(tmp_path))
+    monkeypatch.setattr(plugs, "synthesize", stand_in("first"))
+    folder = plugs.open_source("roundabout")
+    monkeypatch.setattr(plugs, "synthesize", stand_in("second"))
+    assert plugs.open_source("roundabout") == folder
+    assert (folder / "marker").read_text() == "first"
+    assert folder == tmp_path / "highway" / f"roundabout-{plugs.SOURCE_VERSION}"
+
+
+def test_with_noise_the_truth_is_driven(short, tmp_path):
+    """Measured tracks are centimetres off; episodes hold the truth, before their start and after.
+
+    Left to themselves they go on as they truly did, and progress is measured on the noisy log.
+    """
+    out = tmp_path / "noisy"
+    assert main([*command(out), "--noise"]) == 0
+    truth, clean = out / "truth" / "00_trueTracks.csv", short / "data" / "00_tracks.csv"
+    assert truth.read_bytes() == clean.read_bytes()
+    hidden = "hidden/00_hidden.npz"
+    assert (out / hidden).read_bytes() == (short / hidden).read_bytes()
+    true, measured = pd.read_csv(truth), pd.read_csv(out / "data" / "00_tracks.csv")
+    error = np.hypot(measured.xCenter - true.xCenter, measured.yCenter - true.yCenter)
+    assert 0.005 < error.mean() < 0.1
+    runs = []
+    for folder in (short, out):
+        recordings = open_data(f"highway:{folder}")
+        found = list(find_scenarios(recordings, source="", dt_s=DT_S, history=HISTORY))
+        simulation = simulate(recordings, found, "own", world_of("highway:"))
+        replay(simulation, max(each.length for each in found))
+        runs.append(simulation.world)
+    one, other = runs[0].episodes, runs[1].episodes
+    assert one.states.tobytes() == other.states.tobytes()
+    assert one.valid.tobytes() == other.valid.tobytes()
+    away = np.hypot(*(one.log_states - other.log_states)[one.log_valid][:, :2].T)
+    assert 0.005 < away.mean() < 0.1
+    assert runs[1].events().route_m == pytest.approx(runs[1].events().goal_m, abs=0.3)
+
+
+def test_a_recording_can_be_replayed_as_any_other():
+    """The folder itself, without the scheme, is a recording in which nobody reacts."""
+    folder = str(highway_folder("intersection"))
+    assert world_of(folder).traffic == "log"
+    simulation = simulate(open_data(folder), scenario(18, start=150, length=10))
+    replay(simulation, 10)
+    episodes = simulation.world.episodes
+    assert episodes.states.tobytes() == episodes.log_states.tobytes()
+    path = open_data(highway_data("intersection")).tracks_path(1)
+    assert hidden_path(path) == highway_folder("intersection") / "hidden" / "01_hidden.npz"
