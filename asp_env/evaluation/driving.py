@@ -26,7 +26,7 @@ from asp_env.sim.world import Ending
 from asp_env.sim.worlds import world_of
 
 EPISODES_AT_ONCE = 16
-"""A few seconds of work, so that processes end together; more side by side save no time."""
+"""A second or a few of work, so that processes end together; more at once saves no time."""
 
 SAVED_ROLLOUTS = 6
 """So many scenarios' rollouts are kept to look at, of every driver."""

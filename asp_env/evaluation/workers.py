@@ -100,8 +100,11 @@ class _Worker:
 
     def _ended(self) -> AspEnvError:
         status = self.process.wait()
-        how = f"killed by signal {-status}" if status < 0 else f"ended, exit status {status}"
-        return AspEnvError(f"a worker process was {how}; if memory ran out, give fewer --jobs")
+        if status < 0:
+            how = f"was killed by signal {-status}; if memory ran out, give fewer --jobs"
+        else:
+            how = f"ended with exit status {status}; what it said stands above"
+        return AspEnvError(f"a worker process {how}")
 
 
 @final

@@ -88,7 +88,7 @@ def test_bad_work_is_told_too(tmp_path: Path) -> None:
     ("task", "how"),
     [
         (partial(signal.raise_signal, signal.SIGKILL), "was killed by signal 9; if memory ran out"),
-        (partial(os._exit, 7), "ended, exit status 7"),
+        (partial(os._exit, 7), "ended with exit status 7"),
     ],
     ids=["killed", "ended"],
 )
