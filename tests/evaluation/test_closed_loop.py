@@ -265,6 +265,8 @@ def test_a_run_writes_its_folder(crossings, tmp_path):
         ({"horizon": 0.1}, "no whole number of ticks"),
         ({"metrics": "nuplna"}, r"unknown metrics 'nuplna' \(did you mean 'nuplan'"),
         ({"dt": 0.3}, "does not divide recordings of 25 Hz"),
+        ({"jobs": 0}, "--jobs 0: expected at least 1 process"),
+        ({"jobs": -2}, "--jobs -2: expected"),
     ],
     ids=lambda value: next(iter(value)) if isinstance(value, dict) else None,
 )

@@ -24,7 +24,8 @@ from asp_env.evaluation.paper_table.cells import (
     plan_cells,
     site_names,
 )
-from asp_env.evaluation.paper_table.worker import ABANDONED, Job, Judging
+from asp_env.evaluation.paper_table.worker import Job, Judging
+from asp_env.evaluation.workers import ABANDONED
 from tests.predictors.tiny import write_data
 
 DKM, FFW = Entrant(predictor="dkm"), Entrant(predictor="ffw-asp")

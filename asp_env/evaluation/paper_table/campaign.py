@@ -3,7 +3,6 @@
 import json
 import os
 import subprocess
-import sys
 import time
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -16,6 +15,7 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, T
 from asp_env.errors import AspEnvError
 from asp_env.evaluation.paper_table.cells import Cell
 from asp_env.evaluation.paper_table.worker import Job
+from asp_env.evaluation.workers import start
 
 ONE_THREAD = {"OMP_NUM_THREADS": "1", "NUMBA_NUM_THREADS": "1"}
 POLL_S = 0.1
@@ -148,13 +148,11 @@ class Campaign:
     def _launch(self, cell: Cell) -> _Running:
         log = self._out / LOGS / f"{cell.name}.txt"
         log.parent.mkdir(parents=True, exist_ok=True)
-        command = [sys.executable, "-m", "asp_env.evaluation.paper_table.worker"]
         with log.open("ab") as file:
-            process = subprocess.Popen(
-                [*command, self._jobs[cell].dump()],
-                stdin=subprocess.PIPE,
-                stdout=file,
-                stderr=subprocess.STDOUT,
+            process = start(
+                "asp_env.evaluation.paper_table.worker",
+                self._jobs[cell].dump(),
+                output=file,
                 env={**os.environ, **ONE_THREAD},
             )
         return _Running(process=process, log=log, since_s=time.monotonic())

@@ -1,15 +1,13 @@
 """One cell in a process of its own: `python -m asp_env.evaluation.paper_table.worker JOB`.
 
-JOB is JSON. The process ends when its standard input does, so that it never outlives the command
-that started it and two never train the same run.
+JOB is JSON. The process never outlives the command that started it, so that two never train the
+same run.
 """
 
 import dataclasses
 import hashlib
 import json
-import os
 import sys
-import threading
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -23,13 +21,14 @@ from asp_env.data.predictor import load_predictor
 from asp_env.data.source import open_data
 from asp_env.errors import AspEnvError
 from asp_env.evaluation.paper_table.errors import judge_snippets, snippets_to_judge, stamp_of
+from asp_env.evaluation.workers import end_with_starter
 
 FINISHED = "config.json"
 """A run that has it is finished."""
 
 WEIGHTS = "weights.safetensors"
 
-FAILED, ABANDONED = 2, 3
+FAILED = 2
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -209,21 +208,13 @@ def judge(judging: Judging) -> None:
 def main(argv: Sequence[str]) -> int:
     """Runs a job; 2 with a line on stderr where the input is bad."""
     (text,) = argv
-    threading.Thread(target=_watch_input, daemon=True).start()
+    end_with_starter()
     try:
         Job.load(text).run()
     except AspEnvError as error:
         sys.stderr.write(f"asp-env: {' '.join(str(error).split())}\n")
         return FAILED
     return 0
-
-
-def _watch_input() -> None:
-    """Ends the process, whatever it is at, when whoever started it is gone."""
-    # Of the descriptor itself: a lock of a buffer that is held here would spoil an orderly end.
-    while os.read(0, 1):
-        pass
-    os._exit(ABANDONED)
 
 
 if __name__ == "__main__":
