@@ -56,6 +56,23 @@ def test_it_reads_back_without_a_fault(site, capsys):
         assert (recording.sizes == [5.0, 2.0]).all()
 
 
+@every_site
+def test_the_written_velocity_leads_to_the_next_position(site):
+    """In each of highway-env's steps, since it points where a vehicle goes, not where it faces.
+
+    Those who are pushed are moved by more than it, which happens in less than one step of twenty.
+    """
+    tracks = pd.read_csv(highway_folder(site) / "data" / "00_tracks.csv")
+    following = tracks.trackId.diff().shift(-1) == 0
+    moved = np.stack([tracks[name].diff().shift(-1) * 15.0 for name in ("xCenter", "yCenter")])
+    velocity = np.stack([tracks.xVelocity, tracks.yVelocity])
+    away = np.abs(moved - velocity).max(axis=0)[following]
+    assert (away < 2e-3).mean() > 0.95
+    slides = np.abs(tracks.latVelocity[following]) > 0.5
+    assert slides.sum() > 50
+    assert (away[slides] < 2e-3).mean() > 0.9
+
+
 def test_the_command_makes_what_the_source_opens(short, tmp_path, capsys):
     """A tenth of a minute is a whole round; progress goes to stderr."""
     capsys.readouterr()

@@ -103,6 +103,33 @@ def _aside(simulation: Simulation, lane) -> float:
     return lane.local_coordinates(simulation.world.ego_states()[0, :2] * [1, -1])[1]
 
 
+def test_who_is_released_looks_for_a_way_from_where_it_is():
+    """Driven across the junction where it was to turn left, it stays on the eastern arm.
+
+    So it does from a snapshot that was taken before it was released.
+    """
+    simulation = begin("intersection", scenario(19, start=115, length=60))
+    drive(simulation, [(1.0, 0.0)] * 35)
+    world = simulation.world
+    assert isinstance(world, HighwayWorld)
+    taken, told = world.snapshot(), []
+    for _ in range(2):
+        run = world._runs[0]
+        assert run is not None
+        ego = next(each for each in run.road.vehicles if each.track == 19)
+        assert ego.steered
+        assert ("ir1", "il2", None) in ego.route
+        replay(simulation, 1)
+        assert not ego.steered
+        assert ego.route[0][:2] == ("il3", "o3")
+        assert ego.target_lane_index == ("il3", "o3", 0)
+        replay(simulation, 5)
+        told.append(world.episodes.states.tobytes())
+        assert world.ego_states()[0, 1] == pytest.approx(-2.0, abs=0.5)
+        world.restore(taken)
+    assert told[0] == told[1]
+
+
 def test_others_react_to_an_ego_that_is_driven():
     """It halts on its lane: its follower halts behind it. Left alone neither does."""
     alone, driven = (begin("intersection", FOLLOWED) for _ in range(2))
