@@ -7,13 +7,14 @@ standard input does, so that it never outlives whoever started it, however that 
 import os
 import subprocess
 import sys
-import threading
 from collections import deque
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass
 from multiprocessing import connection
+from queue import SimpleQueue
 from socket import socketpair
+from threading import Thread
 from typing import IO, Any, TypeVar, final
 
 from asp_env.errors import AspEnvError
@@ -57,7 +58,7 @@ def start(
 
 def end_with_starter() -> None:
     """Ends this process, whatever it is at, once whoever started it is gone."""
-    threading.Thread(target=_watch_input, daemon=True).start()
+    Thread(target=_watch_input, daemon=True).start()
 
 
 def _watch_input() -> None:
@@ -109,7 +110,7 @@ class _Worker:
 
 @final
 class Crew:
-    """Some processes, or none: then this one works by itself."""
+    """This process and some others."""
 
     def __init__(self, workers: Sequence[_Worker]) -> None:
         """See `hired`."""
@@ -121,41 +122,65 @@ class Crew:
         """Does all tasks, the first ones first; their numbers and results as these come.
 
         Args:
-            work: what is done with each. Every process unpickles a copy, once.
-            tasks: pickled too, as are results.
+            work: what is done with each. Every other process unpickles a copy, once.
+            tasks: pickled too for other processes, as are results.
 
         Raises:
             AspEnvError: the input was bad, or a process has ended.
         """
         waiting = deque(enumerate(tasks))
-        if not self._workers:
-            yield from ((number, work(task)) for number, task in waiting)
-            return
-        busy: dict[object, tuple[_Worker, int]] = {}
-        for worker, (number, task) in zip(self._workers, tuple(waiting), strict=False):
-            waiting.popleft()
-            worker.tell(work)
+        found = SimpleQueue[tuple[int, Any, Exception | None]]()
+        for worker in self._workers:
+            # Ends at the latest with its process, which nobody waits for after an error.
+            Thread(target=_attend, args=(worker, work, waiting, found), daemon=True).start()
+        for _ in tasks:
+            mine = _next(waiting) if found.empty() else None
+            if mine is not None:
+                number, task = mine
+                yield number, work(task)
+                continue
+            number, result, error = found.get()
+            if error is not None:
+                raise error
+            yield number, result
+
+
+def _next(waiting: deque[tuple[int, Task]]) -> tuple[int, Task] | None:
+    try:
+        return waiting.popleft()
+    except IndexError:
+        return None
+
+
+def _attend(
+    worker: _Worker,
+    work: object,
+    waiting: deque[tuple[int, Task]],
+    found: SimpleQueue[tuple[int, Any, Exception | None]],
+) -> None:
+    """Hands tasks to another process until there are none, or one fails."""
+    told = False
+    while (following := _next(waiting)) is not None:
+        number, task = following
+        try:
+            if not told:
+                worker.tell(work)
+                told = True
             worker.tell(task)
-            busy[worker.connection] = worker, number
-        while busy:
-            for ready in connection.wait([worker.connection for worker, _ in busy.values()]):
-                worker, number = busy.pop(ready)
-                result = worker.hear()
-                if waiting:
-                    following, task = waiting.popleft()
-                    worker.tell(task)
-                    busy[ready] = worker, following
-                yield number, result
+            found.put((number, worker.hear(), None))
+        except Exception as error:  # goes on where results are waited for
+            found.put((number, None, error))
+            return
 
 
 @contextmanager
 def hired(processes: int) -> Iterator[Crew]:
-    """A crew for as long as it is needed; for a single process, no others.
+    """A crew of so many processes, this one among them, for as long as it is needed.
 
-    Its processes do not hear of Ctrl-C, and end here whatever happens.
+    The others do not hear of Ctrl-C, and end here whatever happens.
     """
     with ExitStack() as stack:
-        yield Crew([_hire(stack) for _ in range(processes)] if processes > 1 else [])
+        yield Crew([_hire(stack) for _ in range(processes - 1)])
 
 
 def _hire(stack: ExitStack) -> _Worker:

@@ -3,12 +3,14 @@
 import operator
 import os
 import signal
+import subprocess
 import time
 from collections.abc import Callable
 from functools import partial
 from multiprocessing.connection import Connection
 from pathlib import Path
 from socket import socketpair
+from threading import Event
 from typing import Any
 
 import pytest
@@ -35,6 +37,23 @@ def is_there(process: int) -> bool:
     return True
 
 
+class Elsewhere:
+    """A task of another process. Here it waits until one like it is on its way there."""
+
+    def __init__(self, sent: Event, what: Callable[..., Any], *about: Any) -> None:
+        """The task is `what(*about)`."""
+        self._sent, self._what, self._about = sent, what, about
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        """The task itself."""
+        self._sent.set()
+        return partial, (self._what, *self._about)
+
+    def __call__(self) -> None:
+        """Nothing else."""
+        assert self._sent.wait(60)
+
+
 @pytest.mark.parametrize("processes", [1, 2])
 def test_every_task_is_done_once(processes: int) -> None:
     """Five tasks, more than there are processes."""
@@ -44,77 +63,89 @@ def test_every_task_is_done_once(processes: int) -> None:
 
 
 def test_who_works() -> None:
-    """One process is this one; of two, both others have tasks; a third has none left."""
+    """One process is this one; of two, this one and another, which is gone afterwards."""
     assert done(1, [os.getpid]) == {0: os.getpid()}
-    both = {*done(3, [os.getpid, os.getpid]).values()}
-    assert len(both) == 2
-    assert os.getpid() not in both
-    assert not any(is_there(process) for process in both)
+    sent = Event()
+    here, there = sorted(done(2, [Elsewhere(sent, os.getpid)] * 2).values(), key=bool)
+    assert here is None
+    assert there != os.getpid()
+    assert not is_there(there)
 
 
-def test_whoever_is_ready_goes_on() -> None:
-    """While one is at a long task, the other does all the short ones."""
-    with hired(2) as crew:
-        order = [n for n, _ in crew.do(operator.call, [partial(time.sleep, 1.0), *[os.getpid] * 4])]
-    assert sorted(order) == [0, 1, 2, 3, 4]
-    assert order[-1] == 0
+def test_whoever_is_ready_goes_on(tmp_path: Path) -> None:
+    """While one process waits for the last task to be done, the other does all the rest."""
+    sign = tmp_path / "done"
+    wait = ["sh", "-c", 'until [ -e "$0" ]; do sleep 0.05; done', str(sign)]
+    tasks = [partial(subprocess.run, wait, timeout=60), *[os.getpid] * 3, partial(sign.touch)]
+    found = done(2, tasks)
+    assert len({found[n] for n in (1, 2, 3)}) == 1
 
 
-@pytest.mark.parametrize("processes", [1, 2])
-def test_bad_input_is_told_as_if_it_were_here(processes: int, tmp_path: Path) -> None:
+@pytest.mark.parametrize("where", ["here", "elsewhere"])
+def test_bad_input_is_told_as_if_it_were_here(where: str, tmp_path: Path) -> None:
     """The same line; of the system's errors, the same file."""
+
+    def failing(*task: Any) -> None:
+        if where == "here":
+            done(1, [partial(*task)])
+        else:
+            done(2, [Elsewhere(Event(), *task)] * 2)
+
     with pytest.raises(AspEnvError, match="nowhere does not exist; expected a folder"):
-        done(processes, [os.getpid, partial(open_data, str(tmp_path / "nowhere"))])
+        failing(open_data, str(tmp_path / "nowhere"))
     with pytest.raises(FileNotFoundError) as caught:
-        done(processes, [partial(os.stat, "nowhere")])
+        failing(os.stat, "nowhere")
     assert caught.value.filename == "nowhere"
 
 
-def test_bad_work_is_told_too(tmp_path: Path) -> None:
-    """A copy of the work that another process cannot make."""
+def test_work_that_cannot_be_copied_is_told_too(tmp_path: Path) -> None:
+    """Data that are gone before another process opens them."""
+    sent = Event()
 
-    class Unmakable:
+    class Work:
         def __reduce__(self) -> tuple[Any, ...]:
+            sent.set()
             return open_data, (str(tmp_path / "nowhere"),)
 
         def __call__(self, task: object) -> object:
+            assert sent.wait(60)
             return task
 
     with pytest.raises(AspEnvError, match="nowhere does not exist"), hired(2) as crew:
-        list(crew.do(Unmakable(), [1, 2, 3]))
+        list(crew.do(Work(), [1, 2]))
 
 
 @pytest.mark.parametrize(
     ("task", "how"),
     [
-        (partial(signal.raise_signal, signal.SIGKILL), "was killed by signal 9; if memory ran out"),
-        (partial(os._exit, 7), "ended with exit status 7"),
+        ((signal.raise_signal, signal.SIGKILL), "was killed by signal 9; if memory ran out"),
+        ((os._exit, 7), "ended with exit status 7"),
     ],
     ids=["killed", "ended"],
 )
-def test_a_process_that_ends_is_told(task: Callable[[], Any], how: str) -> None:
+def test_a_process_that_ends_is_told(task: tuple[Callable[..., Any], int], how: str) -> None:
     """One line instead of waiting for ever."""
     with pytest.raises(AspEnvError, match=how):
-        done(2, [task, os.getpid])
+        done(2, [Elsewhere(Event(), *task)] * 2)
 
 
 def test_nobody_is_left_behind() -> None:
     """Interrupted, with a process at a task of an hour."""
-    began = time.monotonic()
+    began, sent = time.monotonic(), Event()
+    short, long = Elsewhere(sent, os.getpid), Elsewhere(sent, time.sleep, 3600.0)
     found: list[int] = []
 
     def interrupted() -> None:
         with hired(2) as crew:
-            tasks = [os.getpid, os.getpid, *[partial(time.sleep, 3600.0)] * 2]
-            for _, process in crew.do(operator.call, tasks):
-                found.append(process)
-                if len(found) == 2:
+            for _, process in crew.do(operator.call, [short, short, long, long]):
+                if process is not None:
+                    found.append(process)
                     raise KeyboardInterrupt
 
     with pytest.raises(KeyboardInterrupt):
         interrupted()
     assert time.monotonic() - began < 60
-    assert not any(is_there(process) for process in found)
+    assert not is_there(*found)
 
 
 def test_a_process_ends_with_whoever_started_it() -> None:
