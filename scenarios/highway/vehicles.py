@@ -2,7 +2,7 @@
 
 import math
 from collections.abc import Callable
-from typing import Any
+from typing import Any, no_type_check
 
 import numpy as np
 from highway_env.road.road import RoadNetwork
@@ -183,6 +183,7 @@ def _remembering(locate: Callable[[Any], Any]) -> Callable[[Any], Any]:
     """The same function; vehicles ask it again and again while nobody moves."""
     known: dict[bytes, Any] = {}
 
+    @no_type_check  # asked so often that checks in the tests would take longer than all the rest
     def local_coordinates(position: Float[np.ndarray, " 2"]) -> tuple[float, float]:
         key = position.tobytes()
         found = known.get(key)

@@ -164,20 +164,29 @@ DAMAGE: dict[str, tuple[Callable[[Path], object], str]] = {
     "floats": (lambda path: _npz(path, starts=np.zeros(101)), "of another version"),
     "a number": (lambda path: _npz(path, starts=np.array(3)), "of another version"),
     "less": (lambda path: _npz(path, rows=_rows(path)[:-1]), "of another version"),
-    "other vehicles": (lambda path: _npz(path, rows=_rows(path)[::-1]), "does not tell of"),
 }
 
 
 @pytest.mark.parametrize("kind", DAMAGE)
 def test_damage_is_told_in_one_line(short, tmp_path, kind):
     """Which file, what is wrong, what was expected."""
-    shutil.copytree(short, tmp_path / "copy")
+    path = tmp_path / "00_hidden.npz"
+    shutil.copy(short / "hidden" / path.name, path)
     harm, what = DAMAGE[kind]
+    harm(path)
+    with pytest.raises(DataError, match=rf"00_hidden\.npz.*{what}.*asp-env synthesize") as told:
+        load_history(path)
+    assert "\n" not in str(told.value)
+
+
+@pytest.mark.parametrize("harm", [_truncate, lambda path: _npz(path, rows=_rows(path)[::-1])])
+def test_an_environment_tells_of_damage(short, tmp_path, harm):
+    """When an episode begins: a file that cannot be read, and one with the vehicles mixed up."""
+    shutil.copytree(short, tmp_path / "copy")
     harm(tmp_path / "copy" / "hidden" / "00_hidden.npz")
     env = make(f"highway:{tmp_path / 'copy'}")
-    with pytest.raises(DataError, match=rf"00_hidden\.npz.*{what}.*asp-env synthesize") as told:
+    with pytest.raises(DataError, match=r"00_hidden\.npz (is damaged|does not tell of)"):
         env.reset(seed=0)
-    assert "\n" not in str(told.value)
 
 
 def test_the_history_of_another_recording_is_refused(tmp_path):

@@ -74,7 +74,7 @@ def test_who_is_driven_moves_as_in_a_replay(site):
 @every_site
 def test_who_is_released_goes_on_by_itself(site):
     """Egos that drive in two ticks of three anywhere, then not any more: all stays finite."""
-    scenarios = list(highway_scenarios(site))[2::8]
+    scenarios = list(highway_scenarios(site))[2::12]
     simulation = begin(site, scenarios)
     for tick in range(14):
         drive_some(simulation, tick)
@@ -196,8 +196,9 @@ def _nearest_comer(world: ScenarioWorld) -> float:
     return nearest
 
 
-@pytest.mark.parametrize("traffic", ["own", "idm"])
-@every_site
+@pytest.mark.parametrize(
+    ("site", "traffic"), [("intersection", "idm"), ("roundabout", "own"), ("roundabout", "idm")]
+)
 def test_who_left_never_returns(site, traffic):
     """Presence has one beginning and one end; the ego is there all the while."""
     scenarios = list(highway_scenarios(site))[2 :: 12 if site == "intersection" else 3]

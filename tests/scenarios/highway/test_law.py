@@ -49,7 +49,7 @@ def goes_on(site: str, scenarios: list[Scenario], dt_s: float, history: int) -> 
 @every_site
 def test_left_to_itself_everything_goes_on_as_recorded(site):
     """Nobody is driven, the egos neither: presence is the log's, states are within its rounding."""
-    scenarios = list(highway_scenarios(site))[1 :: 6 if site == "intersection" else 2]
+    scenarios = list(highway_scenarios(site))[1 :: 8 if site == "intersection" else 2]
     assert goes_on(site, scenarios, DT_S, HISTORY) > 2000
 
 
@@ -132,10 +132,10 @@ def test_a_round_is_what_highway_env_makes_of_the_same_generator(site, seed):
 
 @every_site
 def test_the_nearest_lane_is_the_one_that_all_lanes_are_asked_for(site):
-    """At 3000 poses all over the place and along the lanes, on, beside, before and behind them."""
+    """At 2000 poses all over the place and along the lanes, on, beside, before and behind them."""
     fast, slow, rng = network(site), RoadNetwork(), np.random.default_rng(0)
     slow.graph, lanes = fast.graph, fast.lanes_list()
-    for number in range(3000):
+    for number in range(2000):
         lane = lanes[rng.integers(len(lanes))]
         if number % 3:
             place = lane.position(rng.uniform(-40, lane.length + 40), rng.normal(0, 3))
