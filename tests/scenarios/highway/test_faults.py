@@ -9,7 +9,6 @@ from typing import Any
 import numpy as np
 import pytest
 from highway_env.envs import ContinuousIntersectionEnv, IntersectionEnv, RoundaboutEnv
-from highway_env.vehicle.behavior import IDMVehicle
 from highway_env.vehicle.dynamics import BicycleVehicle
 from highway_env.vehicle.kinematics import Vehicle
 
@@ -17,19 +16,11 @@ from asp_env.errors import AspEnvError
 from scenarios.highway.sites import SITES, populated_road
 from tests.envs.same import same
 from tests.highway_folders import SITE_NAMES, highway_data, highway_recordings
-from tests.scenarios.highway.class_fault import NAMES
 from tests.scenarios.highway.environments import ego, make
 
 COAST = np.zeros(2, dtype=np.float32)
 
 every_site = pytest.mark.parametrize("site", SITE_NAMES)
-
-
-@pytest.fixture(autouse=True)
-def _classes_as_they_were(monkeypatch: pytest.MonkeyPatch) -> None:
-    """What highway-env's intersection writes into its class is undone behind each test."""
-    for name in NAMES:
-        monkeypatch.setattr(IDMVehicle, name, getattr(IDMVehicle, name))
 
 
 def test_an_intersection_changes_no_roundabout():
