@@ -4,6 +4,7 @@ import zipfile
 import zlib
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from jaxtyping import Int, Shaped
@@ -34,6 +35,11 @@ class HiddenHistory:
     """What the road had counted by then."""
     starts: Int[np.ndarray, " times+1"]
     """Time i has the rows `starts[i]:starts[i + 1]`."""
+
+    def __deepcopy__(self, memo: dict[int, Any]) -> "HiddenHistory":
+        """Itself, since nobody changes it."""
+        del memo
+        return self
 
     def at(self, frame: int) -> tuple[Rows, int]:
         """The vehicles at a frame, and what the road had counted."""
