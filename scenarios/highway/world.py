@@ -197,7 +197,6 @@ class HighwayWorld(ScenarioWorld):
         assert run is not None
         there = data.valid[b, tick]
         there[:] = False
-        data.states[b, tick] = 0.0
         vehicles = run.road.vehicles
         if vehicles:
             at = [slots[each.track] for each in vehicles]
@@ -205,6 +204,7 @@ class HighwayWorld(ScenarioWorld):
             data.states[b, tick, at] = mirror_states(theirs)
             there[at] = True
         data.states[b, tick, obeys] = moved
+        data.states[b, tick, ~there] = 0.0
         data.gone[b] |= data.valid[b, tick - 1] & ~there
 
     def snapshot(self) -> Any:
