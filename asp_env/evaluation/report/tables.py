@@ -123,7 +123,7 @@ def _grid(
         kind = " class='privileged'" if entrant.privileged else ""
         body.append(f"<tr{kind}>{_row_head(entrant)}{values}</tr>")
     return (
-        f"<div class='scroll'><table style='min-width: {14 + 6 * len(columns)}rem'>"
+        f"<div class='scroll'><table style='min-width: {14 + 7.5 * len(columns)}rem'>"
         f"<thead><tr><th>{escape(heading)}</th>{names}</tr></thead>"
         f"<tbody>{''.join(body)}</tbody></table></div>"
     )
