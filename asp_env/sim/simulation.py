@@ -60,7 +60,7 @@ class Simulation:
     def step(
         self, ego_actions: Float[np.ndarray, "b 2"], ego_driven: Bool[np.ndarray, " b"]
     ) -> None:
-        """One tick. Egos that are not driven replay their log."""
+        """One tick. Egos that are not driven are the world's: they replay, or drive themselves."""
         control = self.driver.control(self.world)
         actions, driven = control.actions.copy(), control.driven.copy()
         actions[:, EGO], driven[:, EGO] = ego_actions, ego_driven
@@ -71,7 +71,7 @@ class Simulation:
     ) -> None:
         """One tick in which the caller drives any agents; the traffic's driver moves the others.
 
-        The ego is never the traffic's: one that is not driven replays its log.
+        The ego is never the traffic's: one that is not driven is the world's.
         """
         control = self.driver.control(self.world)
         theirs = control.driven & ~driven

@@ -46,7 +46,7 @@ class World(Protocol):
         driven: Bool[np.ndarray, "b a"],
         leaving: Bool[np.ndarray, "b a"] | None = None,
     ) -> None:
-        """One tick: `driven` agents obey their actions, `leaving` ones vanish, the rest replay."""
+        """One tick: `driven` agents obey, `leaving` ones vanish, the world moves the rest."""
         ...
 
     def scene(self) -> Scene:

@@ -87,7 +87,7 @@ class Shared(Generic[Value]):
 def vehicles(world: ScenarioWorld) -> Bool[np.ndarray, "b a"]:
     """Who can be driven: vehicles and bicycles that are not parked, but not the ego.
 
-    Pedestrians, animals, trailers and parked vehicles always replay.
+    Pedestrians, animals, trailers and parked vehicles are always left to the world.
     """
     kinds = [int(kind) for kind in PREDICTED | {AgentClass.BICYCLE}]
     episodes = world.episodes
