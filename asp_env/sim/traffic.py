@@ -30,7 +30,8 @@ class Traffic:
     """Drivers side by side in one episode, each of its own agents.
 
     An agent has the driver of its id, else of its class, else the default one, from the reset of
-    its episode to its end. Only vehicles that are not parked are driven; all others are left to the world.
+    its episode to its end. Only vehicles that are not parked are driven; all others are left to
+    the world.
     """
 
     def __init__(
