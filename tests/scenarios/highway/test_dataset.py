@@ -1,5 +1,6 @@
 """Folders of highway-env's traffic: the command, the source, the same bytes, and damage."""
 
+import dataclasses
 import pickle
 import shutil
 import subprocess
@@ -267,3 +268,23 @@ def test_a_recording_can_be_replayed_as_any_other():
     assert episodes.states.tobytes() == episodes.log_states.tobytes()
     path = open_data(highway_data("intersection")).tracks_path(1)
     assert hidden_path(path) == highway_folder("intersection") / "hidden" / "01_hidden.npz"
+
+
+def test_a_recording_may_end_when_the_last_vehicle_has_left():
+    """Its frames then end before its last round does, and what follows are times without rows."""
+    recordings = highway_recordings("roundabout")
+    history = load_history(hidden_path(recordings.tracks_path(0)))
+    assert history.fits(recordings[0])
+    longer = dataclasses.replace(
+        history,
+        steps=np.append(history.steps, [0, 0]),
+        starts=np.append(history.starts, [history.starts[-1]] * 2),
+    )
+    assert longer.fits(recordings[0])
+    shorter = dataclasses.replace(
+        history,
+        steps=history.steps[:-1],
+        starts=history.starts[:-1],
+        rows=history.rows[: history.starts[-2]],
+    )
+    assert not shorter.fits(recordings[0])
