@@ -1,7 +1,7 @@
 """What is changed of a recipe to learn what a part of it is good for, by name.
 
-Each change leaves the number of steps as it was, but `long`, so that a difference is not one of
-training time.
+Each change leaves the number of steps as it was, those of a run that it goes on from included, so
+that a difference is not one of training time; but `long`, and `staged` at the paper's size.
 """
 
 import dataclasses
@@ -12,7 +12,7 @@ from typing import Any
 
 from asp_env.errors import unknown_name
 from asp_env.views import VIEWS
-from predictors.recipes import SEGMENT_S, TrainingConfig, recipe
+from predictors.recipes import CHAINED, SEGMENT_S, TrainingConfig, recipe
 
 Change = Callable[[TrainingConfig], TrainingConfig]
 
@@ -24,8 +24,9 @@ class Variant:
     change: Change
     horizons_s: tuple[float, ...] = (SEGMENT_S,)
     """The horizons that it is meant for."""
-    goes_on: bool = True
-    """Whether a run for more than 3 s goes on from the weights of one for 3 s."""
+    goes_on: bool | None = None
+    """Whether a run for more than 3 s goes on from the weights of one for 3 s; None for what
+    the predictor's recipe does."""
 
     def apply(self, config: TrainingConfig, name: str) -> TrainingConfig:
         """The changed recipe; its preset tells the change."""
@@ -89,8 +90,16 @@ def no_pretraining(config: TrainingConfig) -> TrainingConfig:
 
 def all_epochs(config: TrainingConfig) -> TrainingConfig:
     """Those of a run for 3 s besides its own, for a run that does not go on from one."""
-    before = recipe(config.predictor, config.preset, view=config.view, horizon_s=SEGMENT_S)
-    return dataclasses.replace(config, epochs=before.all_epochs + config.epochs)
+    return dataclasses.replace(config, epochs=_before(config).all_epochs + config.epochs)
+
+
+def fewer_epochs(config: TrainingConfig) -> TrainingConfig:
+    """Half as many as a run for 3 s had, for a run that goes on from it."""
+    return dataclasses.replace(config, epochs=_before(config).all_epochs // 2)
+
+
+def _before(config: TrainingConfig) -> TrainingConfig:
+    return recipe(config.predictor, config.preset, view=config.view, horizon_s=SEGMENT_S)
 
 
 _OF_ALL = {
@@ -104,11 +113,14 @@ _OF_ACTIONS = _OF_ALL | {
     "literal-classification": Variant(change=_network(classification="softmax")),
 }
 
+_AT_ONCE = {"staged": Variant(change=fewer_epochs, horizons_s=(6.0,), goes_on=True)}
+
 VARIANTS: Mapping[str, Mapping[str, Variant]] = MappingProxyType(
     {
-        "mtp": _OF_ALL,
-        "dkm": _OF_ACTIONS,
+        "mtp": _OF_ALL | _AT_ONCE,
+        "dkm": _OF_ACTIONS | _AT_ONCE,
         "ffw-asp": _OF_ACTIONS
+        | _AT_ONCE
         | {
             "connected-head": Variant(change=connected_head),
             "skip": Variant(change=_network(skip=True)),
@@ -146,3 +158,17 @@ def variant(predictor: str, name: str) -> Variant:
     if name not in variants:
         raise unknown_name(f"variant of {predictor}", name, variants)
     return variants[name]
+
+
+def goes_on(predictor: str, name: str | None = None) -> bool:
+    """Whether a run for more than 3 s goes on from the weights of one for 3 s.
+
+    Args:
+        predictor: whose.
+        name: of a change of its recipe; None for the recipe.
+
+    Raises:
+        AspEnvError: the predictor has no such variant.
+    """
+    told = None if name is None else variant(predictor, name).goes_on
+    return predictor in CHAINED if told is None else told

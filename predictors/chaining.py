@@ -75,25 +75,30 @@ def prune(chains: Chains, keep: int) -> Chains:
     return pick(chains, rows)._replace(log_probs=log_probs.log_softmax(dim=1))
 
 
-def merge(chains: Chains, keep: int, radius_m: float) -> Chains:
-    """A few chains that end apart: each stands for all that end near it, with their probabilities.
+def merge(chains: Chains, keep: int, scale_m: float) -> Chains:
+    """A few chains, each where most of the probability lies that those before it leave.
 
-    The most probable chain comes first, then the most probable of those that no other stands for;
-    where fewer ends lie apart than are kept, the most probable others follow.
+    What a chain stands for is the probability of all chains, each weighted by a Gaussian of how far
+    apart they run. `scale_m` is its standard deviation for two that part at a constant rate, at
+    their ends. The first one kept stands for most: the peak of the distribution over trajectories,
+    which one chain that happens to be the most probable need not be near. It takes from the others
+    what it stands for, then the next one is found in the same way.
     """
-    ends = chains.states[:, :, -1, :2]
-    near = torch.linalg.vector_norm(ends[:, :, None] - ends[:, None], dim=-1) <= radius_m
-    probabilities = chains.log_probs.exp()
-    left, rank = probabilities, torch.zeros_like(probabilities)
+    at = chains.states[..., :2]
+    apart_m2 = 3 * (at[:, :, None] - at[:, None]).square().sum(dim=-1).mean(dim=-1)
+    near = (-apart_m2 / (2 * scale_m**2)).exp()
+    left = chains.log_probs.exp()
+    taken = torch.zeros_like(left)
     rows, masses = [], []
     for _ in range(min(keep, left.shape[1])):
-        # First those that nobody stands for, then those not taken yet, last those taken.
-        row = (probabilities - 2 * rank).argmax(dim=1, keepdim=True)
+        stands_for = (near * left[:, None]).sum(dim=-1)
+        # A sum of probabilities is one at most: what is taken comes last.
+        row = (stands_for - 2 * taken).argmax(dim=1, keepdim=True)
         told = near.gather(1, row[:, :, None].expand(-1, 1, near.shape[2]))[:, 0]
-        masses.append(torch.where(told, left, 0.0).sum(dim=1, keepdim=True))
         rows.append(row)
-        left = torch.where(told, 0.0, left)
-        rank = torch.maximum(rank, told.to(rank)).scatter(1, row, 2.0)
+        masses.append(stands_for.gather(1, row))
+        left = left * (1 - told)
+        taken = taken.scatter(1, row, 1.0)
     log_probs = (torch.cat(masses, dim=1) + MIN_MASS).log().log_softmax(dim=1)
     return pick(chains, torch.cat(rows, dim=1))._replace(log_probs=log_probs)
 

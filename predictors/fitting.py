@@ -171,7 +171,7 @@ def train_stages(
     start: Path | None = None,
     hardware: Hardware = ONE_PROCESS,
 ) -> Path:
-    """Trains for a horizon; one above 3 s goes on from a run for 3 s in `out/3s`, made if need be.
+    """Trains in stages: above 3 s it goes on from a run for 3 s in `out/3s`, made if need be.
 
     Args:
         config_for: the configuration of a horizon in seconds.

@@ -16,7 +16,11 @@ from predictors.network import NetworkConfig
 from predictors.ssp_asp import SSPASPConfig
 
 SEGMENT_S = 3.0
-"""Runs for longer horizons go on from the weights of a run for this one."""
+"""How much a predictor that chains segments forecasts at once."""
+
+CHAINED = frozenset({"ssp-asp"})
+"""Predictors whose runs for longer horizons go on from the weights of a run for one segment, as in
+the paper; the others predict any horizon at once and learn it from the start."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -110,8 +114,10 @@ def _small(
 ) -> TrainingConfig:
     """Minutes on two cores: pictures of a quarter of the resolution, a small encoder, one cycle.
 
-    Longer horizons go on from weights for 3 s, and take half the epochs.
+    A longer horizon takes half as many epochs more: after those for 3 s that a predictor which
+    chains segments goes on from, or in one go.
     """
+    longer = horizon_s > SEGMENT_S
     vectors = view.startswith("vectors")
     pixels = (90, 90) if view == "mtp" else (90, 60)
     network = dataclasses.replace(network, encoder="vector" if vectors else "small", features=256)
@@ -123,7 +129,7 @@ def _small(
         pixels=None if vectors else pixels,
         horizon_s=horizon_s,
         standing_share=0.25,
-        epochs=8 if horizon_s <= SEGMENT_S else 4,
+        epochs=(4 if predictor in CHAINED else 12) if longer else 8,
         snippets_per_epoch=6_000,
         max_validation_snippets=2_000,
         batch_size=64,
@@ -173,7 +179,7 @@ def ffw_asp_ours(view: str, horizon_s: float) -> TrainingConfig:
     )
     config = _small("ffw-asp", "ours", network, view, horizon_s)
     return dataclasses.replace(
-        config, standing_share=0.5, epochs=8, snippets_per_epoch=15_000, learning_rate=4e-3
+        config, standing_share=0.5, snippets_per_epoch=15_000, learning_rate=4e-3
     )
 
 
@@ -196,7 +202,7 @@ def ssp_asp_ours(view: str, horizon_s: float) -> TrainingConfig:
     """Small, with what the ablations taught.
 
     Annealed modes hold apart what the best mode alone lets collapse; a run that goes on from one
-    that had them keeps them as they are. Chains that end together are told as one.
+    that had them keeps them as they are. Chains that run near each other speak for each other.
     """
     _check_segments(horizon_s)
     network = SSPASPConfig(

@@ -115,11 +115,12 @@ class SSPASPNetwork(AbstractNetwork):
         return Modes(chains.states, chains.log_probs, chains.actions)
 
     def _kept(self, chains: Chains, chaining: Chaining) -> Chains:
-        kept = self._options.kept
-        if 0 < kept < chains.log_probs.shape[1] and chaining != "full":
-            ahead_s = chains.states.shape[2] * self.shape.dt_s
-            return merge(chains, kept, self._options.spread_mps * ahead_s)
-        more = chains.log_probs.shape[1] > self.config.modes
+        kept, count, ticks = self._options.kept, *chains.states.shape[1:3]
+        if kept and chaining != "full":
+            if count <= kept and ticks < self.shape.horizon:
+                return chains
+            return merge(chains, kept, self._options.spread_mps * ticks * self.shape.dt_s)
+        more = count > self.config.modes
         return prune(chains, self.config.modes) if more and chaining == "beam" else chains
 
     def encode(self, batch: Batch) -> Float[Tensor, "n z"]:

@@ -30,9 +30,10 @@ class SSPASPConfig(NetworkConfig):
     """Whether, in training, ever more later segments follow the most probable mode of the one
     before in place of the one matched to the label."""
     kept: int = 0
-    """Of all modes, how many a forecast keeps: those that end apart, each with the probability of
-    those that end near it. 0 keeps every mode, or in a beam the most probable chains."""
-    spread_mps: float = 0.4
+    """Of all modes, how many a forecast keeps: those that most of the others run near, apart from
+    each other, with the probability of what is near. 0 keeps every mode, or in a beam the most
+    probable chains."""
+    spread_mps: float = 0.8
     """How near that is, for each second ahead."""
     action_weight: float = 1.0
     """w1, of the reconstruction of actions."""

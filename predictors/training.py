@@ -30,7 +30,8 @@ class Train:
     view: str = "chauffeurnet"
     """What the network looks at: chauffeurnet, mtp or vectors."""
     horizon: float = 3.0
-    """How far it forecasts, seconds. More than 3 s go on from a run for 3 s, in OUT/3s."""
+    """How far it forecasts, seconds. More than 3 s of ssp-asp go on from a run for 3 s, in
+    OUT/3s."""
     start: Path | None = None
     """A finished run to start from instead, or a safetensors file of ResNet18 weights."""
     validation: str | None = None
@@ -68,7 +69,7 @@ class Train:
             AspEnvError: an option, the data or the folder is bad.
         """
         try:
-            from predictors.ablations import variant
+            from predictors.ablations import goes_on
             from predictors.fitting import train, train_stages
             from predictors.hardware import Hardware, is_first_process
         except ModuleNotFoundError as error:
@@ -81,10 +82,7 @@ class Train:
             compiled=self.compile,
             drawing=self.drawing,
         )
-        if self.variant is not None and not variant(self.predictor, self.variant).goes_on:
-            config = self.config_for(self.horizon)
-            run = train(config, self.data, self.out, start=self.start, hardware=hardware)
-        else:
+        if goes_on(self.predictor, self.variant):
             run = train_stages(
                 self.config_for,
                 self.horizon,
@@ -93,8 +91,22 @@ class Train:
                 start=self.start,
                 hardware=hardware,
             )
+        else:
+            config = self.config_for(self.horizon)
+            run = train(config, self.data, self.out, start=self.start, hardware=hardware)
         if is_first_process():
             Console().print(f"wrote {run}: name it as {self.predictor}:{run}")
+
+    @staticmethod
+    def goes_on(predictor: str, variant: str | None = None) -> bool:
+        """Whether a run for more than 3 s goes on from one for 3 s.
+
+        Raises:
+            AspEnvError: the predictor has no such variant.
+        """
+        from predictors.ablations import goes_on
+
+        return goes_on(predictor, variant)
 
     @staticmethod
     def variants(predictor: str) -> Mapping[str, Any]:

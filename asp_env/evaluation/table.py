@@ -61,7 +61,7 @@ class Table:
     predictors: tuple[str, ...] = ("mtp", "dkm", "ffw-asp", "ssp-asp")
     """Rows, such as ssp-asp, or ssp-asp:ours for another preset."""
     horizons: tuple[float, ...] = (3.0, 6.0)
-    """Columns, seconds. More than 3 s go on from the weights for 3 s of the same seed."""
+    """Columns, seconds. Those of ssp-asp over 3 s go on from the 3 s weights of the same seed."""
     seeds: tuple[int, ...] = (0, 1, 2)
     """One run each."""
     ablations: tuple[str, ...] = ("none",)
@@ -136,11 +136,11 @@ class Table:
             AspEnvError: there is no such recipe or ablation.
         """
         train = registry.find("commands", "train")
-        entrants = [Entrant.from_name(name) for name in self.predictors]
+        entrants = [Entrant.from_name(name, train.goes_on) for name in self.predictors]
         own = dict.fromkeys(each.predictor for each in entrants if not each.preset)
         try:
             variants = {predictor: train.variants(predictor) for predictor in own}
-            ablations = choose_ablations(self.ablations, variants)
+            ablations = choose_ablations(self.ablations, variants, train.goes_on)
             cells = plan_cells(
                 sites=site_names(self.data),
                 entrants=entrants,

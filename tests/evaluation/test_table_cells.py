@@ -28,19 +28,23 @@ from asp_env.evaluation.paper_table.worker import Job, Judging
 from asp_env.evaluation.workers import ABANDONED
 from tests.predictors.tiny import write_data
 
-DKM, FFW = Entrant(predictor="dkm"), Entrant(predictor="ffw-asp")
+CHAINED = ("ssp-asp",)
+"""Whose runs for more than 3 s go on from others."""
+
+DKM, SSP = (
+    Entrant(predictor=name, preset="", goes_on=name in CHAINED) for name in ("dkm", "ssp-asp")
+)
 
 
 class Known(NamedTuple):
     """What a table needs to know of a variant."""
 
     horizons_s: tuple[float, ...] = (3.0,)
-    goes_on: bool = True
 
 
 VARIANTS = {
     "dkm": {"long": Known()},
-    "ssp-asp": {"long": Known(), "ema": Known(), "from-scratch": Known((6.0,), goes_on=False)},
+    "ssp-asp": {"long": Known(), "ema": Known(), "from-scratch": Known((6.0,))},
 }
 
 
@@ -50,22 +54,23 @@ def names(cells: list[Cell]) -> list[str]:
 
 
 def test_a_whole_table_for_one_seed_comes_first() -> None:
-    """Seeds in turn; within one, 3 s before 6 s, and each 6 s cell starts from its own seed's."""
+    """Seeds in turn; within one, 3 s before 6 s, and what chains starts from its own seed's 3 s."""
     cells = plan_cells(
-        sites=["a"], entrants=[DKM, FFW], views=["vectors"], horizons_s=[6.0, 3.0], seeds=[0, 7]
+        sites=["a"], entrants=[DKM, SSP], views=["vectors"], horizons_s=[6.0, 3.0], seeds=[0, 7]
     )
     assert names(cells)[:4] == [
         "a/vectors/dkm/3s/seed0",
-        "a/vectors/ffw-asp/3s/seed0",
+        "a/vectors/ssp-asp/3s/seed0",
         "a/vectors/dkm/6s/seed0",
-        "a/vectors/ffw-asp/6s/seed0",
+        "a/vectors/ssp-asp/6s/seed0",
     ]
     assert len(names(cells)) == 8
-    for cell in cells:
-        if cell.horizon_s == 6.0 and cell.seed is not None:
-            assert cell.start is not None
-            assert cell.start.name == cell.name.replace("6s", "3s")
-            assert cells.index(cell.start) < cells.index(cell)
+    started = [cell for cell in cells if cell.start is not None]
+    assert names(started) == [f"a/vectors/ssp-asp/6s/seed{seed}" for seed in (0, 7)]
+    for cell in started:
+        assert cell.start is not None
+        assert cell.start.name == cell.name.replace("6s", "3s")
+        assert cells.index(cell.start) < cells.index(cell)
     physical = {cell.name for cell in cells if cell.seed is None}
     assert physical == {
         f"a/constant-{what}/{h}s" for what in ("velocity", "turn-rate") for h in "36"
@@ -73,9 +78,16 @@ def test_a_whole_table_for_one_seed_comes_first() -> None:
 
 
 def test_what_6_s_start_from_is_trained_without_being_asked_for() -> None:
-    """A table of 6 s alone has the 3 s runs too, in front."""
-    cells = plan_cells(sites=["a"], entrants=[DKM], views=["vectors"], horizons_s=[6.0], seeds=[0])
-    assert names(cells) == ["a/vectors/dkm/3s/seed0", "a/vectors/dkm/6s/seed0"]
+    """A table of 6 s alone has the 3 s runs of what chains too, in front."""
+    entrants = [DKM, SSP]
+    cells = plan_cells(
+        sites=["a"], entrants=entrants, views=["vectors"], horizons_s=[6.0], seeds=[0]
+    )
+    assert names(cells) == [
+        "a/vectors/dkm/6s/seed0",
+        "a/vectors/ssp-asp/3s/seed0",
+        "a/vectors/ssp-asp/6s/seed0",
+    ]
 
 
 def test_ablations_are_of_the_first_site_and_their_horizons() -> None:
@@ -88,7 +100,7 @@ def test_ablations_are_of_the_first_site_and_their_horizons() -> None:
     ]
     cells = plan_cells(
         sites=["a", "b"],
-        entrants=[Entrant(predictor="ssp-asp")],
+        entrants=[SSP],
         views=["vectors"],
         horizons_s=[3.0, 6.0],
         seeds=[0],
@@ -111,13 +123,20 @@ def test_ablations_are_of_the_first_site_and_their_horizons() -> None:
 def test_ablations_by_name() -> None:
     """All, none, of everybody that has it, or of one predictor."""
 
+    def goes_on(predictor: str, name: str) -> bool:
+        return predictor in CHAINED and name != "from-scratch"
+
+    def chosen(*given: str) -> list[Ablation]:
+        return choose_ablations(given, VARIANTS, goes_on)
+
     def found(*given: str) -> list[str]:
-        return [f"{each.predictor}:{each.name}" for each in choose_ablations(given, VARIANTS)]
+        return [f"{each.predictor}:{each.name}" for each in chosen(*given)]
 
     assert found("none") == []
     assert found("long") == ["dkm:long", "ssp-asp:long"]
     assert found("ssp-asp:long", "ema") == ["ssp-asp:long", "ssp-asp:ema"]
     assert len(found("all")) == 4
+    assert [each.goes_on for each in chosen("all")] == [False, True, True, False]
     with pytest.raises(AspEnvError, match="did you mean 'ema'"):
         found("ema2")
     with pytest.raises(AspEnvError, match="unknown ablation 'dkm:ema'"):

@@ -6,7 +6,7 @@ from pathlib import Path
 import pytest
 
 from asp_env.errors import AspEnvError
-from predictors.ablations import VARIANTS, variant
+from predictors.ablations import VARIANTS, goes_on, variant
 from predictors.recipes import TrainingConfig, recipe
 from predictors.training import Train
 
@@ -30,15 +30,19 @@ def both(
 def test_something_changes_but_not_the_time(predictor: str, name: str, preset: str) -> None:
     """Another configuration of as many epochs in all; `long` has three times as many.
 
-    What does not go on from a run for 3 s has that run's epochs besides its own.
+    What goes on from a run for 3 s counts that run's epochs too. The paper's staged runs have half
+    as many again as those for 3 s, which are as many as those for 6 s at once.
     """
     base, changed = both(predictor, name, preset=preset)
     assert changed.preset == f"{preset}+{name}"
     if (preset, name) != ("paper", "euler"):
         assert dataclasses.replace(changed, preset=base.preset) != base
     epochs = base.all_epochs * (3 if name == "long" else 1)
+    before = recipe(predictor, preset, view="chauffeurnet", horizon_s=3.0).all_epochs
     if name == "from-scratch":
-        epochs += recipe(predictor, preset, view="chauffeurnet", horizon_s=3.0).all_epochs
+        epochs += before
+    if name == "staged":
+        epochs = (12 if preset == "cpu" else 15) - before
     assert changed.all_epochs == epochs
 
 
@@ -72,3 +76,14 @@ def test_unknown_variants_list_the_known_ones() -> None:
     """A name of another predictor's is none of this one's."""
     with pytest.raises(AspEnvError, match=r"variant of dkm 'skip': known are .*causal, euler, "):
         variant("dkm", "skip")
+
+
+def test_only_what_chains_goes_on_from_3_s() -> None:
+    """As in the paper: FFW-ASP predicts 6 s at once; a variant says so where it does otherwise."""
+    assert [each for each in VARIANTS if goes_on(each)] == ["ssp-asp"]
+    assert goes_on("ssp-asp", "ema")
+    assert not goes_on("ssp-asp", "from-scratch")
+    assert goes_on("dkm", "staged")
+    assert not goes_on("dkm", "long")
+    with pytest.raises(AspEnvError, match="unknown variant of dkm"):
+        goes_on("dkm", "from-scratch")

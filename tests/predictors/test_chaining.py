@@ -8,7 +8,7 @@ import torch
 from hypothesis import given
 from hypothesis import strategies as st
 
-from predictors.chaining import Chains, grow, merge, pick, prune, starts
+from predictors.chaining import MIN_MASS, Chains, grow, merge, pick, prune, starts
 
 FIRST = (0.3, 0.7)
 """Probabilities of the modes of the first segment."""
@@ -133,30 +133,49 @@ def ending_at(places: list[float], probabilities: list[float]) -> Chains:
     )
 
 
-def test_merged_chains_stand_for_those_near_by() -> None:
-    """Ends at 0, 1, 2 (0.2, 0.25, 0.15), 10 (0.3), 20 m (0.1), radius 1 m: 1, 10, 20 are kept.
+HALF_M = math.sqrt(3 / math.log(2))
+"""Two that end 2 m apart are half alike at this scale: exp(-(3 dx²/2) / (2 scale²)); 4 m, 1/16."""
 
-    The end at 10 m is the most probable single chain; that at 1 m stands for 0.6 and so for most.
+
+def test_the_first_chain_is_the_peak_of_the_distribution() -> None:
+    """Ends at 0, 2, 4 m with 0.4, 0.35, 0.25, halved by 2 m, a sixteenth at 4 m: by hand.
+
+    They stand for 0.590625, 0.675 and 0.45, so the one between comes first. It leaves 0.2 and
+    0.125, of which the first stands for 0.2 + 0.125/16; the last keeps 15/16 of its 0.125.
     """
-    chains = ending_at([0.0, 1.0, 2.0, 10.0, 20.0], [0.2, 0.25, 0.15, 0.3, 0.1])
-    kept = merge(chains, 3, 1.0)
-    assert kept.states[0, :, -1, 0].tolist() == [10.0, 1.0, 20.0]
-    assert kept.z[0, :, 0].tolist() == [3.0, 1.0, 4.0]
-    np.testing.assert_allclose(kept.log_probs.exp()[0], [0.3, 0.6, 0.1], atol=2e-4)
+    kept = merge(ending_at([0.0, 2.0, 4.0], [0.4, 0.35, 0.25]), 3, HALF_M)
+    assert kept.states[0, :, -1, 0].tolist() == [2.0, 0.0, 4.0]
+    assert kept.z[0, :, 0].tolist() == [1.0, 0.0, 2.0]
+    np.testing.assert_allclose(
+        kept.log_probs.exp()[0], [0.675, 0.2078125, 0.1171875], atol=2 * MIN_MASS
+    )
+
+
+def test_chains_are_compared_along_their_way() -> None:
+    """Two that end together but run 4 m apart before are not one; a third one's end decides not."""
+    states = torch.zeros(1, 3, 2, 4)
+    states[0, 1, 0, 1] = 4.0
+    states[0, 2, :, 0] = 50.0
+    chains = ending_at([0.0, 0.0, 50.0], [0.3, 0.3, 0.4])._replace(states=states)
+    kept = merge(chains, 3, HALF_M)
+    assert kept.z[0, :, 0].tolist() == [2.0, 0.0, 1.0]
+    np.testing.assert_allclose(
+        kept.log_probs.exp()[0], [0.4, 0.3 + 0.3 / 16, 0.3 * 15 / 16], atol=2 * MIN_MASS
+    )
 
 
 def test_merging_keeps_as_many_as_asked() -> None:
-    """Where all end together the others follow by probability, with next to none left to them."""
-    kept = merge(ending_at([0.0, 0.1, 0.2, 0.3], [0.1, 0.2, 0.4, 0.3]), 3, 1.0)
-    assert kept.states[0, :, -1, 0].tolist() == pytest.approx([0.2, 0.3, 0.1])
+    """Where all run together the others follow, with next to none left to them."""
+    kept = merge(ending_at([0.0, 0.01, 0.02, 0.03], [0.1, 0.2, 0.4, 0.3]), 3, 1.0)
+    assert kept.states[0, 0, -1, 0].item() == pytest.approx(0.02)
     probabilities = kept.log_probs.exp()[0]
     assert float(probabilities[0]) > 0.999
     assert float(probabilities.sum()) == pytest.approx(1, abs=1e-6)
 
 
-@given(st.integers(0, 10_000), st.integers(1, 6), st.integers(1, 4))
+@given(st.integers(0, 10_000), st.integers(1, 6), st.integers(1, 7))
 def test_merged_chains_are_among_the_chains(seed: int, count: int, keep: int) -> None:
-    """Each is one of them, none twice, the first not the worse for its neighbours; sums to one."""
+    """Each is one of them, none twice, the first stands for most, and all sum to one."""
     rng = np.random.default_rng(seed)
     probabilities = rng.dirichlet(np.ones(count))
     chains = ending_at(rng.uniform(0, 5, count).tolist(), probabilities.tolist())
@@ -164,4 +183,15 @@ def test_merged_chains_are_among_the_chains(seed: int, count: int, keep: int) ->
     rows = kept.z[0, :, 0].long().tolist()
     assert len(rows) == len(set(rows)) == min(keep, count)
     assert float(kept.log_probs.exp().sum()) == pytest.approx(1, abs=1e-5)
+    assert int(kept.log_probs[0].argmax()) == 0
     assert float(kept.log_probs[0, 0]) >= np.log(probabilities.max()) - 1e-2
+
+
+@given(st.integers(0, 10_000), st.integers(1, 6))
+def test_what_is_told_is_told_once(seed: int, count: int) -> None:
+    """The shares of all chains together are one before they are scaled to be."""
+    rng = np.random.default_rng(seed)
+    chains = ending_at(rng.uniform(0, 5, count).tolist(), rng.dirichlet(np.ones(count)).tolist())
+    told = merge(chains, count, 1.0).log_probs.exp()[0] * (1 + count * MIN_MASS) - MIN_MASS
+    assert float(told.sum()) == pytest.approx(1, abs=1e-5)
+    assert bool((told > -1e-5).all())

@@ -73,14 +73,24 @@ def test_every_recipe_is_for_every_view(predictor: str, preset: str) -> None:
 
 
 def test_small_pretraining_takes_of_the_epochs() -> None:
-    """Two of SSP-ASP's epochs: with those after them as many as DKM has, at 3 s and at 6 s."""
-    for horizon_s in (3.0, 6.0):
-        ssp, dkm = (
-            recipe(predictor, "cpu", view="vectors", horizon_s=horizon_s)
-            for predictor in ("ssp-asp", "dkm")
-        )
-        assert ssp.all_epochs == dkm.all_epochs == dkm.epochs
-        assert ssp.pretraining_epochs == (2 if horizon_s == 3.0 else 0)
+    """Two of SSP-ASP's epochs: with those after them as many as DKM has."""
+    ssp, dkm = (
+        recipe(predictor, "cpu", view="vectors", horizon_s=3.0) for predictor in ("ssp-asp", "dkm")
+    )
+    assert ssp.all_epochs == dkm.all_epochs == dkm.epochs
+    assert ssp.pretraining_epochs == 2
+
+
+@pytest.mark.parametrize("preset", ["cpu", "ours"])
+def test_small_runs_for_6_s_have_equal_budgets(preset: str) -> None:
+    """12 epochs each: of SSP-ASP 8 for 3 s and 4 after them, of the others all at once."""
+
+    def epochs(predictor: str, preset: str, horizon_s: float) -> int:
+        return recipe(predictor, preset, view="vectors", horizon_s=horizon_s).all_epochs
+
+    assert epochs("ssp-asp", preset, 3.0) + epochs("ssp-asp", preset, 6.0) == 12
+    assert {epochs(name, "cpu", 6.0) for name in ("mtp", "dkm", "ffw-asp")} == {12}
+    assert epochs("ffw-asp", "ours", 6.0) == 12
 
 
 def test_unknown_names_list_the_known_ones() -> None:

@@ -1,6 +1,6 @@
 """The cells of the table: what is trained and judged, and what has to be there before."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from itertools import product
 from typing import Any
@@ -8,7 +8,7 @@ from typing import Any
 from asp_env.errors import AspEnvError, unknown_name
 
 SEGMENT_S = 3.0
-"""Runs for longer horizons start from the weights of one for this, of the same seed."""
+"""Runs for longer horizons that go on from others do so from one for this, of the same seed."""
 
 PHYSICAL = ("constant-velocity", "constant-turn-rate")
 """These learn nothing; every table has them."""
@@ -59,12 +59,14 @@ class Entrant:
     predictor: str
     preset: str = ""
     """Where it is another than the table's."""
+    goes_on: bool
+    """Whether a run for more than 3 s goes on from the weights of one for 3 s."""
 
     @classmethod
-    def from_name(cls, name: str) -> "Entrant":
-        """Of `ssp-asp` or `ssp-asp:ours`."""
+    def from_name(cls, name: str, goes_on: Callable[[str], bool]) -> "Entrant":
+        """Of `ssp-asp` or `ssp-asp:ours`; `goes_on` tells it of a predictor."""
         predictor, _, preset = name.partition(":")
-        return cls(predictor=predictor, preset=preset)
+        return cls(predictor=predictor, preset=preset, goes_on=goes_on(predictor))
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -80,13 +82,16 @@ class Ablation:
 
 
 def choose_ablations(
-    names: Sequence[str], variants: Mapping[str, Mapping[str, Any]]
+    names: Sequence[str],
+    variants: Mapping[str, Mapping[str, Any]],
+    goes_on: Callable[[str, str], bool],
 ) -> list[Ablation]:
     """The ablations of some names.
 
     Args:
         names: `none`, `all`, a name (of every predictor that has it) or `predictor:name`.
-        variants: by predictor and name; each with `horizons_s` and `goes_on`.
+        variants: by predictor and name; each with `horizons_s`.
+        goes_on: of a predictor and a name, whether runs for more than 3 s go on from others.
 
     Raises:
         AspEnvError: no predictor has it.
@@ -102,7 +107,7 @@ def choose_ablations(
                 predictor=each,
                 name=variant,
                 horizons_s=tuple(of[variant].horizons_s),
-                goes_on=of[variant].goes_on,
+                goes_on=goes_on(each, variant),
             )
             for each, of in variants.items()
             for variant in of
@@ -143,7 +148,8 @@ def plan_cells(
 
 
 def _base(site: str, view: str, entrant: Entrant, horizon_s: float, seed: int) -> Cell:
-    start = _base(site, view, entrant, SEGMENT_S, seed) if horizon_s > SEGMENT_S else None
+    later = horizon_s > SEGMENT_S and entrant.goes_on
+    start = _base(site, view, entrant, SEGMENT_S, seed) if later else None
     return Cell(
         site=site,
         predictor=entrant.predictor,
@@ -161,7 +167,8 @@ def _changed(site: str, view: str, ablation: Ablation, horizon_s: float, seed: i
         if SEGMENT_S in ablation.horizons_s:
             start = _changed(site, view, ablation, SEGMENT_S, seed)
         else:
-            start = _base(site, view, Entrant(predictor=ablation.predictor), SEGMENT_S, seed)
+            entrant = Entrant(predictor=ablation.predictor, goes_on=True)
+            start = _base(site, view, entrant, SEGMENT_S, seed)
     return Cell(
         site=site,
         predictor=ablation.predictor,
