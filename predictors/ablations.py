@@ -93,9 +93,9 @@ def all_epochs(config: TrainingConfig) -> TrainingConfig:
     return dataclasses.replace(config, epochs=_before(config).all_epochs + config.epochs)
 
 
-def fewer_epochs(config: TrainingConfig) -> TrainingConfig:
-    """Half as many as a run for 3 s had, for a run that goes on from it."""
-    return dataclasses.replace(config, epochs=_before(config).all_epochs // 2)
+def second_stage(config: TrainingConfig) -> TrainingConfig:
+    """As many epochs as a run for 3 s had, for a run that goes on from it."""
+    return dataclasses.replace(config, epochs=_before(config).all_epochs)
 
 
 def _before(config: TrainingConfig) -> TrainingConfig:
@@ -113,7 +113,7 @@ _OF_ACTIONS = _OF_ALL | {
     "literal-classification": Variant(change=_network(classification="softmax")),
 }
 
-_AT_ONCE = {"staged": Variant(change=fewer_epochs, horizons_s=(6.0,), goes_on=True)}
+_AT_ONCE = {"staged": Variant(change=second_stage, horizons_s=(6.0,), goes_on=True)}
 
 VARIANTS: Mapping[str, Mapping[str, Variant]] = MappingProxyType(
     {

@@ -114,10 +114,10 @@ def _small(
 ) -> TrainingConfig:
     """Minutes on two cores: pictures of a quarter of the resolution, a small encoder, one cycle.
 
-    A longer horizon takes half as many epochs more: after those for 3 s that a predictor which
-    chains segments goes on from, or in one go.
+    A longer horizon takes as many epochs again: after those for 3 s, where a predictor chains
+    segments, or in one go.
     """
-    longer = horizon_s > SEGMENT_S
+    at_once = horizon_s > SEGMENT_S and predictor not in CHAINED
     vectors = view.startswith("vectors")
     pixels = (90, 90) if view == "mtp" else (90, 60)
     network = dataclasses.replace(network, encoder="vector" if vectors else "small", features=256)
@@ -129,7 +129,7 @@ def _small(
         pixels=None if vectors else pixels,
         horizon_s=horizon_s,
         standing_share=0.25,
-        epochs=(4 if predictor in CHAINED else 12) if longer else 8,
+        epochs=16 if at_once else 8,
         snippets_per_epoch=6_000,
         max_validation_snippets=2_000,
         batch_size=64,

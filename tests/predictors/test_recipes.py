@@ -83,14 +83,14 @@ def test_small_pretraining_takes_of_the_epochs() -> None:
 
 @pytest.mark.parametrize("preset", ["cpu", "ours"])
 def test_small_runs_for_6_s_have_equal_budgets(preset: str) -> None:
-    """12 epochs each: of SSP-ASP 8 for 3 s and 4 after them, of the others all at once."""
+    """16 epochs each: of SSP-ASP 8 for 3 s and 8 after them, of the others all at once."""
 
     def epochs(predictor: str, preset: str, horizon_s: float) -> int:
         return recipe(predictor, preset, view="vectors", horizon_s=horizon_s).all_epochs
 
-    assert epochs("ssp-asp", preset, 3.0) + epochs("ssp-asp", preset, 6.0) == 12
-    assert {epochs(name, "cpu", 6.0) for name in ("mtp", "dkm", "ffw-asp")} == {12}
-    assert epochs("ffw-asp", "ours", 6.0) == 12
+    assert epochs("ssp-asp", preset, 3.0) + epochs("ssp-asp", preset, 6.0) == 16
+    assert {epochs(name, "cpu", 6.0) for name in ("mtp", "dkm", "ffw-asp")} == {16}
+    assert epochs("ffw-asp", "ours", 6.0) == 16
 
 
 def test_unknown_names_list_the_known_ones() -> None:
