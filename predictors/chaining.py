@@ -78,15 +78,15 @@ def prune(chains: Chains, keep: int) -> Chains:
 def merge(chains: Chains, keep: int, scale_m: float) -> Chains:
     """A few chains, each where most of the probability lies that those before it leave.
 
-    What a chain stands for is the probability of all chains, each weighted by a Gaussian of how far
-    apart they run. `scale_m` is its standard deviation for two that part at a constant rate, at
-    their ends. The first one kept stands for most: the peak of the distribution over trajectories,
-    which one chain that happens to be the most probable need not be near. It takes from the others
-    what it stands for, then the next one is found in the same way.
+    What a chain stands for is the probability of all chains, each weighted by a Gaussian of twice
+    the mean distance between them (for two that part at a constant rate, the distance of their
+    ends), with the standard deviation `scale_m`. The first one kept stands for most: it is the peak
+    of the distribution over trajectories, which one chain that happens to be the most probable need
+    not be near. It takes from the others what it stands for; then the next is found likewise.
     """
     at = chains.states[..., :2]
-    apart_m2 = 3 * (at[:, :, None] - at[:, None]).square().sum(dim=-1).mean(dim=-1)
-    near = (-apart_m2 / (2 * scale_m**2)).exp()
+    apart_m = torch.linalg.vector_norm(at[:, :, None] - at[:, None], dim=-1).mean(dim=-1)
+    near = (-0.5 * (2 * apart_m / scale_m).square()).exp()
     left = chains.log_probs.exp()
     taken = torch.zeros_like(left)
     rows, masses = [], []

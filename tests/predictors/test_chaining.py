@@ -133,8 +133,8 @@ def ending_at(places: list[float], probabilities: list[float]) -> Chains:
     )
 
 
-HALF_M = math.sqrt(3 / math.log(2))
-"""Two that end 2 m apart are half alike at this scale: exp(-(3 dx²/2) / (2 scale²)); 4 m, 1/16."""
+HALF_M = math.sqrt(2 / math.log(2))
+"""At this scale, two that end 2 m apart are half alike: exp(-2² / (2 scale²)); 4 m, a sixteenth."""
 
 
 def test_the_first_chain_is_the_peak_of_the_distribution() -> None:
