@@ -1,12 +1,15 @@
 """Calibrating the probabilities of modes by one temperature (Guo et al. 2017)."""
 
+from collections.abc import Callable
+
 import numpy as np
 import torch
 from jaxtyping import Float, Int
 from lightning.fabric.utilities import move_data_to_device
 
+from predictors.batch import Batch
 from predictors.modes import best_mode
-from predictors.network import AbstractNetwork
+from predictors.network import AbstractNetwork, Modes
 from predictors.samples import Batches
 
 LIMITS = (0.05, 20.0)
@@ -14,22 +17,36 @@ STEPS = 60
 _GOLDEN = (np.sqrt(5.0) - 1) / 2
 
 
-def temperature_on(network: AbstractNetwork, batches: Batches) -> float:
-    """The temperature of a network's logits on validation data; leaves it evaluating, on the CPU.
+def calibrate(network: AbstractNetwork, batches: Batches) -> float:
+    """Calibrates a network on validation data; leaves it evaluating, on the CPU.
 
     Worked out on a GPU where there is one: at full size a CPU would take longer than the training.
+
+    Returns:
+        What the logits of its forecasts are to be divided by. What those of unmerged modes are to
+        be divided by before they are merged, where any are, is kept in the network.
     """
     device = torch.device("cuda" if torch.cuda.is_available() else "cpu")
     network.eval().to(device)
+    if network.merging_temperature is not None:
+        found = _temperature(network.unmerged, batches, device)
+        network.merging_temperature.fill_(found)
+    temperature = _temperature(network, batches, device)
+    network.cpu()
+    return temperature
+
+
+def _temperature(
+    forecast: Callable[[Batch], Modes], batches: Batches, device: torch.device
+) -> float:
     logits, best = [], []
     with torch.inference_mode():
         for each in batches:
             batch, labels = move_data_to_device(each, device)
-            modes = network(batch)
+            modes = forecast(batch)
             logits.append(modes.logits.cpu().numpy())
             nearest = best_mode(modes.states[..., :2], labels.states[..., :2], "distance")
             best.append(nearest.cpu().numpy())
-    network.cpu()
     return fit_temperature(np.concatenate(logits), np.concatenate(best))
 
 

@@ -19,7 +19,7 @@ from asp_env import registry
 from asp_env.data.source import open_data
 from asp_env.errors import AspEnvError
 from asp_env.views import make_view
-from predictors.calibration import temperature_on
+from predictors.calibration import calibrate
 from predictors.checkpoint import CONFIG, read_config, save_learned, shape_for, write_json
 from predictors.drawing import hired
 from predictors.hardware import LOGS, Hardware, make_trainer, quiet
@@ -130,17 +130,16 @@ def train(
             trainer.strategy.barrier()
             return out
 
-        weights = load_file(best.best_path)
-        network.load_state_dict(weights)
+        network.load_state_dict(load_file(best.best_path))
         with torch.compiler.set_stance("force_eager") if hardware.compiled else nullcontext():
-            temperature = temperature_on(network, batches[1])
+            temperature = calibrate(network, batches[1])
     save_learned(
         out,
         plug=plug,
         network_config=config.network,
         shape=shape,
         view=view,
-        weights=weights,
+        weights=network.state_dict(),
         temperature=temperature,
         provenance={
             **run,

@@ -90,11 +90,22 @@ class SSPASPNetwork(AbstractNetwork):
         if config.skip:
             width += 2 * z + 1 + 2 * shape.history
         self.head = ConnectedHead(width, config.hidden, modes=config.modes, ticks=shape.history)
+        if config.kept:
+            self.register_buffer("temperature", torch.ones(()))
 
     @property
     def later_ticks(self) -> tuple[int, ...]:
         """The ends of all segments."""
         return tuple(range(self.shape.history, self.shape.horizon + 1, self.shape.history))
+
+    @property
+    def merging_temperature(self) -> Float[Tensor, ""] | None:
+        """Of the modes of all segments together."""
+        return self.get_buffer("temperature") if self._options.kept else None
+
+    def unmerged(self, batch: Batch) -> Modes:
+        """Every mode of each segment after every one before."""
+        return self.chain(batch, "full")
 
     def forward(self, batch: Batch) -> Modes:
         """The modes of every target; segments are chained by beam."""
@@ -115,13 +126,17 @@ class SSPASPNetwork(AbstractNetwork):
         return Modes(chains.states, chains.log_probs, chains.actions)
 
     def _kept(self, chains: Chains, chaining: Chaining) -> Chains:
-        kept, count, ticks = self._options.kept, *chains.states.shape[1:3]
-        if kept and chaining != "full":
-            if count <= kept and ticks < self.shape.horizon:
-                return chains
-            return merge(chains, kept, self._options.spread_mps * ticks * self.shape.dt_s)
-        more = count > self.config.modes
-        return prune(chains, self.config.modes) if more and chaining == "beam" else chains
+        count, ticks = chains.states.shape[1:3]
+        temperature = self.merging_temperature
+        if temperature is None or chaining == "full":
+            more = count > self.config.modes
+            return prune(chains, self.config.modes) if more and chaining == "beam" else chains
+        kept, ended = self._options.kept, ticks == self.shape.horizon
+        if count <= kept and not ended:
+            return chains
+        calm = chains._replace(log_probs=(chains.log_probs / temperature).log_softmax(dim=1))
+        few = merge(calm, kept, self._options.spread_mps * ticks * self.shape.dt_s)
+        return few if ended else few._replace(log_probs=few.log_probs * temperature)
 
     def encode(self, batch: Batch) -> Float[Tensor, "n z"]:
         """φ."""

@@ -11,6 +11,7 @@ from asp_env.data.geometry import states_to_frame
 from asp_env.dynamics import rollout
 from asp_env.errors import AspEnvError
 from predictors.batch import Batch, Labels
+from predictors.chaining import Chains, merge
 from predictors.modes import best_mode, into_frame, mode_terms
 from predictors.network import Modes, Moment
 from predictors.ssp_asp import SSPASPConfig, SSPASPNetwork
@@ -78,6 +79,49 @@ def test_beam_is_the_best_of_full(sample: tuple[Batch, Labels]) -> None:
     with torch.no_grad():
         forecast: Modes = ssp()(sample[0])
     assert torch.equal(forecast.states, beam.states)
+
+
+def merging(horizon: int, temperature: float) -> SSPASPNetwork:
+    """One that keeps three modes, with what calibration would have found."""
+    network = ssp(horizon=horizon, kept=3)
+    found = network.merging_temperature
+    assert found is not None
+    found.fill_(temperature)
+    return network
+
+
+@pytest.mark.parametrize("horizon", [15, 30])
+@pytest.mark.parametrize("temperature", [1.0, 2.5])
+def test_merged_are_all_chains_made_calm(
+    horizon: int, temperature: float, sample: tuple[Batch, Labels]
+) -> None:
+    """Of all chains at p^(1/T), scaled to sum to one, 0.8 m/s times the horizon apart."""
+    network = merging(horizon, temperature)
+    with torch.no_grad():
+        full, few = network.unmerged(sample[0]), network(sample[0])
+    calm = (full.logits.exp() ** (1 / temperature)).log().log_softmax(dim=1)
+    assert full.actions is not None
+    every = Chains(full.states, full.actions, calm, torch.zeros(*calm.shape, 1))
+    expected = merge(every, 3, 0.8 * 0.2 * horizon)
+    assert few.states.shape == (6, 3, horizon, 4)
+    assert torch.equal(few.states, expected.states)
+    torch.testing.assert_close(few.logits, expected.log_probs)
+
+
+def test_what_is_merged_at_6_s_goes_on_to_9_s(sample: tuple[Batch, Labels]) -> None:
+    """Every chain of 9 s begins with one of the three that a forecast of 6 s keeps."""
+    with torch.no_grad():
+        six, nine = merging(30, 2.5)(sample[0]), merging(45, 2.5)(sample[0])
+    apart_m = (nine.states[:, :, None, :30, :2] - six.states[:, None, ..., :2]).abs()
+    assert float(apart_m.amax(dim=(3, 4)).amin(dim=2).max()) < 1e-5
+    torch.testing.assert_close(nine.logits.exp().sum(dim=1), torch.ones(6))
+
+
+def test_only_what_merges_has_a_temperature_of_its_own() -> None:
+    """The paper's network has no such weight; that of one that merges begins at 1."""
+    assert ssp().merging_temperature is None
+    assert "temperature" not in ssp().state_dict()
+    assert float(ssp(kept=3).state_dict()["temperature"]) == 1
 
 
 @pytest.mark.parametrize("chaining", ["top1", "oracle"])
