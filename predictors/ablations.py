@@ -90,16 +90,23 @@ def no_pretraining(config: TrainingConfig) -> TrainingConfig:
 
 def all_epochs(config: TrainingConfig) -> TrainingConfig:
     """Those of a run for 3 s besides its own, for a run that does not go on from one."""
-    return dataclasses.replace(config, epochs=_before(config).all_epochs + config.epochs)
+    before, own = _epochs(config, SEGMENT_S), _epochs(config, config.horizon_s)
+    return _share(config, (before + own) / own)
 
 
 def second_stage(config: TrainingConfig) -> TrainingConfig:
     """As many epochs as a run for 3 s had, for a run that goes on from it."""
-    return dataclasses.replace(config, epochs=_before(config).all_epochs)
+    return _share(config, _epochs(config, SEGMENT_S) / _epochs(config, config.horizon_s))
 
 
-def _before(config: TrainingConfig) -> TrainingConfig:
-    return recipe(config.predictor, config.preset, view=config.view, horizon_s=SEGMENT_S)
+def _epochs(config: TrainingConfig, horizon_s: float) -> int:
+    """Those of the preset."""
+    return recipe(config.predictor, config.preset, view=config.view, horizon_s=horizon_s).all_epochs
+
+
+def _share(config: TrainingConfig, share: float) -> TrainingConfig:
+    """So many times the epochs, which may be others than the preset's."""
+    return dataclasses.replace(config, epochs=max(1, round(share * config.epochs)))
 
 
 _OF_ALL = {

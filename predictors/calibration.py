@@ -1,4 +1,4 @@
-"""Calibrating the probabilities of modes by one temperature (Guo et al. 2017)."""
+"""Calibrating the probabilities of modes by temperatures (Guo et al. 2017)."""
 
 from collections.abc import Callable
 
@@ -11,6 +11,7 @@ from predictors.batch import Batch
 from predictors.modes import best_mode
 from predictors.network import AbstractNetwork, Modes
 from predictors.samples import Batches
+from predictors.ssp_asp import SSPASPNetwork
 
 LIMITS = (0.05, 20.0)
 STEPS = 60
@@ -23,13 +24,13 @@ def calibrate(network: AbstractNetwork, batches: Batches) -> float:
     Worked out on a GPU where there is one: at full size a CPU would take longer than the training.
 
     Returns:
-        What the logits of its forecasts are to be divided by. What those of unmerged modes are to
-        be divided by before they are merged, where any are, is kept in the network.
+        What the logits of its forecasts are to be divided by. What those of chains are divided by
+        before they are merged, where any are, the network keeps.
     """
     device = torch.device("cuda" if torch.cuda.is_available() else "cpu")
     network.eval().to(device)
-    if network.merging_temperature is not None:
-        found = _temperature(network.unmerged, batches, device)
+    if isinstance(network, SSPASPNetwork) and network.merging_temperature is not None:
+        found = _temperature(lambda batch: network.chain(batch, "full"), batches, device)
         network.merging_temperature.fill_(found)
     temperature = _temperature(network, batches, device)
     network.cpu()

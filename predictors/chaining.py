@@ -1,9 +1,9 @@
 """Chaining segments of several modes into longer forecasts. N targets, K chains, M modes, T ticks.
 
 A later segment starts from one mode of the one before. `top1` goes on from the most probable mode
-alone, `full` from every one, `beam` from every one and keeps the most probable chains. `oracle`
-goes on from the mode nearest to the label (the paper's label matching, at test time): it knows the
-future, and tables say so.
+alone (as it is, before any are merged), `full` from every one, `beam` from every one and keeps the
+most probable chains, or those that speak for most. `oracle` goes on from the mode nearest to the
+label (the paper's label matching, at test time): it knows the future, and tables say so.
 """
 
 from typing import Literal, NamedTuple

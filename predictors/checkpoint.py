@@ -20,6 +20,7 @@ from predictors.chaining import CHAININGS, Chaining
 from predictors.learned import Learned
 from predictors.model_card import model_card
 from predictors.network import AbstractNetwork, LearnedPlug, NetworkShape
+from predictors.ssp_asp import SSPASPNetwork
 
 CONFIG = "config.json"
 WEIGHTS = "weights.safetensors"
@@ -124,6 +125,9 @@ def load_learned(plug: LearnedPlug, argument: str, *, dt_s: float | None = None)
             f"nothing to chain: name it without @{chaining}, as {plug.name}:{folder}"
         )
     _load_weights(network, folder / WEIGHTS)
+    calm = network.merging_temperature if isinstance(network, SSPASPNetwork) else None
+    if chaining == "full" and calm is not None:  # the other temperature is that of merged chains
+        temperature = float(calm)
     return Learned(
         name=plug.name,
         network=network,
@@ -245,7 +249,7 @@ def _load_weights(network: AbstractNetwork, path: Path) -> None:
         network.load_state_dict(read_weights(path))
     except RuntimeError as error:
         raise CheckpointError(
-            f"{path} does not fit the network of its {CONFIG}: {_brief(error)}"
+            f"{path} does not fit the network of its {CONFIG}, train again: {_brief(error)}"
         ) from error
 
 

@@ -81,7 +81,7 @@ def train(
         begin = Start.read(start, plug, view=view, dt_s=config.dt_s)
     if begin is not None:
         run["start"] = begin.weights_hash
-    resumed = _resumes(out, run)
+    resumed = _resumes(out, run, staged=start == out / BEFORE)
 
     training = chosen.training
     if begin is None or begin.action_range is None:
@@ -207,7 +207,7 @@ def _check_before(start: Path, config: TrainingConfig, data: str) -> None:
         )
 
 
-def _resumes(out: Path, run: dict[str, Any]) -> bool:
+def _resumes(out: Path, run: dict[str, Any], *, staged: bool) -> bool:
     """Whether the folder holds this run unfinished; False where there is nothing yet."""
     if (out / CONFIG).exists():
         raise AspEnvError(f"{out} holds a finished run: give another --out, or delete it")
@@ -223,7 +223,7 @@ def _resumes(out: Path, run: dict[str, Any]) -> bool:
             )
         return True
     # A kill right after the folder was made left it without a word of what it is.
-    known = (BEFORE, STATE)
+    known = (BEFORE, STATE) if staged else (STATE,)
     if out.exists() and (not out.is_dir() or any(each.name not in known for each in out.iterdir())):
         raise AspEnvError(f"{out} holds something that is no run: give another --out")
     return False

@@ -169,7 +169,7 @@ def _limits(config: dict[str, Any]) -> Iterator[str]:
         "its errors: judge it there first."
     )
     yield (
-        f"- Probabilities are calibrated by one temperature, {config['temperature']:.4g}, on the "
+        f"- Probabilities are calibrated by a temperature, {config['temperature']:.4g}, on the "
         "validation data; on other data they may be too sure."
     )
     yield "- Not tested for use in a vehicle."

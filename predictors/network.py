@@ -112,21 +112,9 @@ class AbstractNetwork(nn.Module, ABC):
         """How many ticks after now the later scenes lie that it learns from; mostly none."""
         return ()
 
-    @property
-    def merging_temperature(self) -> Float[Tensor, ""] | None:
-        """What the logits of `unmerged` modes are divided by before some speak for others.
-
-        A buffer, fitted after training; None for a network that merges none.
-        """
-        return None
-
     @abstractmethod
     def forward(self, batch: Batch) -> Modes:
         """The modes of every target."""
-
-    def unmerged(self, batch: Batch) -> Modes:
-        """All modes, before any are merged."""
-        return self(batch)
 
     def loss(self, modes: Modes, labels: Labels, moment: Moment) -> dict[str, Tensor]:
         """The terms of the loss by name, `loss` their weighted sum."""

@@ -214,6 +214,7 @@ def ssp_asp_ours(view: str, horizon_s: float) -> TrainingConfig:
         assignment="distance",
         annealed=horizon_s <= SEGMENT_S,
         kept=3,
+        spread_mps=0.8,
         normalise=True,
         stop_gradient=True,
         scheduled=True,

@@ -61,6 +61,10 @@ class Place(NamedTuple):
 class SSPASPNetwork(AbstractNetwork):
     """φ, ψ, ξ, γ and the bicycle model."""
 
+    merging_temperature: Float[Tensor, ""] | None
+    """What log-probabilities of chains are divided by before they are merged, fitted when training
+    is over; None where none are."""
+
     def __init__(self, config: SSPASPConfig, shape: NetworkShape) -> None:
         """With random weights.
 
@@ -90,22 +94,14 @@ class SSPASPNetwork(AbstractNetwork):
         if config.skip:
             width += 2 * z + 1 + 2 * shape.history
         self.head = ConnectedHead(width, config.hidden, modes=config.modes, ticks=shape.history)
-        if config.kept:
-            self.register_buffer("temperature", torch.ones(()))
+        # A run that goes on from another is selected with what that one's calibration found.
+        calm = torch.ones(()) if config.kept else None
+        self.register_buffer("merging_temperature", calm)
 
     @property
     def later_ticks(self) -> tuple[int, ...]:
         """The ends of all segments."""
         return tuple(range(self.shape.history, self.shape.horizon + 1, self.shape.history))
-
-    @property
-    def merging_temperature(self) -> Float[Tensor, ""] | None:
-        """Of the modes of all segments together."""
-        return self.get_buffer("temperature") if self._options.kept else None
-
-    def unmerged(self, batch: Batch) -> Modes:
-        """Every mode of each segment after every one before."""
-        return self.chain(batch, "full")
 
     def forward(self, batch: Batch) -> Modes:
         """The modes of every target; segments are chained by beam."""

@@ -33,8 +33,8 @@ class SSPASPConfig(NetworkConfig):
     """Of all modes, how many a forecast keeps: those that most of the others run near, apart from
     each other, with the probability of what is near. 0 keeps every mode, or in a beam the most
     probable chains."""
-    spread_mps: float = 0.8
-    """How near that is, for each second ahead."""
+    spread_mps: float = 0.4
+    """How near that is, for each second ahead: the standard deviation in `chaining.merge`."""
     action_weight: float = 1.0
     """w1, of the reconstruction of actions."""
     feature_weight: float = 1.0
@@ -48,9 +48,14 @@ class SSPASPConfig(NetworkConfig):
         """Checks the sizes.
 
         Raises:
-            AspEnvError: one is not positive, or `ema` is not in [0, 1).
+            AspEnvError: one is not positive, `kept` is negative, or `ema` is not in [0, 1).
         """
         self.check_positive("features", "modes", "gru_width", "gru_layers")
+        if self.kept < 0 or not self.spread_mps > 0:
+            raise AspEnvError(
+                f"network: kept is {self.kept} and spread_mps {self.spread_mps}, expected 0 or "
+                "more and a positive number"
+            )
         if self.hidden < 0 or not 0 <= self.ema < 1:
             raise AspEnvError(
                 f"network: hidden is {self.hidden} and ema {self.ema}, expected 0 or more and "

@@ -30,10 +30,10 @@ class Train:
     view: str = "chauffeurnet"
     """What the network looks at: chauffeurnet, mtp or vectors."""
     horizon: float = 3.0
-    """How far it forecasts, seconds. More than 3 s of ssp-asp go on from a run for 3 s, in
-    OUT/3s."""
+    """How far it forecasts, seconds. Over 3 s, ssp-asp and the variant staged of the others go on
+    from a run for 3 s, in OUT/3s."""
     start: Path | None = None
-    """A finished run to start from instead, or a safetensors file of ResNet18 weights."""
+    """A finished run to start from, or a safetensors file of ResNet18 weights."""
     validation: str | None = None
     """Other data to select on; all of DATA is learned from then."""
     history: Literal["recorded", "causal"] = "recorded"

@@ -136,9 +136,9 @@ class Table:
             AspEnvError: there is no such recipe or ablation.
         """
         train = registry.find("commands", "train")
-        entrants = [Entrant.from_name(name, train.goes_on) for name in self.predictors]
-        own = dict.fromkeys(each.predictor for each in entrants if not each.preset)
         try:
+            entrants = [Entrant.from_name(name, train.goes_on) for name in self.predictors]
+            own = dict.fromkeys(each.predictor for each in entrants if not each.preset)
             variants = {predictor: train.variants(predictor) for predictor in own}
             ablations = choose_ablations(self.ablations, variants, train.goes_on)
             cells = plan_cells(

@@ -320,3 +320,6 @@ def test_run_from_other_weights_is_told(data: str, tmp_path: Path) -> None:
     assert "starts from, failed" in told[second]
     (begin / "weights.safetensors").write_bytes(b"others")
     assert "started from other weights" in failed(8)[second]
+    at_once = Job(train={"out": str(run), "data": data}, judging=None, recipe={"epochs": 4})
+    with pytest.raises(AspEnvError, match="went on from another run"):
+        at_once.check()

@@ -78,6 +78,17 @@ def test_unknown_variants_list_the_known_ones() -> None:
         variant("dkm", "skip")
 
 
+@pytest.mark.parametrize(
+    ("predictor", "name", "epochs"), [("dkm", "staged", 2), ("ssp-asp", "from-scratch", 8)]
+)
+def test_other_epochs_than_the_presets_are_shared_likewise(
+    predictor: str, name: str, epochs: int
+) -> None:
+    """With 4 for 6 s: half of them after 3 s (8 of 16), or as many again at once (16 for 8)."""
+    command = Train(predictor=predictor, data="", out=Path(), horizon=6.0, variant=name, epochs=4)
+    assert command.config_for(6.0).epochs == epochs
+
+
 def test_only_what_chains_goes_on_from_3_s() -> None:
     """As in the paper: FFW-ASP predicts 6 s at once; a variant says so where it does otherwise."""
     assert [each for each in VARIANTS if goes_on(each)] == ["ssp-asp"]

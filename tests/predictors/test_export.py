@@ -32,10 +32,11 @@ from tests.predictors.tiny import save_random
 VIEWS = ("chauffeurnet", "vectors", "mtp")
 SEGMENT = 15
 CASES = [
-    *((name, view, SEGMENT) for name, view in zip(sorted(RECIPES), itertools.cycle(VIEWS))),
-    ("ssp-asp", "vectors", 2 * SEGMENT),
+    *((name, view, SEGMENT, "cpu") for name, view in zip(sorted(RECIPES), itertools.cycle(VIEWS))),
+    *(("ssp-asp", "vectors", 2 * SEGMENT, preset) for preset in ("cpu", "ours")),
 ]
-"""Every trainable predictor; between them every kind of view; and segments chained by beam."""
+"""Every trainable predictor; between them every kind of view; and segments chained by beam, kept as
+they are or merged."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -57,9 +58,9 @@ class Exported:
 @pytest.fixture(scope="module", params=CASES, ids=["-".join(map(str, case)) for case in CASES])
 def exported(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory) -> Exported:
     """One export of each case."""
-    name, view, horizon = request.param
+    name, view, horizon, preset = request.param
     folder = tmp_path_factory.mktemp("exported")
-    run = save_random(folder / "run", name, view, horizon=horizon, temperature=1.7)
+    run = save_random(folder / "run", name, view, horizon=horizon, preset=preset, temperature=1.7)
     write_onnx(f"{name}:{run}", folder / "file.onnx")
     plug: LearnedPlug = registry.find("predictors", name)
     predictor = load_learned(plug, str(run))

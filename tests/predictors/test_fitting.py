@@ -15,11 +15,13 @@ from asp_env.data.snippets import SnippetIndex, gather_scene, index_snippets
 from asp_env.data.source import Recordings, open_data
 from asp_env.errors import AspEnvError
 from predictors import training_data
-from predictors.calibration import calibrate, fit_temperature
+from predictors.calibration import fit_temperature
+from predictors.chaining import Chaining
 from predictors.fitting import train
 from predictors.learned import Learned
 from predictors.lightning_parts import one_cycle
 from predictors.modes import best_mode
+from predictors.ssp_asp import SSPASPNetwork
 from predictors.training_data import VALIDATION_BATCH, open_training_data
 from tests.predictors.tiny import tiny_config, tiny_network, write_data
 
@@ -79,23 +81,25 @@ def test_what_merges_modes_is_calibrated_before_and_after(data: str, tmp_path: P
     predictor = load_predictor(f"ssp-asp:{run}", horizon=15, dt_s=0.2)
     assert isinstance(predictor, Learned)
     network = predictor.network
+    assert isinstance(network, SSPASPNetwork)
     found = network.merging_temperature
     assert found is not None
     shown = open_training_data(config, data).validation
     batches = shown.batches(
         predictor.view, size=VALIDATION_BATCH, later_ticks=network.later_ticks, config=config
     )
-    logits, best = [], []
-    with torch.inference_mode():
-        for batch, labels in batches:
-            modes = network.unmerged(batch)
-            logits.append(modes.logits.numpy())
-            best.append(best_mode(modes.states[..., :2], labels.states[..., :2], "distance"))
-    expected = fit_temperature(np.concatenate(logits), np.concatenate(best))
-    assert float(found) == pytest.approx(expected, rel=1e-5)
-    assert abs(expected - 1) > 1e-3
     told = json.loads((run / "config.json").read_text())["temperature"]
-    assert calibrate(network, batches) == pytest.approx(told, rel=1e-4)
+    both: tuple[tuple[Chaining, float], ...] = (("full", float(found)), ("beam", told))
+    for chaining, temperature in both:
+        logits, best = [], []
+        with torch.inference_mode():
+            for batch, labels in batches:
+                modes = network.chain(batch, chaining)
+                logits.append(modes.logits.numpy())
+                best.append(best_mode(modes.states[..., :2], labels.states[..., :2], "distance"))
+        expected = fit_temperature(np.concatenate(logits), np.concatenate(best))
+        assert temperature == pytest.approx(expected, rel=1e-3)
+        assert abs(temperature - 1) > 1e-2
 
 
 def test_finished_run_is_refused(data: str, finished: Path) -> None:

@@ -1,6 +1,7 @@
 """SSP-ASP: what chains of segments are at 6 s, and that training chains them as inference does."""
 
 import dataclasses
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -12,11 +13,19 @@ from asp_env.dynamics import rollout
 from asp_env.errors import AspEnvError
 from predictors.batch import Batch, Labels
 from predictors.chaining import Chains, merge
+from predictors.checkpoint import load_learned
 from predictors.modes import best_mode, into_frame, mode_terms
 from predictors.network import Modes, Moment
-from predictors.ssp_asp import SSPASPConfig, SSPASPNetwork
+from predictors.ssp_asp import SSPASP, SSPASPConfig, SSPASPNetwork
 from predictors.vector_encoder import VectorTensors
-from tests.predictors.tiny import RANGE, draw_samples, make_network, tiny_network, tiny_shape
+from tests.predictors.tiny import (
+    RANGE,
+    draw_samples,
+    make_network,
+    save_random,
+    tiny_network,
+    tiny_shape,
+)
 
 ROWS = (3, 8, 20, 30, 41, 55)
 END = Moment(share=1.0)
@@ -83,7 +92,7 @@ def test_beam_is_the_best_of_full(sample: tuple[Batch, Labels]) -> None:
 
 def merging(horizon: int, temperature: float) -> SSPASPNetwork:
     """One that keeps three modes, with what calibration would have found."""
-    network = ssp(horizon=horizon, kept=3)
+    network = ssp(horizon=horizon, kept=3, spread_mps=0.8)
     found = network.merging_temperature
     assert found is not None
     found.fill_(temperature)
@@ -98,7 +107,7 @@ def test_merged_are_all_chains_made_calm(
     """Of all chains at p^(1/T), scaled to sum to one, 0.8 m/s times the horizon apart."""
     network = merging(horizon, temperature)
     with torch.no_grad():
-        full, few = network.unmerged(sample[0]), network(sample[0])
+        full, few = network.chain(sample[0], "full"), network(sample[0])
     calm = (full.logits.exp() ** (1 / temperature)).log().log_softmax(dim=1)
     assert full.actions is not None
     every = Chains(full.states, full.actions, calm, torch.zeros(*calm.shape, 1))
@@ -117,11 +126,26 @@ def test_what_is_merged_at_6_s_goes_on_to_9_s(sample: tuple[Batch, Labels]) -> N
     torch.testing.assert_close(nine.logits.exp().sum(dim=1), torch.ones(6))
 
 
+def test_all_chains_are_calibrated_as_such(sample: tuple[Batch, Labels], tmp_path: Path) -> None:
+    """`RUN@full` of what merges divides by the temperature of all chains, not of those kept."""
+    run = save_random(
+        tmp_path / "run", "ssp-asp", "vectors", horizon=30, preset="ours", temperature=1.7
+    )
+    full, kept = (load_learned(SSPASP, f"{run}@{chaining}") for chaining in ("full", "beam"))
+    network = full.network
+    assert isinstance(network, SSPASPNetwork)
+    with torch.no_grad():
+        chains, few = (network.chain(sample[0], each) for each in ("full", "beam"))
+        torch.testing.assert_close(full.modes(sample[0]).logits, chains.logits)
+        calm = (few.logits / 1.7).log_softmax(dim=1)
+        torch.testing.assert_close(kept.modes(sample[0]).logits, calm)
+
+
 def test_only_what_merges_has_a_temperature_of_its_own() -> None:
     """The paper's network has no such weight; that of one that merges begins at 1."""
     assert ssp().merging_temperature is None
-    assert "temperature" not in ssp().state_dict()
-    assert float(ssp(kept=3).state_dict()["temperature"]) == 1
+    assert "merging_temperature" not in ssp().state_dict()
+    assert float(ssp(kept=3).state_dict()["merging_temperature"]) == 1
 
 
 @pytest.mark.parametrize("chaining", ["top1", "oracle"])

@@ -114,11 +114,12 @@ def save_random(
     *,
     horizon: int = 15,
     seed: int = 0,
+    preset: str = "cpu",
     temperature: float = 1.0,
 ) -> Path:
     """A checkpoint of a tiny network with random weights; the folder."""
     plug: LearnedPlug = registry.find("predictors", predictor)
-    config, shape = tiny_network(predictor, view), tiny_shape(view, horizon)
+    config, shape = tiny_network(predictor, view, preset=preset), tiny_shape(view, horizon)
     network = make_network(predictor, config, shape, seed=seed)
     folder.mkdir(parents=True)
     save_learned(

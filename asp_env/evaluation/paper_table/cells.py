@@ -167,8 +167,13 @@ def _changed(site: str, view: str, ablation: Ablation, horizon_s: float, seed: i
         if SEGMENT_S in ablation.horizons_s:
             start = _changed(site, view, ablation, SEGMENT_S, seed)
         else:
-            entrant = Entrant(predictor=ablation.predictor, goes_on=True)
-            start = _base(site, view, entrant, SEGMENT_S, seed)
+            start = Cell(
+                site=site,
+                predictor=ablation.predictor,
+                view=view,
+                horizon_s=SEGMENT_S,
+                seed=seed,
+            )
     return Cell(
         site=site,
         predictor=ablation.predictor,

@@ -99,6 +99,11 @@ class Job:
                 "delete it to train it again, or choose another --out"
             )
         start = self.train.get("start")
+        if start is None and provenance.get("start") is not None:
+            raise AspEnvError(
+                f"{out} went on from another run, the recipe now learns from the start: delete it "
+                "to train it again, or choose another --out"
+            )
         if start is None or not (Path(start) / FINISHED).exists():
             return
         if provenance.get("start") != cache.digest(Path(start) / WEIGHTS):
