@@ -12,6 +12,7 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
+from asp_env.dynamics import wrap_angle
 from predictors.modes import Assignment, best_mode
 
 Chaining = Literal["beam", "top1", "full", "oracle"]
@@ -83,24 +84,37 @@ def merge(chains: Chains, keep: int, scale_m: float) -> Chains:
     ends), with the standard deviation `scale_m`. The first one kept stands for most: it is the peak
     of the distribution over trajectories, which one chain that happens to be the most probable need
     not be near. It takes from the others what it stands for; then the next is found likewise.
+
+    Returns:
+        With the mean states and features of what runs near those kept, by the same Gaussian at half
+        the scale. Their actions are still those of the chains kept: infer them anew.
     """
     at = chains.states[..., :2]
     apart_m = torch.linalg.vector_norm(at[:, :, None] - at[:, None], dim=-1).mean(dim=-1)
     near = (-0.5 * (2 * apart_m / scale_m).square()).exp()
     left = chains.log_probs.exp()
     taken = torch.zeros_like(left)
-    rows, masses = [], []
+    rows, masses, shares = [], [], []
     for _ in range(min(keep, left.shape[1])):
         stands_for = (near * left[:, None]).sum(dim=-1)
         # A sum of probabilities is one at most: what is taken comes last.
         row = (stands_for - 2 * taken).argmax(dim=1, keepdim=True)
         told = near.gather(1, row[:, :, None].expand(-1, 1, near.shape[2]))[:, 0]
+        own = torch.zeros_like(left).scatter(1, row, MIN_MASS)
+        share = told**4 * left + own  # half the scale: the fourth power of the Gaussian
         rows.append(row)
         masses.append(stands_for.gather(1, row))
+        shares.append(share / share.sum(dim=1, keepdim=True))
         left = left * (1 - told)
         taken = taken.scatter(1, row, 1.0)
     log_probs = (torch.cat(masses, dim=1) + MIN_MASS).log().log_softmax(dim=1)
-    return pick(chains, torch.cat(rows, dim=1))._replace(log_probs=log_probs)
+    share = torch.stack(shares, dim=1)
+    kept = pick(chains, torch.cat(rows, dim=1))
+    turned = wrap_angle(chains.states[:, None, ..., 2] - kept.states[:, :, None, :, 2])
+    heading = kept.states[..., 2] + (share[..., None] * turned).sum(dim=2)
+    means = (share @ chains.states.flatten(2)).view_as(kept.states)
+    states = torch.stack([means[..., 0], means[..., 1], heading, means[..., 3]], dim=-1)
+    return kept._replace(states=states, log_probs=log_probs, z=share @ chains.z)
 
 
 def pick(chains: Chains, rows: Int[Tensor, "n k"]) -> Chains:

@@ -25,6 +25,7 @@ from jaxtyping import Float
 from torch import Tensor, nn
 from torch.nn import functional
 
+from asp_env.dynamics import clip_actions, inverse
 from asp_env.errors import AspEnvError
 from predictors.batch import Batch, Labels
 from predictors.chaining import Chaining, Chains, grow, merge, prune, starts
@@ -38,6 +39,7 @@ from predictors.network import (
     Modes,
     Moment,
     NetworkShape,
+    drive,
     drive_from,
     start_states,
 )
@@ -115,13 +117,13 @@ class SSPASPNetwork(AbstractNetwork):
         with torch.autocast(z.device.type, enabled=False):
             past = self.scaled_actions(batch.actions)
             chains = self._segment(Place(z, past, start_states(batch), batch.length_m))
-            chains = self._kept(chains, chaining)
+            chains = self._kept(chains, chaining, batch)
             for _ in self.later_ticks[1:]:
                 chains = starts(chains, chaining, label=label, assignment=self.config.assignment)
-                chains = self._kept(grow(chains, self._go_on(chains, batch)), chaining)
+                chains = self._kept(grow(chains, self._go_on(chains, batch)), chaining, batch)
         return Modes(chains.states, chains.log_probs, chains.actions)
 
-    def _kept(self, chains: Chains, chaining: Chaining) -> Chains:
+    def _kept(self, chains: Chains, chaining: Chaining, batch: Batch) -> Chains:
         count, ticks = chains.states.shape[1:3]
         temperature = self.merging_temperature
         if temperature is None or chaining == "full":
@@ -132,7 +134,22 @@ class SSPASPNetwork(AbstractNetwork):
             return chains
         calm = chains._replace(log_probs=(chains.log_probs / temperature).log_softmax(dim=1))
         few = merge(calm, kept, self._options.spread_mps * ticks * self.shape.dt_s)
-        return few if ended else few._replace(log_probs=few.log_probs * temperature)
+        if not ended:
+            few = few._replace(log_probs=few.log_probs * temperature)
+        return self._driven(few, batch)
+
+    def _driven(self, chains: Chains, batch: Batch) -> Chains:
+        """What a bicycle can drive of chains of mean states: the actions to heading and speed.
+
+        Their features, means as well, are normalised again.
+        """
+        dt_s, integrator = self.shape.dt_s, self._options.integrator
+        start = start_states(batch)[:, None, None].expand(-1, chains.states.shape[1], 1, -1)
+        before = torch.cat([start, chains.states[:, :, :-1]], dim=2)
+        lengths = batch.length_m[:, None, None]
+        actions = clip_actions(inverse(before, chains.states, lengths, dt_s, integrator=integrator))
+        z = self._normalised(chains.z.flatten(0, 1)).view_as(chains.z)
+        return chains._replace(states=drive(actions, batch, dt_s, integrator), actions=actions, z=z)
 
     def encode(self, batch: Batch) -> Float[Tensor, "n z"]:
         """φ."""

@@ -31,8 +31,8 @@ class SSPASPConfig(NetworkConfig):
     before in place of the one matched to the label."""
     kept: int = 0
     """Of all modes, how many a forecast keeps: those that most of the others run near, apart from
-    each other, with the probability of what is near. 0 keeps every mode, or in a beam the most
-    probable chains."""
+    each other, as the mean and with the probability of what is near. 0 keeps every mode, or in a
+    beam the most probable chains."""
     spread_mps: float = 0.4
     """How near that is, for each second ahead: the standard deviation in `chaining.merge`."""
     action_weight: float = 1.0

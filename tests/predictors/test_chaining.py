@@ -124,13 +124,18 @@ def test_targets_are_chained_apart(first: Chains) -> None:
 
 
 def ending_at(places: list[float], probabilities: list[float]) -> Chains:
-    """Chains of one target that end at (x, 0)."""
+    """Chains of one target that end at (x, 0); actions and features hold the number of a row."""
     states = torch.zeros(1, len(places), 2, 4)
     states[0, :, -1, 0] = torch.tensor(places)
-    features = torch.arange(float(len(places)))[None, :, None]
+    rows = torch.arange(float(len(places)))[None, :, None]
     return Chains(
-        states, torch.zeros(1, len(places), 2, 2), torch.tensor([probabilities]).log(), features
+        states, rows[..., None].repeat(1, 1, 2, 2), torch.tensor([probabilities]).log(), rows
     )
+
+
+def rows_of(kept: Chains) -> list[int]:
+    """Which chains of one target were kept."""
+    return kept.actions[0, :, 0, 0].long().tolist()
 
 
 HALF_M = math.sqrt(2 / math.log(2))
@@ -144,11 +149,26 @@ def test_the_first_chain_is_the_peak_of_the_distribution() -> None:
     0.125, of which the first stands for 0.2 + 0.125/16; the last keeps 15/16 of its 0.125.
     """
     kept = merge(ending_at([0.0, 2.0, 4.0], [0.4, 0.35, 0.25]), 3, HALF_M)
-    assert kept.states[0, :, -1, 0].tolist() == [2.0, 0.0, 4.0]
-    assert kept.z[0, :, 0].tolist() == [1.0, 0.0, 2.0]
+    assert rows_of(kept) == [1, 0, 2]
     np.testing.assert_allclose(
         kept.log_probs.exp()[0], [0.675, 0.2078125, 0.1171875], atol=2 * MIN_MASS
     )
+
+
+def test_what_is_kept_is_the_mean_of_what_runs_near() -> None:
+    """At half the scale, 2 m away is a sixteenth: (0.35 · 2 + 0.25/16 · 4) / 0.390625 = 1.952 m.
+
+    Its features are 0.976 likewise. The others stand alone with what is left, headings and speeds
+    of two alike ones are half-way between, across the turn from π to -π too.
+    """
+    kept = merge(ending_at([0.0, 2.0, 4.0], [0.4, 0.35, 0.25]), 3, HALF_M)
+    np.testing.assert_allclose(kept.states[0, :, -1, 0], [1.952, 0.0, 4.0], atol=1e-3)
+    np.testing.assert_allclose(kept.z[0, :, 0], [0.976, 0.0, 2.0], atol=1e-3)
+    alike = ending_at([0.0, 0.0], [0.5, 0.5])
+    alike.states[0, :, -1, 2] = torch.tensor([math.pi - 0.1, 0.3 - math.pi])
+    alike.states[0, :, -1, 3] = torch.tensor([4.0, 6.0])
+    first = merge(alike, 1, HALF_M).states[0, 0, -1]
+    np.testing.assert_allclose(first[2:], [math.pi + 0.1, 5.0], atol=1e-3)
 
 
 def test_chains_are_compared_along_their_way() -> None:
@@ -158,7 +178,7 @@ def test_chains_are_compared_along_their_way() -> None:
     states[0, 2, :, 0] = 50.0
     chains = ending_at([0.0, 0.0, 50.0], [0.3, 0.3, 0.4])._replace(states=states)
     kept = merge(chains, 3, HALF_M)
-    assert kept.z[0, :, 0].tolist() == [2.0, 0.0, 1.0]
+    assert rows_of(kept) == [2, 0, 1]
     np.testing.assert_allclose(
         kept.log_probs.exp()[0], [0.4, 0.3 + 0.3 / 16, 0.3 * 15 / 16], atol=2 * MIN_MASS
     )
@@ -167,7 +187,8 @@ def test_chains_are_compared_along_their_way() -> None:
 def test_merging_keeps_as_many_as_asked() -> None:
     """Where all run together the others follow, with next to none left to them."""
     kept = merge(ending_at([0.0, 0.01, 0.02, 0.03], [0.1, 0.2, 0.4, 0.3]), 3, 1.0)
-    assert kept.states[0, 0, -1, 0].item() == pytest.approx(0.02)
+    assert rows_of(kept)[0] == 2
+    assert kept.states[0, 0, -1, 0].item() == pytest.approx(0.019, abs=1e-4)
     probabilities = kept.log_probs.exp()[0]
     assert float(probabilities[0]) > 0.999
     assert float(probabilities.sum()) == pytest.approx(1, abs=1e-6)
@@ -175,16 +196,17 @@ def test_merging_keeps_as_many_as_asked() -> None:
 
 @given(st.integers(0, 10_000), st.integers(1, 6), st.integers(1, 7))
 def test_merged_chains_are_among_the_chains(seed: int, count: int, keep: int) -> None:
-    """Each is one of them, none twice, the first stands for most, and all sum to one."""
+    """None is kept twice, the first stands for most, and all sum to one; means lie between."""
     rng = np.random.default_rng(seed)
-    probabilities = rng.dirichlet(np.ones(count))
-    chains = ending_at(rng.uniform(0, 5, count).tolist(), probabilities.tolist())
-    kept = merge(chains, keep, 1.0)
-    rows = kept.z[0, :, 0].long().tolist()
+    probabilities, places = rng.dirichlet(np.ones(count)), rng.uniform(0, 5, count)
+    kept = merge(ending_at(places.tolist(), probabilities.tolist()), keep, 1.0)
+    rows = rows_of(kept)
     assert len(rows) == len(set(rows)) == min(keep, count)
     assert float(kept.log_probs.exp().sum()) == pytest.approx(1, abs=1e-5)
     assert int(kept.log_probs[0].argmax()) == 0
     assert float(kept.log_probs[0, 0]) >= np.log(probabilities.max()) - 1e-2
+    ends = kept.states[0, :, -1, 0]
+    assert places.min() - 1e-4 <= float(ends.min()) <= float(ends.max()) <= places.max() + 1e-4
 
 
 @given(st.integers(0, 10_000), st.integers(1, 6))
@@ -194,5 +216,6 @@ def test_merging_does_not_read_the_order(seed: int, count: int) -> None:
     chains = ending_at(rng.uniform(0, 5, count).tolist(), rng.dirichlet(np.ones(count)).tolist())
     order = torch.from_numpy(rng.permutation(count))[None]
     kept, again = merge(chains, 3, 1.0), merge(pick(chains, order), 3, 1.0)
-    assert torch.equal(kept.z, again.z)
+    assert rows_of(kept) == rows_of(again)
+    torch.testing.assert_close(kept.states, again.states)
     torch.testing.assert_close(kept.log_probs, again.log_probs)

@@ -9,7 +9,7 @@ import pytest
 import torch
 
 from asp_env.data.geometry import states_to_frame
-from asp_env.dynamics import rollout
+from asp_env.dynamics import clip_actions, rollout
 from asp_env.errors import AspEnvError
 from predictors.batch import Batch, Labels
 from predictors.chaining import Chains, merge
@@ -104,7 +104,10 @@ def merging(horizon: int, temperature: float) -> SSPASPNetwork:
 def test_merged_are_all_chains_made_calm(
     horizon: int, temperature: float, sample: tuple[Batch, Labels]
 ) -> None:
-    """Of all chains at p^(1/T), scaled to sum to one, 0.8 m/s times the horizon apart."""
+    """Of all chains at p^(1/T), scaled to sum to one, by 0.8 m/s times the horizon.
+
+    Their speeds are the mean ones, which accelerations within the limits reach.
+    """
     network = merging(horizon, temperature)
     with torch.no_grad():
         full, few = network.chain(sample[0], "full"), network(sample[0])
@@ -112,18 +115,24 @@ def test_merged_are_all_chains_made_calm(
     assert full.actions is not None
     every = Chains(full.states, full.actions, calm, torch.zeros(*calm.shape, 1))
     expected = merge(every, 3, 0.8 * 0.2 * horizon)
-    assert few.states.shape == (6, 3, horizon, 4)
-    assert torch.equal(few.states, expected.states)
     torch.testing.assert_close(few.logits, expected.log_probs)
+    np.testing.assert_allclose(few.states[..., 3], expected.states[..., 3], atol=1e-3)
 
 
-def test_what_is_merged_at_6_s_goes_on_to_9_s(sample: tuple[Batch, Labels]) -> None:
-    """Every chain of 9 s begins with one of the three that a forecast of 6 s keeps."""
+@pytest.mark.parametrize("horizon", [15, 30, 45])
+def test_what_is_kept_can_be_driven(horizon: int, sample: tuple[Batch, Labels]) -> None:
+    """Three modes of any number of segments are rollouts of their actions, to 1e-4."""
     with torch.no_grad():
-        six, nine = merging(30, 2.5)(sample[0]), merging(45, 2.5)(sample[0])
-    apart_m = (nine.states[:, :, None, :30, :2] - six.states[:, None, ..., :2]).abs()
-    assert float(apart_m.amax(dim=(3, 4)).amin(dim=2).max()) < 1e-5
-    torch.testing.assert_close(nine.logits.exp().sum(dim=1), torch.ones(6))
+        few: Modes = merging(horizon, 2.5)(sample[0])
+    assert few.actions is not None
+    assert few.actions.shape == (6, 3, horizon, 2)
+    assert torch.equal(few.actions, clip_actions(few.actions))
+    start = torch.zeros(6, 3, 4, dtype=torch.float64)
+    start[..., 3] = sample[0].motion[:, :1]
+    lengths = sample[0].length_m[:, None].double()
+    whole = rollout(start, few.actions.double(), lengths, 0.2, integrator="heun")
+    np.testing.assert_allclose(few.states, whole, atol=1e-4)
+    torch.testing.assert_close(few.logits.exp().sum(dim=1), torch.ones(6))
 
 
 def test_all_chains_are_calibrated_as_such(sample: tuple[Batch, Labels], tmp_path: Path) -> None:
