@@ -1,8 +1,8 @@
 """Every predictor as the conformance suite tries it, and the situations that it is asked about.
 
 Each that can be trained is tried on pictures and on vectors, with random weights, and what chains
-segments with every chaining at 6 s. A predictor is tried by being registered, and in the recipes if
-it is trained.
+segments with every chaining at 6 s; so are the recipes `ours`, on vectors. A predictor is tried by
+being registered, and in the recipes if it is trained.
 """
 
 from functools import cache
@@ -42,6 +42,8 @@ class Case(NamedTuple):
     """Of learned ones."""
     chaining: str = ""
     """Of those that chain segments."""
+    preset: str = ""
+    """Of those whose recipe is not `cpu`."""
 
     @property
     def horizon(self) -> int:
@@ -59,14 +61,17 @@ class Case(NamedTuple):
             return self.name
         run = folder / self.label
         if not run.exists():
-            save_random(run, self.name, self.view, horizon=self.horizon, seed=seed)
+            preset = self.preset or "cpu"
+            save_random(run, self.name, self.view, horizon=self.horizon, seed=seed, preset=preset)
         return f"{self.name}:{run}" + (f"@{self.chaining}" if self.chaining else "")
 
 
 PHYSICAL = tuple(Case(name) for name in registry.names("predictors") if name not in RECIPES)
 ONE_SEGMENT = tuple(Case(name, view) for name in RECIPES for view in VIEWS)
 CHAINED = tuple(Case("ssp-asp", "vectors", chaining) for chaining in CHAININGS)
-LEARNED = ONE_SEGMENT + CHAINED
+OURS = tuple(Case(name, "vectors", preset="ours") for name, of in RECIPES.items() if "ours" in of)
+OURS_CHAINED = tuple(Case("ssp-asp", "vectors", chaining, "ours") for chaining in CHAININGS)
+LEARNED = ONE_SEGMENT + CHAINED + OURS + OURS_CHAINED
 
 
 def tried(cases: tuple[Case, ...]) -> pytest.MarkDecorator:
