@@ -41,7 +41,7 @@ class Train:
     split: Literal["recording", "blocks"] = "recording"
     """What is held out: whole recordings, or blocks of time within each."""
     epochs: int | None = None
-    """Instead of the preset's."""
+    """Instead of the preset's; of each stage where there are two."""
     seed: int = 0
     """Of the initial weights and the order of the data."""
     max_snippets: int | None = None

@@ -74,7 +74,7 @@ class Table:
     per_recording: int | None = None
     """Test snippets of each recording at most, at random."""
     epochs: int | None = None
-    """Instead of the preset's."""
+    """Instead of the preset's; of each stage where there are two."""
     max_snippets: int | None = None
     """Learn from no more than so many, chosen at random."""
 
