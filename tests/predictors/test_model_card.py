@@ -97,7 +97,7 @@ def test_numbers_of_a_run(run: Path) -> None:
         "| best epoch | 3 |",
         "| selected by | 1.235 m, the lowest of all epochs",
         "| versions | numpy 2.4.6, torch 2.13.0 |",
-        "one temperature, 1.7, on the validation data",
+        "a temperature, 1.7, on the validation data",
         "CC BY-NC-SA",
     ):
         assert said in card, said
