@@ -1,8 +1,10 @@
 """Whether two things that environments return are the same, bit for bit."""
 
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
+from gymnasium.vector import AutoresetMode
 
 
 def same(one: Any, other: Any, path: str = "") -> None:
@@ -24,3 +26,30 @@ def same(one: Any, other: Any, path: str = "") -> None:
             assert one.tobytes() == other.tobytes(), f"{path}: {one} and {other}"
     else:
         assert one == other, f"{path}: {one} and {other}"
+
+
+def same_through_ends(
+    one: Any, other: Any, mode: AutoresetMode, actions: Sequence[np.ndarray]
+) -> int:
+    """Two batches return the same bits through their episodes' ends; how many there were."""
+    same(one.reset(seed=3), other.reset(seed=3))
+    ends = 0
+    for each in actions:
+        told = one.step(each)
+        same(told, other.step(each))
+        over = told[2] | told[3]
+        ends += int(over.sum())
+        if mode is AutoresetMode.DISABLED and over.any():
+            told = one.reset(options={"reset_mask": over.copy()})
+            same(told, other.reset(options={"reset_mask": over.copy()}))
+    return ends
+
+
+def same_alone(one: Any, other: Any, seed: int) -> None:
+    """The only agent of a parallel environment is told what a single one tells its ego."""
+    rng = np.random.default_rng(seed)
+    same([part["vehicle_0"] for part in one.reset(seed=seed)], list(other.reset(seed=seed)))
+    while one.agents:
+        action = rng.uniform(-0.3, 0.6, 2)
+        told = one.step({"vehicle_0": action})
+        same([part["vehicle_0"] for part in told], list(other.step(action)))

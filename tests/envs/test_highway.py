@@ -18,7 +18,7 @@ from stable_baselines3.common.vec_env import DummyVecEnv
 
 import asp_env
 from asp_env.envs.replay import ReplayEnv
-from tests.envs.same import same
+from tests.envs.same import same, same_alone, same_through_ends
 from tests.envs.traces import PARTS, make, trace, trace_vector
 from tests.highway_folders import SITE_NAMES, highway_data
 
@@ -62,18 +62,9 @@ def test_equals_single_environments_bit_for_bit(site, mode):
     other = gymnasium.make_vec(
         IDS[site], vectorization_mode="sync", vector_kwargs={"autoreset_mode": mode}, **given
     )
-    same(one.reset(seed=3), other.reset(seed=3))
-    rng, ends = np.random.default_rng(0), 0
-    for _ in range(18):
-        actions = rng.uniform((0.0, -0.5), (1.0, 0.5), size=(3, 2)).astype(np.float32)
-        told = one.step(actions)
-        same(told, other.step(actions))
-        over = told[2] | told[3]
-        ends += int(over.sum())
-        if mode is AutoresetMode.DISABLED and over.any():
-            told = one.reset(options={"reset_mask": over.copy()})
-            same(told, other.reset(options={"reset_mask": over.copy()}))
-    assert ends > 3
+    rng = np.random.default_rng(0)
+    drawn = [rng.uniform((0.0, -0.5), (1.0, 0.5), size=(3, 2)) for _ in range(18)]
+    assert same_through_ends(one, other, mode, [each.astype(np.float32) for each in drawn]) > 3
 
 
 def test_the_same_bits_in_another_process_and_beside_other_worlds():
@@ -143,12 +134,7 @@ def test_a_lone_agent_is_the_ego_of_the_single_environment(site):
     one = asp_env.parallel_env(highway_data(site), max_agents=1, **LITTLE)
     other = ReplayEnv(highway_data(site), **LITTLE)
     for seed in range(2):
-        rng = np.random.default_rng(seed)
-        same([part["vehicle_0"] for part in one.reset(seed=seed)], list(other.reset(seed=seed)))
-        while one.agents:
-            action = rng.uniform(-0.3, 0.6, 2)
-            told = one.step({"vehicle_0": action})
-            same([part["vehicle_0"] for part in told], list(other.step(action)))
+        same_alone(one, other, seed)
 
 
 @every_site

@@ -17,7 +17,7 @@ from asp_env.envs.parallel import ParallelReplayEnv
 from asp_env.envs.replay import ReplayEnv
 from tests.builders import Drive
 from tests.crossing_files import write_crossing
-from tests.envs.same import same
+from tests.envs.same import same, same_alone
 from tests.real_data import real_data
 
 with warnings.catch_warnings():  # PettingZoo's tests import its games by a way it calls old
@@ -77,12 +77,7 @@ def test_a_lone_agent_is_the_ego_of_the_single_environment(crossing, traffic):
     }  # fmt: skip
     one, other = _make(crossing, max_agents=1, **options), ReplayEnv(crossing, **options)
     for seed in range(4):
-        rng = np.random.default_rng(seed)
-        same([part["vehicle_0"] for part in one.reset(seed=seed)], list(other.reset(seed=seed)))
-        while one.agents:
-            action = rng.uniform(-0.3, 0.6, 2)
-            told = one.step({"vehicle_0": action})
-            same([part["vehicle_0"] for part in told], list(other.step(action)))
+        same_alone(one, other, seed)
 
 
 def test_each_agent_sees_what_it_would_see_as_the_ego(crossing):

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from gymnasium.vector import AutoresetMode, SyncVectorEnv, VectorEnv
 
-from tests.envs.same import same
+from tests.envs.same import same_through_ends
 
 ALL = ("raster", "vectors", "actions", "state", "route")
 COUNT = 4
@@ -47,15 +47,5 @@ def test_equals_single_environments_bit_for_bit(crossing, traffic, mode):
     """Observations, rewards, endings and infos through many autoresets, in every mode."""
     one = _batched(crossing, traffic=traffic, observations=ALL, autoreset_mode=mode)
     other = _singles(crossing, mode, traffic=traffic, observations=ALL)
-    same(one.reset(seed=3), other.reset(seed=3))
-    rng, ends = np.random.default_rng(0), 0
-    for _ in range(100):
-        actions = _actions(rng)
-        told = one.step(actions)
-        same(told, other.step(actions))
-        over = told[2] | told[3]
-        ends += int(over.sum())
-        if mode is AutoresetMode.DISABLED and over.any():
-            told = one.reset(options={"reset_mask": over.copy()})
-            same(told, other.reset(options={"reset_mask": over.copy()}))
-    assert ends > 2 * COUNT
+    rng = np.random.default_rng(0)
+    assert same_through_ends(one, other, mode, [_actions(rng) for _ in range(100)]) > 2 * COUNT
