@@ -7,9 +7,8 @@ Importing this package registers the Gymnasium environments `asp_env/Replay-v0`,
 import gymnasium
 
 from asp_env.data.source import load
-from asp_env.envs.entry import parallel_env, sb3_vec_env
-from asp_env.envs.flat import FlatParts
-from asp_env.envs.prediction_features import PredictionFeatures, VectorPredictionFeatures
+from asp_env.envs.registration import parallel_env, sb3_vec_env
+from asp_env.envs.wrappers import FlatParts, PredictionFeatures, VectorPredictionFeatures
 from asp_env.errors import AspEnvError
 
 __all__ = [

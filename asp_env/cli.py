@@ -16,6 +16,15 @@ from asp_env.errors import AspEnvError
 
 BAD_INPUT = 2
 
+RENAMED_OPTIONS = {
+    ("drive", "--most"): "--max-scenarios",
+    ("drive", "--metrics"): "--rules",
+    ("train", "--preset"): "--recipe",
+    ("train", "--drawing"): "--num-workers",
+    ("table", "--preset"): "--recipe",
+}
+"""Old names of options, by command. They work for one more release, with a warning."""
+
 
 def main(argv: Sequence[str] | None = None) -> int:
     """Runs one command; 0 on success, 2 with one line on stderr for bad input."""
@@ -26,7 +35,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     name, rest = given[0], given[1:]
     try:
         command = registry.find("commands", name)
-        _parse(name, command, rest).run()
+        _parse(name, command, _with_current_names(name, rest)).run()
     except AspEnvError as error:
         return _refuse(str(error))
     except OSError as error:
@@ -36,6 +45,19 @@ def main(argv: Sequence[str] | None = None) -> int:
         sys.stderr.write("asp-env: interrupted\n")
         return 130
     return 0
+
+
+def _with_current_names(command: str, args: Sequence[str]) -> list[str]:
+    """Replaces deprecated options, each with a warning on stderr."""
+    current: list[str] = []
+    for arg in args:
+        option, equals, value = arg.partition("=")
+        renamed = RENAMED_OPTIONS.get((command, option))
+        if renamed is not None:
+            sys.stderr.write(f"asp-env: {option} is deprecated; use {renamed}\n")
+            arg = f"{renamed}{equals}{value}"
+        current.append(arg)
+    return current
 
 
 def _parse(name: str, command: Any, rest: Sequence[str]) -> Any:

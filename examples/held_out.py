@@ -32,7 +32,7 @@ def train_and_compare(
 ) -> Scores:
     """Trains PPO, and drives up to `count` scenarios of each held-out DATA with it and without."""
     if train_on.startswith("runs/") and not Path(train_on).exists():
-        from scenarios.synthetic import synthesize
+        from scenarios.sumo import synthesize
 
         places = {"recordings": 8, "locations": 8, "minutes": 3.0, "seed": 11}
         synthesize(Path(train_on), site="intersection", **places)

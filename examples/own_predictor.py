@@ -4,7 +4,7 @@ from typing import ClassVar
 
 import numpy as np
 
-from asp_env.data.forecast import Forecast, fill_missing, make_forecast
+from asp_env.data.predictor import Forecast, fill_missing, make_forecast
 from asp_env.data.scene import Scene
 from asp_env.data.snippets import Future
 from asp_env.dynamics import MAX_ACCELERATION_MPS2, MAX_STEERING_RAD, rollout
@@ -21,7 +21,7 @@ class Braking:
     history = 1
     horizon = 15
     trained_on = None
-    about: ClassVar[dict[str, str]] = {}
+    metadata: ClassVar[dict[str, str]] = {}
 
     def predict(self, scene: Scene, future: Future | None = None) -> Forecast:
         """Two modes for every target, through the bicycle model."""

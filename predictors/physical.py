@@ -7,12 +7,13 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 from asp_env.data.classes import PREDICTED
-from asp_env.data.forecast import Forecast, constant_velocity, make_forecast
-from asp_env.data.parts import TrainedOn
+from asp_env.data.predictor import Forecast, constant_velocity, make_forecast
 from asp_env.data.scene import Scene
 from asp_env.data.snippets import Future
-from asp_env.dynamics import clip_actions, inverse, rollout, wrap_angle
+from asp_env.data.split import TrainedOn
+from asp_env.dynamics import clip_actions, inverse, rollout
 from asp_env.errors import AspEnvError
+from asp_env.geometry import wrap_angle
 
 TURN_OVER_S = 0.6
 """The present yaw rate is the mean over this time: one step of 0.2 s is mostly noise."""
@@ -30,7 +31,7 @@ class ConstantVelocity:
     history: int = 0
 
     @property
-    def about(self) -> Mapping[str, str]:
+    def metadata(self) -> Mapping[str, str]:
         """Nothing: it is not trained."""
         return {}
 
@@ -77,7 +78,7 @@ class ConstantTurnRate:
         return max(1, round(TURN_OVER_S / self.dt_s))
 
     @property
-    def about(self) -> Mapping[str, str]:
+    def metadata(self) -> Mapping[str, str]:
         """Nothing: it is not trained."""
         return {}
 
@@ -131,7 +132,7 @@ class Oracle:
     history: int = 0
 
     @property
-    def about(self) -> Mapping[str, str]:
+    def metadata(self) -> Mapping[str, str]:
         """Nothing: it is not trained."""
         return {}
 

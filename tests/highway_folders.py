@@ -6,7 +6,7 @@ import tempfile
 from functools import cache
 from pathlib import Path
 
-from asp_env.data.scenario import ScenarioSet, find_scenarios
+from asp_env.data.scenarios.scenario import ScenarioSet, find_scenarios
 from asp_env.data.source import Recordings, open_data
 from scenarios.highway.dataset import synthesize
 from scenarios.highway.sites import SITES

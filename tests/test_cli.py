@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 
 from asp_env import registry
-from asp_env.cli import main
+from asp_env.cli import RENAMED_OPTIONS, main
 from asp_env.errors import AspEnvError
 
 
@@ -61,7 +61,7 @@ def test_an_unknown_command_is_refused(capsys):
         (["x"], "--out PATH"),
         ([], "Missing from asp-env drive"),
         (["x", "--out", "o", "--horizon", "long"], "could not convert string to float: 'long'"),
-        (["x", "--out", "o", "--most", "1.5"], "--most"),
+        (["x", "--out", "o", "--max-scenarios", "1.5"], "--max-scenarios"),
         (["x", "--out", "o", "--part", "some"], "'some'"),
     ],
     ids=["unknown", "too many", "missing option", "nothing", "no number", "no integer", "no part"],
@@ -105,7 +105,7 @@ def test_an_unwritable_output_is_refused(capsys, tmp_path, command):
         (["--dt", "nan"], "expected a positive number"),
         (["--horizon", "inf"], "expected a positive number"),
         (["--horizon", "-1"], "expected a positive number"),
-        (["--most", "0"], "expected at least 1"),
+        (["--max-scenarios", "0"], "expected at least 1"),
     ],
     ids=lambda value: "-".join(value) if isinstance(value, list) else None,
 )
@@ -180,3 +180,20 @@ def test_the_installed_command_exits_with_the_status():
     )
     assert (done.returncode, done.stdout) == (2, "")
     assert done.stderr == "asp-env: /dev/null: exists already; choose another --out or remove it\n"
+
+
+@pytest.mark.parametrize(("command", "old"), RENAMED_OPTIONS)
+def test_deprecated_options_warn_and_work(
+    command: str, old: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """An old name is taken like the new one, as two words or with an equals sign."""
+    new = RENAMED_OPTIONS[command, old]
+    fields = {
+        "--" + name.replace("_", "-") for name in registry.find("commands", command).__annotations__
+    }
+    assert new in fields
+    assert old not in fields
+    assert main([command, old, "no-such-value", f"{old}=another"]) == 2
+    lines = capsys.readouterr().err.splitlines()
+    assert lines[:2] == [f"asp-env: {old} is deprecated; use {new}"] * 2
+    assert "Unrecognized" not in lines[-1]

@@ -65,7 +65,7 @@ def test_names(group: registry.Group, name: str) -> None:
 
 def test_find_gives_the_object() -> None:
     """`expert` is the class that the entry point names."""
-    from asp_env.planning.expert import Expert
+    from asp_env.planning.planner import Expert
 
     assert registry.find("planners", "expert") is Expert
 

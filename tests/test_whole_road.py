@@ -52,7 +52,7 @@ def test_drives_are_logged_and_the_expert_stands_first(
 ) -> None:
     """The logged driver keeps to its log: no divergence, all of the way, nothing at fault."""
     out = tmp_path / "driven"
-    options = ["--predictors", f"ffw-asp:{run}", "--most", "2", "--out", str(out)]
+    options = ["--predictors", f"ffw-asp:{run}", "--max-scenarios", "2", "--out", str(out)]
     assert main(["drive", str(traffic), *options]) == 0
     expert = {r["metric"]: float(r["value"]) for r in _rows(out) if r["planner"] == "expert"}
     assert _rows(out)[0]["planner"] == "expert"

@@ -11,13 +11,13 @@ import hashlib
 import json
 import os
 import tempfile
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from asp_env.errors import DataError
+from asp_env.errors import AspEnvError, DataError
 
 FORMAT = 5
 """Raise whenever a reader makes something else of the same files."""
@@ -180,3 +180,33 @@ def _header(
         if needed <= start:
             return header.ljust(start - len(_MAGIC) - 8), start
         start = _aligned(needed)
+
+
+def get_or_create(shelf_name: str, name: str, make: Callable[[Path], None]) -> Path:
+    """A folder of the cache, made if it is not there yet.
+
+    Several processes may ask at once: the first to finish wins, the others take what it made.
+
+    Args:
+        shelf_name: what kind of folder it is.
+        name: of the folder; another one for other content.
+        make: makes the content in a new folder.
+
+    Raises:
+        AspEnvError: the cache folder cannot be written.
+    """
+    shelf = cache_folder() / shelf_name
+    folder = shelf / name
+    if folder.is_dir():
+        return folder
+    try:
+        shelf.mkdir(parents=True, exist_ok=True)
+        with tempfile.TemporaryDirectory(dir=shelf, prefix=f".{name}-") as aside:
+            made = Path(aside) / "made"
+            make(made)
+            if not folder.is_dir():
+                os.rename(made, folder)
+    except OSError as error:
+        if not folder.is_dir():  # else another process was faster
+            raise AspEnvError(f"cannot write to {shelf}: {error.strerror or error}") from error
+    return folder

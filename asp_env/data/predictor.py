@@ -1,13 +1,108 @@
-"""The socket for predictors, and how one is named: `name` or `name:RUN_DIR`."""
+"""What a predictor says of its targets.
 
+MERGED: The socket for predictors, and how one is named: `name` or `name:RUN_DIR`.
+"""
+
+import dataclasses
 from collections.abc import Mapping
+from dataclasses import dataclass
 from typing import Protocol, runtime_checkable
 
+import numpy as np
+from jaxtyping import Bool, Float, Int
+
 from asp_env import registry
-from asp_env.data.forecast import Forecast
-from asp_env.data.parts import TrainedOn
 from asp_env.data.scene import Scene
 from asp_env.data.snippets import Future
+from asp_env.data.split import TrainedOn
+from asp_env.dynamics import rollout
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Forecast:
+    """M modes of T ticks for each of N targets; step 0 is one tick ahead of the scene."""
+
+    states: Float[np.ndarray, "t m steps 4"]
+    """[x m, y m, heading rad, speed m/s] in the recording's frame."""
+    actions: Float[np.ndarray, "t m steps 2"]
+    actions_valid: Bool[np.ndarray, " t"]
+    """False for a predictor that forecasts no actions."""
+    log_probs: Float[np.ndarray, "t m"]
+    """Natural logarithms of the modes' probabilities, which sum to one."""
+    ids: Int[np.ndarray, " t"]
+    targets: Int[np.ndarray, "t 2"]
+    """(situation, slot) in the scene."""
+    tick: Int[np.ndarray, " t"]
+    """The scene's tick, so that a late forecast can be matched."""
+    valid: Bool[np.ndarray, " t"]
+    """False for agents that this predictor does not forecast; their rows are zeros."""
+    dt_s: float
+
+    @property
+    def probabilities(self) -> Float[np.ndarray, "t m"]:
+        """The modes' probabilities."""
+        return np.exp(self.log_probs)
+
+    @property
+    def most_probable(self) -> Int[np.ndarray, " t"]:
+        """The index of each target's most probable mode; the first one of equals."""
+        return self.log_probs.argmax(axis=-1)
+
+
+def make_forecast(
+    scene: Scene,
+    *,
+    states: Float[np.ndarray, "t m steps 4"],
+    actions: Float[np.ndarray, "t m steps 2"] | None,
+    log_probs: Float[np.ndarray, "t m"],
+    valid: Bool[np.ndarray, " t"],
+) -> Forecast:
+    """A forecast of the scene's targets, zeroed where not valid."""
+    at = (scene.targets[:, 0], scene.targets[:, 1])
+    keep = valid[:, None, None, None]
+    has_actions = actions is not None
+    if actions is None:
+        actions = np.zeros((*states.shape[:-1], 2), dtype=states.dtype)
+    return Forecast(
+        states=np.where(keep, states, 0).astype(np.float32),
+        actions=np.where(keep, actions, 0).astype(np.float32),
+        actions_valid=valid & has_actions,
+        log_probs=log_probs.astype(np.float32),
+        ids=scene.ids[at],
+        targets=scene.targets,
+        tick=scene.tick[scene.targets[:, 0]],
+        valid=valid,
+        dt_s=scene.dt_s,
+    )
+
+
+def constant_velocity(scene: Scene, *, steps: int) -> Float[np.ndarray, "t steps 4"]:
+    """Each target goes on straight at its present speed: zero actions through the bicycle."""
+    at = (scene.targets[:, 0], scene.targets[:, 1])
+    now = scene.states[at][:, -1]
+    actions = np.zeros((len(now), steps, 2), dtype=now.dtype)
+    lengths = np.maximum(scene.sizes[at][:, 0], 0.1)
+    return rollout(now, actions, lengths, scene.dt_s, reverse=True)
+
+
+def fill_missing(forecast: Forecast, scene: Scene) -> Forecast:
+    """The forecast with constant velocity, in every mode alike, for targets that it leaves out.
+
+    For planners and drivers, which need a word on everybody who is there now.
+    """
+    at = (scene.targets[:, 0], scene.targets[:, 1])
+    fill = ~forecast.valid & scene.valid[at][:, -1]
+    if not fill.any():
+        return forecast
+    straight = constant_velocity(scene, steps=forecast.states.shape[2])[:, None]
+    states = np.where(fill[:, None, None, None], straight, forecast.states)
+    alike = np.float32(-np.log(forecast.log_probs.shape[1]))
+    return dataclasses.replace(
+        forecast,
+        states=states.astype(np.float32),
+        log_probs=np.where(fill[:, None], alike, forecast.log_probs),
+        valid=forecast.valid | fill,
+    )
 
 
 @runtime_checkable
@@ -45,7 +140,7 @@ class Predictor(Protocol):
         ...
 
     @property
-    def about(self) -> Mapping[str, str]:
+    def metadata(self) -> Mapping[str, str]:
         """For tables and manifests: `trained_on`, `view`, `preset`, `weights`, as they apply."""
         ...
 

@@ -1,8 +1,10 @@
 """What the road looks like at one place, in its recording's metric frame."""
 
+from collections import OrderedDict
+from collections.abc import Callable
 from dataclasses import dataclass, field
 from enum import IntEnum
-from typing import Any
+from typing import Any, Generic, TypeVar, final
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
@@ -111,3 +113,33 @@ class RoadMap:
             return (0.0, 0.0, 1.0, 1.0)
         low, high = points.min(axis=0), points.max(axis=0)
         return (float(low[0]), float(low[1]), float(high[0]), float(high[1]))
+
+
+Made = TypeVar("Made")
+
+
+@final
+class MapCache(Generic[Made]):
+    """A function of a road map that remembers its latest results, by the identity of the map."""
+
+    def __init__(self, make: Callable[[RoadMap], Made], size: int = 512) -> None:
+        """Creates an empty cache.
+
+        Args:
+            make: the function.
+            size: number of maps; the least recently used one is forgotten first.
+        """
+        self._make = make
+        self._size = size
+        self._entries: OrderedDict[int, tuple[RoadMap, Made]] = OrderedDict()
+
+    def __call__(self, road_map: RoadMap) -> Made:
+        """The value of `make(road_map)`."""
+        key = id(road_map)
+        # The entry holds its map, so that an id cannot pass to another map while the entry lives.
+        if key not in self._entries:
+            self._entries[key] = (road_map, self._make(road_map))
+            while len(self._entries) > self._size:
+                self._entries.popitem(last=False)
+        self._entries.move_to_end(key)
+        return self._entries[key][1]

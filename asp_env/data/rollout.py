@@ -15,7 +15,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 
 from asp_env.data.classes import AgentClass
-from asp_env.data.scenario import Scenario
+from asp_env.data.scenarios.scenario import Scenario
 from asp_env.errors import DataError
 
 FORMAT = 1

@@ -11,6 +11,9 @@ from asp_env.data.road_map import RoadMap
 from asp_env.dynamics import inverse
 from asp_env.errors import AspEnvError
 
+EGO = 0
+"""The slot of the ego."""
+
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Scene:

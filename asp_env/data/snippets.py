@@ -6,8 +6,7 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
-from asp_env.data.clock import frames_per_tick, ticks
-from asp_env.data.recording import Recording
+from asp_env.data.recording import Recording, frames_per_tick, ticks
 from asp_env.data.scene import Scene, infer_actions
 
 HISTORY_S = 3.0

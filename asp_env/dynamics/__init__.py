@@ -1,7 +1,13 @@
-"""The ground floor: how a vehicle moves. One definition for NumPy and torch."""
+"""Dynamics: the kinematic bicycle model, for NumPy and torch, and the intelligent driver model."""
 
-from asp_env.dynamics.bicycle import forward, inverse, rollout, wrap_angle
-from asp_env.dynamics.limits import MAX_ACCELERATION_MPS2, MAX_STEERING_RAD, clip_actions
+from asp_env.dynamics.bicycle import (
+    MAX_ACCELERATION_MPS2,
+    MAX_STEERING_RAD,
+    clip_actions,
+    forward,
+    inverse,
+    rollout,
+)
 
 __all__ = [
     "MAX_ACCELERATION_MPS2",
@@ -10,5 +16,4 @@ __all__ = [
     "forward",
     "inverse",
     "rollout",
-    "wrap_angle",
 ]

@@ -13,7 +13,10 @@ from typing import Any, Literal
 import numpy as np
 from jaxtyping import Float
 
-from asp_env.dynamics.limits import MAX_STEERING_RAD, namespace
+from asp_env.geometry import namespace, wrap_angle
+
+MAX_ACCELERATION_MPS2 = 5.0
+MAX_STEERING_RAD = math.pi / 4
 
 Integrator = Literal["heun", "euler"]
 
@@ -24,15 +27,6 @@ STANDSTILL_MPS = 0.5
 """Below this mean speed a change of heading says nothing of the steering, which is then 0."""
 
 _MAX_SIN_SLIP = math.sin(math.atan(0.5 * math.tan(MAX_STEERING_RAD)))
-
-
-def wrap_angle(angle_rad: Any) -> Any:
-    """The same angle in [-π, π); π itself only where rounding says so.
-
-    One that lies there already stays as it is, bit for bit.
-    """
-    turns = namespace(angle_rad).floor((angle_rad + math.pi) / (2 * math.pi))
-    return angle_rad - 2 * math.pi * turns
 
 
 def forward(
@@ -158,3 +152,11 @@ def inverse(
     sin_slip = xp.clip(rear_m * turned / (safe_mean * dt_s), -_MAX_SIN_SLIP, _MAX_SIN_SLIP)
     steering = xp.arctan(2.0 * sin_slip / xp.sqrt(1.0 - sin_slip * sin_slip))
     return xp.stack([acceleration, xp.where(moves, steering, xp.zeros_like(steering))], axis=-1)
+
+
+def clip_actions(actions: Float[Any, "*batch 2"]) -> Float[Any, "*batch 2"]:
+    """Actions [acceleration m/s², steering rad] moved to the nearest that is allowed."""
+    xp = namespace(actions)
+    acceleration = xp.clip(actions[..., 0], -MAX_ACCELERATION_MPS2, MAX_ACCELERATION_MPS2)
+    steering = xp.clip(actions[..., 1], -MAX_STEERING_RAD, MAX_STEERING_RAD)
+    return xp.stack([acceleration, steering], axis=-1)

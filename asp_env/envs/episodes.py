@@ -1,6 +1,11 @@
-"""Episodes of recordings as the environments drive them: one core, of any number side by side."""
+"""Memory for observations that is used again once nobody holds it.
+
+MERGED: Which scenarios an environment draws from, and the one that a reset asks for.
+MERGED: Episodes of recordings as the environments drive them: one core, of any number side by side.
+"""
 
 import dataclasses
+import sys
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
@@ -9,22 +14,167 @@ import numpy as np
 from gymnasium import spaces
 from jaxtyping import Bool, Float, Int, Shaped
 
-from asp_env.data.clock import DEFAULT_DT_S, ticks
-from asp_env.data.scenario import Scenario, ScenarioSet
-from asp_env.data.scenario_filter import ScenarioFilter
+from asp_env.data.recording import DEFAULT_DT_S, ticks
+from asp_env.data.scenarios.scenario import Scenario, ScenarioFilter, ScenarioSet
+from asp_env.data.scenarios.selection import choose_scenarios, scenario_of
 from asp_env.data.snippets import HISTORY_S
-from asp_env.data.source import open_data
+from asp_env.data.source import Recordings, open_data
 from asp_env.dynamics import MAX_ACCELERATION_MPS2, MAX_STEERING_RAD
-from asp_env.envs.start import Starts
 from asp_env.errors import AspEnvError, unknown_name
-from asp_env.sim.observation import Observation, Observer
+from asp_env.sim.observation import Observation, Observer, ego_context
 from asp_env.sim.reward import reward_terms, weighted_sum, weights_from
-from asp_env.sim.sight import ego_sight
 from asp_env.sim.simulation import Simulation, ending
-from asp_env.sim.traffic import TrafficSpec, make_traffic
-from asp_env.sim.world import Ending, Events
-from asp_env.sim.worlds import world_of
+from asp_env.sim.traffic.assignment import TrafficSpec, make_traffic
+from asp_env.sim.world import Ending, Events, world_of
 from asp_env.views import make_picture_view
+
+
+def _references(held: list[Observation], number: int, name: str) -> int:
+    """How many references there are to one array, this function's own among them."""
+    return sys.getrefcount(held[number][name])
+
+
+class Buffers:
+    """Hands out arrays for observations; none again while anybody else holds it or a part of it.
+
+    Fresh memory of large pictures costs as much time as drawing them, since the system has to find
+    and clear it page by page. NumPy arrays and tensors that share an array's memory keep a
+    reference to it, so an array that has no reference but this object's own is free.
+    """
+
+    _KEPT = 3
+    """The caller often still holds the last observations while it asks for the next."""
+
+    def __init__(self, observer: Observer, count: int) -> None:
+        """Of that many observations each."""
+        self._observer = observer
+        self._count = count
+        self._held: list[Observation] = []
+        self._alone = _references([{"": np.empty(0)}], 0, "")
+
+    def take(self) -> Observation:
+        """Arrays whose content does not matter; the caller owns them while it holds them."""
+        for number, arrays in enumerate(self._held):
+            if all(_references(self._held, number, name) == self._alone for name in arrays):
+                self._held.append(self._held.pop(number))
+                return dict(arrays)
+        fresh = self._observer.memory(self._count)
+        self._held.append(fresh)
+        del self._held[: -self._KEPT]
+        return dict(fresh)
+
+
+OPTIONS = ("scenario", "start_tick", "ego")
+"""What `reset(options=…)` understands."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class ScenarioSampler:
+    """Where episodes of some recordings may begin."""
+
+    recordings: Recordings
+    scenarios: ScenarioSet
+
+    @classmethod
+    def choose(
+        cls,
+        recordings: Recordings,
+        wanted: ScenarioSet | ScenarioFilter | str,
+        *,
+        dt_s: float,
+        history: int,
+    ) -> "ScenarioSampler":
+        """The scenarios to draw from: those that fit a filter or its words, or those given.
+
+        Raises:
+            AspEnvError: there is none, or those given are of other data or another time step.
+        """
+        data = recordings.source
+        if isinstance(wanted, ScenarioSet):
+            _check(wanted, recordings, dt_s=dt_s, history=history)
+            return cls(recordings=recordings, scenarios=wanted)
+        found = choose_scenarios(recordings, str(wanted), dt_s=dt_s, history=history)
+        if not len(found):
+            raise AspEnvError(
+                f"{data}: no vehicle covers 10 m in 4 s after 3 s of history; use other recordings"
+            )
+        return cls(recordings=recordings, scenarios=found)
+
+    def __deepcopy__(self, memo: dict[int, Any]) -> "ScenarioSampler":
+        """Itself, since nothing of it ever changes."""
+        del memo
+        return self
+
+    def find(self, options: Mapping[str, Any], drawn: int) -> Scenario:
+        """The scenario that the options of a reset ask for, else the drawn one.
+
+        `scenario` is a number or a name. `ego` is the track id of any vehicle, in the recording of
+        the scenario; `start_tick` the tick of the first observation. Without a start the episode
+        begins as soon as the history is there; it lasts as long as the track, 15 s at most.
+
+        Raises:
+            AspEnvError: an option is unknown, or what it asks for does not exist.
+        """
+        for name in options:
+            if name not in OPTIONS:
+                raise unknown_name("reset option", str(name), OPTIONS)
+        asked = options.get("scenario")
+        given = self.scenarios[drawn] if asked is None else self._asked(asked)
+        ego, start_tick = options.get("ego"), options.get("start_tick")
+        if ego is None and start_tick is None:
+            return given
+        if asked is None and ego is None:
+            raise AspEnvError(
+                f"start_tick {start_tick} alone: name the scenario or the ego that starts there"
+            )
+        if asked is None and len(self.recordings) > 1:
+            raise AspEnvError(
+                f"ego {ego} without a scenario: {self.scenarios.source} has "
+                f"{len(self.recordings)} recordings; name a scenario of the one that is meant"
+            )
+        return scenario_of(
+            self.recordings,
+            source=self.scenarios.source,
+            recording=given.recording,
+            ego_id=given.ego_id if ego is None else _whole("ego", ego),
+            start_tick=None if start_tick is None else _whole("start_tick", start_tick),
+            dt_s=self.scenarios.dt_s,
+            history=self.scenarios.history,
+        )
+
+    def _asked(self, asked: Any) -> Scenario:
+        if isinstance(asked, str):
+            return self.scenarios.by_name(asked)
+        whole = isinstance(asked, int | np.integer) and not isinstance(asked, bool)
+        if not (whole and 0 <= asked < len(self.scenarios)):
+            raise AspEnvError(
+                f"scenario {asked}: expected 0 to {len(self.scenarios) - 1} for this data, or a "
+                "scenario's name"
+            )
+        return self.scenarios[int(asked)]
+
+
+def _check(given: ScenarioSet, recordings: Recordings, *, dt_s: float, history: int) -> None:
+    if not len(given):
+        raise AspEnvError("scenarios: the set is empty; expected at least one scenario")
+    names = tuple(recording.name for recording in recordings)
+    if given.recordings != names:
+        raise AspEnvError(
+            f"scenarios of {given.source}: expected some of {recordings.source}, whose recordings "
+            f"are {', '.join(names)}"
+        )
+    if abs(given.dt_s - dt_s) > 1e-9 or given.history != history:
+        raise AspEnvError(
+            f"scenarios for {given.history} past ticks of {given.dt_s:g} s: expected {history} of "
+            f"{dt_s:g} s"
+        )
+
+
+def _whole(name: str, value: Any) -> int:
+    if not isinstance(value, int | np.integer) or isinstance(value, bool):
+        raise AspEnvError(f"{name} {value!r}: expected a whole number")
+    return int(value)
+
 
 _ACTION_LIMITS = np.array([MAX_ACCELERATION_MPS2, MAX_STEERING_RAD], dtype=np.float32)
 _TERMINAL = np.array([kind in (Ending.COLLISION, Ending.OFF_ROAD, Ending.GOAL) for kind in Ending])
@@ -52,7 +202,7 @@ class ReplayOptions:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Outcome:
+class StepResult:
     """What a step of B episodes led to."""
 
     reward: Float[np.ndarray, " b"]
@@ -81,7 +231,7 @@ class ReplayEpisodes:
         chosen = _options(options)
         history = ticks(HISTORY_S, chosen.dt_s)
         self.recordings = open_data(data)
-        self._starts = Starts.choose(
+        self._starts = ScenarioSampler.choose(
             self.recordings, chosen.scenarios, dt_s=chosen.dt_s, history=history
         )
         self.scenarios = self._starts.scenarios
@@ -156,7 +306,7 @@ class ReplayEpisodes:
             self._tags[b] = None if scenario is None else scenario.tags
         self.events = world.events()
 
-    def step(self, actions: Float[np.ndarray, "b 2"]) -> Outcome:
+    def step(self, actions: Float[np.ndarray, "b 2"]) -> StepResult:
         """One tick; actions in [-1, 1]."""
         world, before = self.simulation.world, self.events
         assert before is not None
@@ -166,7 +316,7 @@ class ReplayEpisodes:
         self.events = after = world.events()
         terms = reward_terms(before, after, states_before, world.ego_states(), world.dt_s)
         why = ending(after)
-        return Outcome(
+        return StepResult(
             reward=weighted_sum(terms, self._weights),
             terms=terms,
             terminated=_TERMINAL[why],
@@ -180,7 +330,7 @@ class ReplayEpisodes:
         """What the egos of some episodes see now, by default of all; into `out` if given."""
         assert self.events is not None
         events = self.events if rows is None else _rows(self.events, rows)
-        return self.observer.observe(ego_sight(self.simulation.world, rows), events, out)
+        return self.observer.observe(ego_context(self.simulation.world, rows), events, out)
 
     def info(self) -> dict[str, Shaped[np.ndarray, " b"]]:
         """What is told beside the observation, in fresh arrays."""

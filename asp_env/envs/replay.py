@@ -9,16 +9,15 @@ import gymnasium
 import numpy as np
 from jaxtyping import Float, Shaped
 
-from asp_env.data.forecast import Forecast
+from asp_env.data.predictor import Forecast
 from asp_env.data.recording import Background
-from asp_env.data.scenario import Scenario, ScenarioSet
+from asp_env.data.scenarios.scenario import Scenario, ScenarioSet
 from asp_env.data.scene import Scene
 from asp_env.data.snippets import Future
 from asp_env.data.source import Recordings
-from asp_env.envs.episodes import Outcome, ReplayEpisodes, as_actions
+from asp_env.envs.episodes import ReplayEpisodes, StepResult, as_actions
 from asp_env.render.live import MODES, Live
-from asp_env.sim.recorded import recorded_future
-from asp_env.sim.scenario_world import ScenarioWorld
+from asp_env.sim.world import World, recorded_future
 
 NOT_BEGUN = "no episode has begun: call reset first"
 METADATA = {"render_modes": [*MODES], "render_fps": 5}
@@ -76,7 +75,7 @@ points, fields as `LINE_FIELDS`, in the ego's frame |
     | `actions` | `actions`: `Box(±[10, π/4], (15, 2), float32)` | acceleration m/s² and steering \
 rad of the last 3 s, oldest first, inferred from the motion |
     | `state` | `state`: `Box(…, (9,), float32)` | fields and bounds in \
-`asp_env.sim.observed.STATE_FIELDS`: speed m/s, acceleration m/s², steering rad, offset to the \
+`asp_env.sim.observation.STATE_FIELDS`: speed m/s, acceleration m/s², steering rad, offset to the \
 left of the route m, heading error rad, share of the route done, way to the goal m, length m, \
 width m |
     | `route` | `route`: `Box(±1000, (30, 2), float32)` | points 2, 4, … 60 m ahead on the ego's \
@@ -236,7 +235,7 @@ way, in its frame, m; beyond the end of the way straight on |
             gymnasium.error.ResetNeeded: no episode has begun.
             AspEnvError: it is not of this scene, or not finite.
         """
-        self._live.tell(self.scene(), forecast, plan)
+        self._live.set_overlay(self.scene(), forecast, plan)
         if self.render_mode == "human":
             self.render()
 
@@ -270,7 +269,7 @@ way, in its frame, m; beyond the end of the way straight on |
 
     def _keep_up(self) -> None:
         if self.render_mode == "human":
-            self._live.keep_up(self.scene(), self._background())
+            self._live.update(self.scene(), self._background())
 
     def _background(self) -> Background | None:
         return self.recordings[int(self._world().episodes.recording[0])].background
@@ -289,7 +288,7 @@ way, in its frame, m; beyond the end of the way straight on |
         self._start, self._actions = (scenario, rng.bit_generator.state), []
         self._episodes.begin([scenario], [rng], np.ones(1, dtype=bool))
 
-    def _act(self, action: Float[np.ndarray, " 2"]) -> Outcome:
+    def _act(self, action: Float[np.ndarray, " 2"]) -> StepResult:
         self._actions.append(action)
         return self._episodes.step(action[None])
 
@@ -299,7 +298,7 @@ way, in its frame, m; beyond the end of the way straight on |
     def _info(self) -> dict[str, Any]:
         return {name: value.tolist()[0] for name, value in self._episodes.info().items()}
 
-    def _world(self) -> ScenarioWorld:
+    def _world(self) -> World:
         if self._start is None:
             raise gymnasium.error.ResetNeeded(NOT_BEGUN)
         return self._episodes.simulation.world

@@ -11,16 +11,15 @@ from gymnasium.vector import AutoresetMode, VectorEnv
 from gymnasium.vector.utils import batch_space
 from jaxtyping import Bool, Shaped
 
-from asp_env.data.scenario import ScenarioSet
+from asp_env.data.scenarios.scenario import ScenarioSet
 from asp_env.data.scene import Scene
 from asp_env.data.snippets import Future
 from asp_env.data.source import Recordings
-from asp_env.envs.buffers import Buffers
-from asp_env.envs.episodes import Outcome, ReplayEpisodes, as_actions
+from asp_env.envs.episodes import Buffers, ReplayEpisodes, StepResult, as_actions
 from asp_env.errors import AspEnvError
 from asp_env.render.frames import draw_frame
 from asp_env.sim.observation import Observation
-from asp_env.sim.recorded import recorded_future
+from asp_env.sim.world import recorded_future
 
 Infos = dict[str, Any]
 
@@ -136,7 +135,7 @@ class ReplayVectorEnv(VectorEnv[Observation, Any, np.ndarray]):
         return self._observe(), reward, terminated, truncated, infos
 
     def _finish_same_step(
-        self, outcome: Outcome
+        self, outcome: StepResult
     ) -> tuple[Observation, np.ndarray, np.ndarray, np.ndarray, Infos]:
         """Resets what is over at once; what it ended with goes into the infos."""
         over = outcome.terminated | outcome.truncated
@@ -309,7 +308,7 @@ def _of_env(options: dict[str, Any], b: int, num_envs: int) -> dict[str, Any]:
     return chosen
 
 
-def _told(outcome: Outcome) -> Infos:
+def _told(outcome: StepResult) -> Infos:
     return {"reward_terms": dict(outcome.terms), "ending": outcome.ending}
 
 

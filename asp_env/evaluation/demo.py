@@ -13,12 +13,12 @@ from rich.console import Console
 
 from asp_env import registry
 from asp_env.errors import AspEnvError
-from asp_env.evaluation.closed_loop import Drive, drive, save_rollouts
-from asp_env.evaluation.open_loop import Evaluate, evaluate
-from asp_env.evaluation.output import output_folder, write_manifest, write_metrics
+from asp_env.evaluation.closed_loop.drive import Drive, drive, save_rollouts
+from asp_env.evaluation.open_loop.evaluate import Evaluate, evaluate
 from asp_env.evaluation.report import check_report_possible, write_report
+from asp_env.evaluation.results import output_folder, write_manifest, write_metrics
 from asp_env.evaluation.tables import driving_table, open_loop_tables
-from asp_env.metrics.presets import DEFAULT_PRESET, PRESETS
+from asp_env.metrics.driving.rules import DEFAULT_PRESET, RULES
 
 SITE = "intersection"
 PREDICTOR = "ffw-asp"
@@ -26,13 +26,13 @@ TRAINING = {"recordings": 30, "minutes": 2.5, "seed": 0, "locations": 6}
 HELD_OUT = {"recordings": 9, "minutes": 2.0, "seed": 48_271}
 """Traffic of other seeds, so of other places; no predictor sees it before it is judged."""
 SCENARIOS = 48
-PRESET = "ours"
+RECIPE = "ours"
 PLAN = {
     "site": SITE,
     "training": TRAINING,
     "held_out": HELD_OUT,
     "predictor": PREDICTOR,
-    "preset": PRESET,
+    "preset": RECIPE,
     "asp-env": metadata.version("asp-env"),
 }
 """What a demo's folder is made by; kept in it, so that another demo's remains are not taken up."""
@@ -67,7 +67,7 @@ class Demo:
         run = self.out / PREDICTOR
         if not (run / "config.json").exists():
             console.rule(f"training {PREDICTOR}")
-            _command("train", predictor=PREDICTOR, data=str(training), out=run, preset=PRESET)
+            _command("train", predictor=PREDICTOR, data=str(training), out=run, recipe=RECIPE)
         console.rule("judging forecasts and driving")
         trained = f"{PREDICTOR}:{run}"
         opened = evaluate(
@@ -82,7 +82,7 @@ class Demo:
                 data=str(held_out),
                 out=self.out,
                 predictors=("oracle", "constant-velocity", trained),
-                most=SCENARIOS,
+                max_scenarios=SCENARIOS,
             )
         )
         with _replacing(self.out) as folder:
@@ -106,9 +106,7 @@ class Demo:
             )
         for table in (
             *open_loop_tables(opened.rows, opened.manifest["privileged"]),
-            driving_table(
-                closed.rows, closed.manifest["privileged"], PRESETS[DEFAULT_PRESET].shown
-            ),
+            driving_table(closed.rows, closed.manifest["privileged"], RULES[DEFAULT_PRESET].shown),
         ):
             console.print(table)
         console.print(f"wrote {self.out / 'report.html'}")

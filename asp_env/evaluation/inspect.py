@@ -1,4 +1,7 @@
-"""`asp-env inspect`: what DATA holds, and every fault found in it."""
+"""How far inferred actions lead away from the log: the floor of every action-space predictor.
+
+MERGED: `asp-env inspect`: what DATA holds, and every fault found in it.
+"""
 
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -6,22 +9,59 @@ from typing import Annotated
 
 import numpy as np
 import tyro
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, Int
 from rich.console import Console
 from rich.progress import track
 from rich.table import Table
 
 from asp_env.data.classes import AgentClass
-from asp_env.data.clock import DEFAULT_DT_S, frames_per_tick, ticks
-from asp_env.data.recording import Recording
+from asp_env.data.recording import DEFAULT_DT_S, Recording, frames_per_tick, ticks
 from asp_env.data.road_map import RoadMap
-from asp_env.data.scenario import ScenarioSet, find_scenarios
-from asp_env.data.scenario_tags import COLUMNS, TAGS
+from asp_env.data.scenarios.scenario import ScenarioSet, find_scenarios
+from asp_env.data.scenarios.tags import COLUMNS, TAGS
+from asp_env.data.scene import infer_actions
 from asp_env.data.snippets import EVERY_S, HISTORY_S, find_snippets
 from asp_env.data.source import Recordings, open_data
+from asp_env.dynamics import rollout
 from asp_env.errors import DataError
-from asp_env.evaluation.drift import drift_m
 from asp_env.metrics.drivable import CELL_M, drivable_field
+from asp_env.metrics.forecast.errors import moving
+
+_CHUNK = 10_000
+
+
+def drift_m(
+    recording: Recording,
+    tracks: Int[np.ndarray, " n"],
+    ticks: Int[np.ndarray, " n"],
+    *,
+    dt_s: float,
+    horizon: int,
+) -> tuple[Float[np.ndarray, " n"], Bool[np.ndarray, " n"]]:
+    """Distance between the log and the rollout of its own actions after `horizon` ticks.
+
+    From the logged state at each (track, tick) the actions inferred from the following states
+    are rolled out (Heun), and the positions at the end compared. The tracks must last that long.
+
+    Returns:
+        Metres, and which of the vehicles move: over 1 m/s at the start, or displaced over 2 m.
+    """
+    stride = frames_per_tick(recording.frame_rate_hz, dt_s)
+    metres, moves = [np.zeros(0)], [np.zeros(0, dtype=bool)]
+    for start in range(0, len(tracks), _CHUNK):
+        some = slice(start, start + _CHUNK)
+        track = tracks[some]
+        begin = recording.starts[track] - recording.first_frames[track] + ticks[some] * stride
+        rows = begin[:, None] + np.arange(horizon + 1) * stride
+        states = recording.states[rows].astype(np.float64)
+        lengths_m = recording.sizes[track, 0].astype(np.float64)
+        known = np.ones(rows.shape, dtype=bool)
+        actions = infer_actions(states, known, lengths_m, dt_s)
+        driven = rollout(states[:, 0], actions, lengths_m, dt_s, reverse=True)
+        metres.append(np.hypot(*(driven[:, -1, :2] - states[:, -1, :2]).T))
+        moves.append(moving(states[:, 0], states[:, 1:, :2], known[:, 1:]))
+    return np.concatenate(metres), np.concatenate(moves)
+
 
 HORIZONS_S = (3.0, 6.0)
 PERCENTILES = (50, 90, 99)

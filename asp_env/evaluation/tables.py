@@ -5,8 +5,8 @@ from collections.abc import Collection, Sequence
 from rich import box
 from rich.table import Table
 
-from asp_env.evaluation.entrants import short_names
-from asp_env.evaluation.output import Row
+from asp_env.evaluation.results import Row
+from asp_env.evaluation.selection import short_names
 
 OPEN_LOOP = {"FDE": "FDE m", "FDE / constant velocity": "FDE / const. vel."}
 OPEN_LOOP_SHORT = {"ADE": "ADE m", "miss": "miss"}

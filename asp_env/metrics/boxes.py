@@ -10,8 +10,9 @@ from numba import njit
 
 from asp_env.data.classes import AgentClass
 from asp_env.dynamics.bicycle import AXLE_SHARE_OF_LENGTH
+from asp_env.geometry import overlaps, turned_overlaps
 
-STANDING_MPS = 0.05
+AT_REST_MPS = 0.05
 """At or below this speed nuPlan calls a vehicle stopped."""
 
 BEHIND_RAD = math.radians(150.0)
@@ -44,44 +45,6 @@ TOWING = (
 """Classes that may have a trailer of their own."""
 
 
-@njit(cache=True, inline="always")
-@no_type_check
-def _separated(
-    dx, dy, cos, sin, half_length, half_width, cos_o, sin_o, half_length_o, half_width_o
-):
-    """Whether an axis of the first box keeps the boxes apart; (dx, dy) leads to the second."""
-    ahead = abs(cos * dx + sin * dy)
-    left = abs(cos * dy - sin * dx)
-    along = abs(cos * cos_o + sin * sin_o)
-    across = abs(cos * sin_o - sin * cos_o)
-    if ahead >= half_length + along * half_length_o + across * half_width_o:
-        return True
-    return left >= half_width + across * half_length_o + along * half_width_o
-
-
-@njit(cache=True)
-@no_type_check
-def turned_overlaps(x, y, cos, sin, length, width, x_o, y_o, cos_o, sin_o, length_o, width_o):
-    """`overlaps` of boxes whose headings are given by cosine and sine."""
-    dx, dy = x_o - x, y_o - y
-    half, wide, half_o, wide_o = 0.5 * length, 0.5 * width, 0.5 * length_o, 0.5 * width_o
-    if _separated(dx, dy, cos, sin, half, wide, cos_o, sin_o, half_o, wide_o):
-        return False
-    return not _separated(-dx, -dy, cos_o, sin_o, half_o, wide_o, cos, sin, half, wide)
-
-
-@njit(cache=True)
-@no_type_check
-def overlaps(x, y, heading, length, width, x_o, y_o, heading_o, length_o, width_o):
-    """Whether two oriented boxes intersect (separating axis theorem); touching is no overlap."""
-    dx, dy = x_o - x, y_o - y
-    reach = 0.5 * (math.hypot(length, width) + math.hypot(length_o, width_o))
-    if dx * dx + dy * dy >= reach * reach:
-        return False
-    c, s, co, so = math.cos(heading), math.sin(heading), math.cos(heading_o), math.sin(heading_o)
-    return turned_overlaps(x, y, c, s, length, width, x_o, y_o, co, so, length_o, width_o)
-
-
 @njit(cache=True)
 @no_type_check
 def is_behind(x, y, heading, length, x_o, y_o):
@@ -96,9 +59,9 @@ def is_behind(x, y, heading, length, x_o, y_o):
 @no_type_check
 def _kind(x, y, heading, speed, length, width, x_o, y_o, heading_o, speed_o, length_o, width_o):
     """The `Contact` of two boxes that overlap."""
-    if abs(speed) <= STANDING_MPS:
+    if abs(speed) <= AT_REST_MPS:
         return Contact.EGO_STANDS.value
-    if abs(speed_o) <= STANDING_MPS:
+    if abs(speed_o) <= AT_REST_MPS:
         return Contact.OTHER_STANDS.value
     if is_behind(x, y, heading, length, x_o, y_o):
         return Contact.REAR.value

@@ -9,10 +9,9 @@ import numpy as np
 from jaxtyping import Bool, Float
 from numba import njit
 
-from asp_env.data.road_map import RoadMap
+from asp_env.data.road_map import MapCache, RoadMap
 from asp_env.errors import DataError
-from asp_env.metrics.per_map import PerMap
-from asp_env.metrics.route import route_coordinates
+from asp_env.geometry import route_coordinates
 
 CELL_M = 0.1
 MARGIN_M = 5.0
@@ -123,8 +122,8 @@ def _draw_signed(road_map: RoadMap) -> DrivableField:
     return DrivableField(outside_m=(outside - inside).astype(np.float32), origin_m=origin_m)
 
 
-_fields = PerMap(_draw)
-_signed_fields = PerMap(_draw_signed)
+_fields = MapCache(_draw, 32)
+_signed_fields = MapCache(_draw_signed, 32)
 
 
 def drivable_field(road_map: RoadMap) -> DrivableField:

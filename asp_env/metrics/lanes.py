@@ -1,4 +1,6 @@
-"""Which lanes of a map points lie in, and what follows for whoever drives there.
+"""Where a point lies along a route whose points are 1 m apart, compiled.
+
+MERGED: Which lanes of a map points lie in, and what follows for whoever drives there.
 
 Maps have gaps, and tracks lie off their maps by some decimetres. So a point that no lane covers
 tells nothing: it is in no wrong lane and in no other one. Where lanes overlap, a vehicle is given
@@ -14,10 +16,9 @@ import numpy as np
 from jaxtyping import Bool, Float
 from numba import njit
 
-from asp_env.data.geometry import box_corners, path_length
-from asp_env.data.road_map import RoadMap
+from asp_env.data.road_map import MapCache, RoadMap
+from asp_env.geometry import box_corners, path_length
 from asp_env.metrics.masked import Masked
-from asp_env.metrics.per_map import PerMap
 
 CROSSING_RAD = math.radians(30.0)
 """Lanes that overlap cross where their headings differ by more than this, and by less than its
@@ -118,7 +119,7 @@ def _tabulate(road_map: RoadMap) -> LaneTable:
     return LaneTable(boxes=boxes, chains=_chains(road_map), crossed=_where_crossed(road_map, boxes))
 
 
-lane_table = PerMap(_tabulate)
+lane_table = MapCache(_tabulate, 32)
 
 
 def _chains(road_map: RoadMap) -> Float[np.ndarray, "chains lanes"]:

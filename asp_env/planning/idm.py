@@ -3,14 +3,13 @@
 import numpy as np
 from jaxtyping import Float, Int
 
-from asp_env.data.forecast import Forecast
-from asp_env.data.scene import Scene
+from asp_env.data.predictor import Forecast
+from asp_env.data.scene import EGO, Scene
 from asp_env.dynamics import rollout
+from asp_env.dynamics.car_following import IDM, follow_paths, speed_limits
 from asp_env.errors import AspEnvError
-from asp_env.metrics.route import route_coordinates
+from asp_env.geometry import route_coordinates
 from asp_env.planning.planner import Plan
-from asp_env.sim.idm import IDM, follow_paths, speed_limits
-from asp_env.sim.world import EGO
 
 DESIRED_MPS = 50 / 3.6
 """The speed limit in towns."""

@@ -1,14 +1,18 @@
-"""The socket for planners."""
+"""The socket for planners.
+
+MERGED: The logged driver itself: what every planner is measured against.
+"""
 
 from dataclasses import dataclass
-from typing import Protocol, runtime_checkable
+from typing import NoReturn, Protocol, runtime_checkable
 
 import numpy as np
 from jaxtyping import Float
 
 from asp_env import registry
-from asp_env.data.forecast import Forecast
+from asp_env.data.predictor import Forecast
 from asp_env.data.scene import Scene
+from asp_env.errors import AspEnvError
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -41,3 +45,24 @@ def load_planner(name: str) -> Planner:
         AspEnvError: the name is unknown.
     """
     return registry.find("planners", name)()
+
+
+class Expert:
+    """Replays the logged ego, position by position; it plans nothing.
+
+    Its score is the noise floor of data and metrics. Whoever runs planners looks at `privileged`
+    and lets the world replay the ego, so that `plan` is never asked.
+    """
+
+    name = "expert"
+    privileged = True
+    uses_forecasts = False
+
+    def plan(self, scene: Scene, forecast: Forecast) -> NoReturn:
+        """Refuses: the log is not in the scene.
+
+        Raises:
+            AspEnvError: always.
+        """
+        del scene, forecast
+        raise AspEnvError("the expert does not plan: let the world replay the ego")

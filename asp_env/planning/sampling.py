@@ -9,16 +9,15 @@ import numpy as np
 from jaxtyping import Float, Int
 from numba import njit
 
-from asp_env.data.forecast import Forecast
-from asp_env.data.scene import Scene
-from asp_env.dynamics import MAX_ACCELERATION_MPS2, forward, wrap_angle
-from asp_env.metrics.boxes import STANDING_MPS, is_behind, overlaps, touching_trailers
+from asp_env.data.predictor import Forecast
+from asp_env.data.scene import EGO, Scene
+from asp_env.dynamics import MAX_ACCELERATION_MPS2, forward
+from asp_env.dynamics.car_following import IDM, pursuit_steering
+from asp_env.geometry import overlaps, project, route_coordinates, wrap_angle
+from asp_env.metrics.boxes import AT_REST_MPS, is_behind, touching_trailers
 from asp_env.metrics.drivable import OFF_ROAD_M, off_road_m
-from asp_env.metrics.route import project, route_coordinates
 from asp_env.planning.idm import RouteLimits
 from asp_env.planning.planner import Plan
-from asp_env.sim.idm import IDM, pursuit_steering
-from asp_env.sim.world import EGO
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -218,7 +217,7 @@ def _first_touch(plan, size, other, other_size, margin):
         ):  # fmt: skip
             if is_behind(x, y, heading, size[0], other[t, 0], other[t, 1]):
                 return EXCUSED
-            if margin == 0.0 and abs(speed) <= STANDING_MPS:
+            if margin == 0.0 and abs(speed) <= AT_REST_MPS:
                 return EXCUSED
             return t
     return NEVER

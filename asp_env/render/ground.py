@@ -7,10 +7,10 @@ import cv2
 import numpy as np
 from jaxtyping import UInt8
 
-from asp_env.data.geometry import path_length
 from asp_env.data.recording import Background
 from asp_env.data.road_map import LineType, Ragged, RoadMap
 from asp_env.errors import DataError
+from asp_env.geometry import path_length
 from asp_env.render.canvas import SHIFT, Colour, Frame
 
 GROUND: Colour = (22, 26, 32)

@@ -3,7 +3,7 @@
 import numpy as np
 from jaxtyping import Shaped, UInt8
 
-from asp_env.data.forecast import Forecast
+from asp_env.data.predictor import Forecast
 from asp_env.data.recording import Background
 from asp_env.data.scene import Scene
 from asp_env.errors import AspEnvError
@@ -41,7 +41,7 @@ class Live:
         """Shows no more of what was told."""
         self._forecast = self._plan = None
 
-    def tell(
+    def set_overlay(
         self,
         scene: Scene,
         forecast: Forecast | None,
@@ -65,7 +65,7 @@ class Live:
             raise AspEnvError(f"plan of shape {plan.shape}: expected finite (steps, 2 or more)")
         self._forecast, self._plan, self._told_tick = forecast, plan, int(scene.tick[0])
 
-    def keep_up(self, scene: Scene, background: Background | None) -> None:
+    def update(self, scene: Scene, background: Background | None) -> None:
         """After a tick, in mode `human`: the window shows it for as long as it takes."""
         if self._window is not None and not self._window.closed:
             self.render(scene, background)

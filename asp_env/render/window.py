@@ -1,7 +1,13 @@
-"""A window on the screen that shows pictures, by pygame-ce."""
+"""A window on the screen that shows pictures, by pygame-ce.
 
+MERGED: Films in a window, under the user's keys.
+"""
+
+import dataclasses
 import os
 import sys
+from collections.abc import Sequence
+from dataclasses import dataclass
 from importlib.util import find_spec
 from typing import Any
 
@@ -9,6 +15,7 @@ import numpy as np
 from jaxtyping import UInt8
 
 from asp_env.errors import AspEnvError, MissingExtraError
+from asp_env.render.film import STILL_S, Film
 
 UNSEEN = "offscreen"
 """What SDL falls back to where there is no screen."""
@@ -121,3 +128,110 @@ def _pygame() -> Any:
     import pygame
 
     return pygame
+
+
+KEYS = "space: pause   left, right: step   up, down: speed   m: map   n, p: next   q: quit"
+SPEEDS = (0.125, 0.25, 0.5, 1.0, 2.0, 4.0, 8.0)
+WINDOW_FPS = 30.0
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class Playing:
+    """Where a player stands."""
+
+    films: Sequence[Film]
+    film: int = 0
+    time_s: float = 0.0
+    """Beyond the film's end while its last picture stands still."""
+    speed: float = 1.0
+    paused: bool = False
+    whole_map: bool = False
+    over: bool = False
+
+    @property
+    def now(self) -> Film:
+        """The film that is shown."""
+        return self.films[self.film]
+
+    def advanced(self, passed_s: float) -> "Playing":
+        """After some time; behind a film comes the next, behind the last nothing more."""
+        if self.paused:
+            return self
+        time_s = self.time_s + passed_s * self.speed
+        if time_s > self.now.duration_s + STILL_S * self.speed:
+            if self.film + 1 < len(self.films):
+                return dataclasses.replace(self, film=self.film + 1, time_s=0.0)
+            return dataclasses.replace(self, time_s=self.now.duration_s, paused=True)
+        return dataclasses.replace(self, time_s=time_s)
+
+    def pressed(self, key: str) -> "Playing":
+        """After a key; those that mean nothing change nothing."""
+        if key in ("q", "escape"):
+            return dataclasses.replace(self, over=True)
+        if key == "space":
+            again = self.paused and self.time_s >= self.now.duration_s
+            time_s = 0.0 if again else self.time_s
+            return dataclasses.replace(self, paused=not self.paused, time_s=time_s)
+        if key == "m":
+            return dataclasses.replace(self, whole_map=not self.whole_map)
+        if key in ("left", "right"):
+            return self._stepped(-1 if key == "left" else 1)
+        if key in ("n", "p"):
+            film = min(max(self.film + (1 if key == "n" else -1), 0), len(self.films) - 1)
+            return dataclasses.replace(self, film=film, time_s=0.0)
+        if key in ("up", "down"):
+            at = min(range(len(SPEEDS)), key=lambda i: abs(SPEEDS[i] - self.speed))
+            at = min(max(at + (1 if key == "up" else -1), 0), len(SPEEDS) - 1)
+            return dataclasses.replace(self, speed=SPEEDS[at])
+        return self
+
+    def _stepped(self, ticks: int) -> "Playing":
+        """At the tick before or after this time, paused."""
+        dt_s = self.now.rollout.dt_s
+        at = min(self.time_s, self.now.duration_s) / dt_s
+        whole = round(at) if abs(at - round(at)) < 1e-6 else int(at) + (ticks < 0)
+        time_s = min(max((whole + ticks) * dt_s, 0.0), self.now.duration_s)
+        return dataclasses.replace(self, time_s=time_s, paused=True)
+
+
+def play(playing: Playing, *, size_px: tuple[int, int], extent_m: float) -> None:
+    """Shows films one after the other until the user has seen enough.
+
+    Args:
+        playing: what, and from where on.
+        size_px: width and height of the window at first.
+        extent_m: width of what is shown about the ego, where it is not the whole map.
+
+    Raises:
+        AspEnvError: there is no screen.
+        MissingExtraError: the package that opens windows is not installed.
+    """
+    window, shown = Window("asp-env", size_px), None
+    try:
+        while not (playing.over or window.closed):
+            wanted = (playing, window.size_px)
+            if wanted != shown:
+                window.show(_picture(playing, window.size_px, extent_m), _title(playing))
+                shown = wanted
+            else:
+                window.look()
+            for key in window.pressed_keys():
+                playing = playing.pressed(key)
+            playing = playing.advanced(window.wait_s(WINDOW_FPS))
+    finally:
+        window.close()
+
+
+def _picture(playing: Playing, size_px: tuple[int, int], extent_m: float) -> np.ndarray:
+    film = playing.now
+    return film.frame(
+        min(playing.time_s, film.duration_s),
+        size_px=size_px,
+        extent_m=None if playing.whole_map else extent_m,
+        hint=KEYS if playing.paused else "",
+    )
+
+
+def _title(playing: Playing) -> str:
+    number = f" ({playing.film + 1} of {len(playing.films)})" if len(playing.films) > 1 else ""
+    return f"{playing.now.title}{number}, speed {playing.speed:g}"

@@ -8,11 +8,10 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 
 from asp_env.data.recording import Recording
-from asp_env.data.scenario import Scenario
-from asp_env.sim.drivers import Driver
-from asp_env.sim.replay import ReplayWorld
-from asp_env.sim.scenario_world import ScenarioWorld
-from asp_env.sim.world import EGO, Ending, Events
+from asp_env.data.scenarios.scenario import Scenario
+from asp_env.data.scene import EGO
+from asp_env.sim.traffic import Driver
+from asp_env.sim.world import Ending, Events, ReplayWorld, World
 
 OFF_ROAD_END_M = 2.0
 """An episode ends this far outside the drivable area; less may be a gap in the map."""
@@ -31,7 +30,7 @@ class Simulation:
         num_episodes: int,
         dt_s: float,
         history: int,
-        kind: type[ScenarioWorld] = ReplayWorld,
+        kind: type[World] = ReplayWorld,
     ) -> None:
         """Episodes begin with `reset`.
 
@@ -41,7 +40,7 @@ class Simulation:
             num_episodes: B.
             dt_s: length of a tick.
             history: past ticks that scenes show.
-            kind: of the world, see `asp_env.sim.worlds.world_of`.
+            kind: of the world, see `asp_env.sim.world.world_of`.
         """
         self.world = kind(recordings, num_episodes=num_episodes, dt_s=dt_s, history=history)
         self.driver = driver
@@ -50,10 +49,10 @@ class Simulation:
         self,
         scenarios: Sequence[Scenario],
         rngs: Sequence[np.random.Generator],
-        where: Bool[np.ndarray, " b"] | None = None,
+        reset_mask: Bool[np.ndarray, " b"] | None = None,
     ) -> None:
-        """Starts the episodes at `where`, by default all."""
-        chosen = np.ones(len(self.world), dtype=bool) if where is None else where
+        """Starts the episodes at `reset_mask`, by default all."""
+        chosen = np.ones(len(self.world), dtype=bool) if reset_mask is None else reset_mask
         self.world.reset(scenarios, rngs, chosen)
         self.driver.reset(self.world, chosen)
 
@@ -102,6 +101,6 @@ def ending(events: Events) -> Int[np.ndarray, " b"]:
         (Ending.OFF_ROAD, events.off_road_m > OFF_ROAD_END_M),
         (Ending.COLLISION, events.at_fault),
     )
-    for kind, where in holds:
-        out[where] = int(kind)
+    for kind, mask in holds:
+        out[mask] = int(kind)
     return out

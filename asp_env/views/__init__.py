@@ -11,7 +11,7 @@ from typing import Any, NamedTuple, Protocol, runtime_checkable
 import numpy as np
 
 from asp_env.errors import AspEnvError, unknown_name
-from asp_env.views.drawable import Drawable
+from asp_env.views.view import Drawable
 
 _NOTHING: Mapping[str, Any] = MappingProxyType({})
 

@@ -28,12 +28,11 @@ from typing import Any, ClassVar, final
 import numpy as np
 from jaxtyping import UInt8
 
+from asp_env.data.road_map import MapCache
 from asp_env.errors import AspEnvError
-from asp_env.views.boundaries import BOUNDARY_WIDTH_M, MapCache, boundary_pieces
 from asp_env.views.draw import draw_agents, draw_boundaries
-from asp_env.views.drawable import Drawable
-from asp_env.views.placed import memory, place
-from asp_env.views.view import View
+from asp_env.views.map_layers import BOUNDARY_WIDTH_M, boundary_pieces
+from asp_env.views.view import Drawable, View, memory, place
 
 SNAPSHOTS = (0, 2, 4, 6, 8, 9, 11, 13, 15)
 """States of the history at which the other agents are drawn; 15 is now."""
@@ -138,7 +137,7 @@ class ChauffeurNet:
         return out
 
     def draw_packed(self, scene: Drawable) -> UInt8[np.ndarray, "t 12 h bytes"]:
-        """What `draw` gives, packed to bits as `asp_env.views.packing` does, and sooner.
+        """What `draw` gives, packed to bits as `asp_env.views.draw` does, and sooner.
 
         Raises:
             AspEnvError: the history is too short.

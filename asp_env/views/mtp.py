@@ -38,14 +38,17 @@ from jaxtyping import Int64, UInt8, UInt32
 from numba import njit
 
 from asp_env.data.classes import VULNERABLE, AgentClass
-from asp_env.data.road_map import LineType, RoadMap
+from asp_env.data.road_map import LineType, MapCache, RoadMap
 from asp_env.errors import AspEnvError
-from asp_env.views.area import Rings, drivable_rings, fill_rings
-from asp_env.views.boundaries import BOUNDARY_WIDTH_M, MapCache, boundary_pieces
 from asp_env.views.draw import draw_coloured_agents, draw_coloured_lines
-from asp_env.views.drawable import Drawable
-from asp_env.views.placed import memory, place
-from asp_env.views.view import View
+from asp_env.views.map_layers import (
+    BOUNDARY_WIDTH_M,
+    Rings,
+    boundary_pieces,
+    drivable_rings,
+    fill_rings,
+)
+from asp_env.views.view import Drawable, View, memory, place
 
 DASHED_RGB = (0, 153, 255)
 BOUNDARY_RGB = (0, 0, 255)

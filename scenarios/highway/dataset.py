@@ -1,4 +1,7 @@
-"""A folder of highway-env's traffic in the inD layout, with what its vehicles had in mind."""
+"""A folder of highway-env's traffic in the inD layout, with what its vehicles had in mind.
+
+MERGED: What the registry finds here: the source `highway:`.
+"""
 
 from dataclasses import dataclass
 from pathlib import Path
@@ -7,14 +10,22 @@ import numpy as np
 from rich.console import Console
 from rich.progress import track as with_progress
 
+from asp_env.data.cache import get_or_create
 from asp_env.errors import AspEnvError, unknown_name
-from scenarios.highway.history import FOLDER, HiddenHistory
+from asp_env.files import written_aside
 from scenarios.highway.road_map import ORIGIN_LAT_LON_DEG, ORIGIN_UTM_M, write_road_map
-from scenarios.highway.rounds import KEPT_EVERY, ROUND_S, Round, Seen, simulate_round
+from scenarios.highway.rounds import (
+    FOLDER,
+    KEPT_EVERY,
+    ROUND_S,
+    HiddenHistory,
+    Round,
+    Seen,
+    simulate_round,
+)
 from scenarios.highway.sites import SITES, STEP_S, STEPS_PER_S, Site, network
 from scenarios.noise import measure
 from scenarios.tables import Meta, Track, write_recording_meta, write_tracks, write_tracks_meta
-from scenarios.written import written_aside
 
 MOST_MINUTES = 60.0
 SMOOTHED_FRAMES = 13
@@ -184,3 +195,45 @@ def _derivative(values: np.ndarray) -> np.ndarray:
     if len(values) < 2:
         return np.zeros_like(values)
     return np.gradient(values, STEP_S, axis=0)
+
+
+SOURCE_RECORDINGS, SOURCE_MINUTES, SOURCE_SEED = 6, 2.0, 90_521
+"""What `highway:SITE` consists of."""
+SOURCE_VERSION = 1
+"""Raise when other bytes come of the same seed, so that nobody mixes them with cached ones."""
+
+
+def open_source(argument: str) -> Path:
+    """The folder of `highway:ARGUMENT`.
+
+    Args:
+        argument: `intersection` or `roundabout`, made on first use in the user's cache folder; or a
+            folder that `asp-env synthesize OUT --site highway:…` made.
+
+    Raises:
+        AspEnvError: an unknown site, a folder of something else, or a cache folder that cannot be
+            written.
+    """
+    if argument in SITES:
+        return get_or_create(
+            "highway",
+            f"{argument}-{SOURCE_VERSION}",
+            lambda folder: synthesize(
+                folder,
+                site=argument,
+                recordings=SOURCE_RECORDINGS,
+                minutes=SOURCE_MINUTES,
+                seed=SOURCE_SEED,
+                progress=True,
+            ),
+        )
+    folder = Path(argument).expanduser()
+    if not argument or not folder.is_dir():
+        raise unknown_name("highway site or folder", argument, SITES)
+    if not (folder / FOLDER).is_dir():
+        raise AspEnvError(
+            f"highway:{argument}: {folder / FOLDER} is missing; expected a folder made by `asp-env "
+            "synthesize OUT --site highway:…`; without what the vehicles had in mind it can only "
+            f"be replayed: use {argument} itself"
+        )
+    return folder.absolute()

@@ -1,24 +1,230 @@
-"""Rounds: highway-env's episodes one after the other, as they would go without an ego."""
+"""What highway-env's vehicles know besides how they move, as rows of a table.
 
+With it a road is brought back exactly: the same vehicles in the same order go on as they did.
+
+MERGED: What highway-env's vehicles had in mind while a recording was made, kept beside its tracks.
+"""
+
+import zipfile
+import zlib
 from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
 
 import numpy as np
-from jaxtyping import Float, Int
+from jaxtyping import Float, Int, Shaped
 
-from scenarios.highway.axes import mirror_states
-from scenarios.highway.hidden import Rows, read_vehicles
+from asp_env.data.recording import Recording
+from asp_env.errors import DataError
+from scenarios.highway.road_map import mirror_states
 from scenarios.highway.sites import (
+    SITES,
     STEP_S,
     STEPS_PER_S,
     Site,
-    bring_another,
-    clear_leavers,
     populated_road,
+    remove_exited,
+    spawn_vehicle,
 )
-from scenarios.highway.vehicles import Road, TrafficVehicle
+from scenarios.highway.vehicles import Network, Road, TrafficVehicle
+
+LONGEST_ROUTE = 16
+"""Roads; a way through the roundabout has at most 11."""
+
+ANY_LANE = -1
+"""In a route, in place of a lane of the road."""
+
+HIDDEN = np.dtype(
+    [
+        ("track", np.int32),
+        ("x", np.float64),
+        ("y", np.float64),
+        ("heading", np.float64),
+        ("speed", np.float64),
+        ("target_lane", np.int16),
+        ("target_speed", np.float64),
+        ("timer", np.float64),
+        ("delta", np.float64),
+        ("route", np.int16, (LONGEST_ROUTE, 2)),
+        ("route_length", np.int16),
+        ("crashed", np.bool_),
+        ("pushed", np.bool_),
+        ("impact", np.float64, (2,)),
+        ("yielding", np.bool_),
+        ("yield_timer", np.int32),
+        ("steered", np.bool_),
+    ]
+)
+"""Of a vehicle: number in the recording; m, m, rad, m/s in highway-env's axes; the lane that it
+makes for; the speed it wants, m/s; seconds since it thought of changing lanes; the exponent of its
+law; (road, lane) of the rest of its route; whether it crashed, and by how much it is pushed at the
+next step, m; whether it gives way, and since how many checks; whether somebody else steers it."""
+
+Rows = Shaped[np.ndarray, " _"]
+"""Of `HIDDEN`, in the order of the road's vehicles."""
+
+
+def read_vehicles(road: Road) -> Rows:
+    """The hidden state of all vehicles on a road."""
+    rows = np.zeros(len(road.vehicles), dtype=HIDDEN)
+    for row, vehicle in zip(rows, road.vehicles, strict=True):
+        _read(row, vehicle, road.network)
+    return rows
+
+
+def _read(row: Any, vehicle: Any, network: Network) -> None:
+    row["track"] = vehicle.track
+    row["x"], row["y"] = vehicle.position
+    row["heading"], row["speed"] = vehicle.heading, vehicle.speed
+    start, end, number = vehicle.target_lane_index
+    row["target_lane"] = network.indices.index((start, end, int(number)))
+    row["target_speed"], row["timer"], row["delta"] = (
+        vehicle.target_speed,
+        vehicle.timer,
+        vehicle.DELTA,
+    )
+    route = vehicle.route or []
+    row["route_length"] = len(route)
+    for k, (start, end, lane) in enumerate(route):
+        row["route"][k] = network.roads.index((start, end)), ANY_LANE if lane is None else lane
+    row["crashed"] = vehicle.crashed
+    if vehicle.impact is not None:
+        row["pushed"], row["impact"] = True, vehicle.impact
+    row["yielding"] = getattr(vehicle, "is_yielding", False)
+    row["yield_timer"] = getattr(vehicle, "yield_timer", 0)
+    row["steered"] = vehicle.steered
+
+
+def restore(rows: Rows, road: Road, kind: type[TrafficVehicle]) -> list[TrafficVehicle]:
+    """The vehicles of some rows, not yet on the road."""
+    return [_restore(row, road, kind) for row in rows]
+
+
+def _restore(row: Any, road: Road, kind: type[TrafficVehicle]) -> TrafficVehicle:
+    network: Network = road.network
+    vehicle: Any = kind(
+        road, [float(row["x"]), float(row["y"])], float(row["heading"]), float(row["speed"])
+    )
+    vehicle.track = int(row["track"])
+    vehicle.target_lane_index = network.indices[int(row["target_lane"])]
+    # set afterwards, since the constructor takes zeros for nothing
+    vehicle.target_speed = float(row["target_speed"])
+    vehicle.timer = float(row["timer"])
+    vehicle.DELTA = float(row["delta"])
+    vehicle.route = [
+        (*network.roads[int(road_number)], None if lane == ANY_LANE else int(lane))
+        for road_number, lane in row["route"][: int(row["route_length"])]
+    ]
+    vehicle.crashed = bool(row["crashed"])
+    vehicle.impact = row["impact"].copy() if row["pushed"] else None
+    if row["yielding"]:
+        vehicle.is_yielding, vehicle.color = True, None
+    vehicle.yield_timer = int(row["yield_timer"])
+    vehicle.steered = bool(row["steered"])
+    return vehicle
+
+
+FOLDER = "hidden"
+"""Beside `data` and `maps`."""
+
+WANTED = "made by `asp-env synthesize OUT --site highway:…`"
+
+_DAMAGE = (OSError, ValueError, KeyError, EOFError, TypeError, zipfile.BadZipFile, zlib.error)
+"""What NumPy raises of files that are not whole, or are something else."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class HiddenHistory:
+    """The hidden states of all vehicles of a recording, every 0.2 s."""
+
+    site: Site
+    rows: Shaped[np.ndarray, " n"]
+    """Of `HIDDEN`, time by time."""
+    steps: Int[np.ndarray, " times"]
+    """What the road had counted by then."""
+    starts: Int[np.ndarray, " times+1"]
+    """Time i has the rows `starts[i]:starts[i + 1]`."""
+
+    def __deepcopy__(self, memo: dict[int, Any]) -> "HiddenHistory":
+        """Itself, since nobody changes it."""
+        del memo
+        return self
+
+    def at(self, frame: int) -> tuple[Rows, int]:
+        """The vehicles at a frame, and what the road had counted."""
+        time = frame // KEPT_EVERY
+        return self.rows[self.starts[time] : self.starts[time + 1]], int(self.steps[time])
+
+    def coming(self, frame: int) -> Rows:
+        """Those who are there at a frame and were not there before; none behind the last frame."""
+        time = frame // KEPT_EVERY
+        if frame % KEPT_EVERY or not 0 < time < len(self.steps):
+            return self.rows[:0]
+        now, _ = self.at(frame)
+        before, _ = self.at(frame - KEPT_EVERY)
+        return now[~np.isin(now["track"], before["track"])]
+
+    def fits(self, recording: Recording) -> bool:
+        """Whether it tells of the same vehicles at the same times."""
+        frames = np.repeat(np.arange(len(self.steps)), np.diff(self.starts)) * KEPT_EVERY
+        tracks, last = self.rows["track"], recording.last_frames
+        if len(self.steps) < -(
+            -recording.num_frames // KEPT_EVERY
+        ):  # more: all left before the end
+            return False
+        if len(tracks) and not 0 <= tracks.min() <= tracks.max() < len(recording):
+            return False
+        there = (recording.first_frames[tracks] <= frames) & (frames <= last[tracks])
+        times = last // KEPT_EVERY - (recording.first_frames - 1) // KEPT_EVERY
+        return bool(there.all() and len(tracks) == times.sum())
+
+    def save(self, path: Path) -> None:
+        """Writes a file that needs no pickle."""
+        np.savez_compressed(
+            path,
+            site=np.array(self.site.name),
+            rows=self.rows,
+            starts=self.starts,
+            steps=self.steps,
+        )
+
+
+def load_history(path: Path) -> HiddenHistory:
+    """Reads what `save` wrote.
+
+    Raises:
+        DataError: the file is missing, damaged, or of another version.
+    """
+    try:
+        with path.open("rb") as file, np.load(file, allow_pickle=False) as found:
+            site, rows = str(found["site"]), found["rows"]
+            starts, steps = found["starts"], found["steps"]
+    except FileNotFoundError:
+        raise DataError(f"{path} is missing: expected a folder {WANTED}") from None
+    except _DAMAGE as error:
+        raise DataError(f"{path} is damaged ({error}): expected what was {WANTED}") from error
+    if site not in SITES or rows.dtype != HIDDEN or not _whole(rows, starts, steps):
+        raise DataError(f"{path}: of another version; expected what was {WANTED} by this one")
+    return HiddenHistory(site=SITES[site], rows=rows, starts=starts, steps=steps)
+
+
+def _whole(rows: np.ndarray, starts: np.ndarray, steps: np.ndarray) -> bool:
+    if not (rows.ndim == starts.ndim == steps.ndim == 1 and starts.dtype.kind == "i"):
+        return False
+    if len(starts) != len(steps) + 1 or steps.dtype.kind != "i":
+        return False
+    return bool(starts[0] == 0 and starts[-1] == len(rows) and (np.diff(starts) >= 0).all())
+
+
+def hidden_path(tracks_path: Path) -> Path:
+    """Where the hidden history of a recording lies, from where its tracks lie."""
+    name = tracks_path.name.partition("_")[0]
+    return tracks_path.parent.parent / FOLDER / f"{name}_hidden.npz"
+
 
 ROUND_S = 20
 """highway-env's own episodes last 11 s and 13 s; by then its roundabout is nearly empty."""
+
 
 KEPT_EVERY = 3
 """Frames from one kept hidden state to the next: 0.2 s."""
@@ -62,8 +268,8 @@ def simulate_round(site: Site, rng: np.random.Generator, *, frames: int) -> Roun
         if frame:
             step_road(road)
             if frame % STEPS_PER_S == 0:
-                clear_leavers(site, road)
-                bring_another(site, road, rng)
+                remove_exited(site, road)
+                spawn_vehicle(site, road, rng)
         _look(road.vehicles, seen, frame)
         if frame % KEPT_EVERY == 0:
             hidden.append(read_vehicles(road))

@@ -1,4 +1,7 @@
-"""The places of highway-env that are driven here, and the traffic that it puts there."""
+"""The places of highway-env that are driven here, and the traffic that it puts there.
+
+MERGED: Rounds: highway-env's episodes one after the other, as they would go without an ego.
+"""
 
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -9,12 +12,13 @@ import numpy as np
 from highway_env.envs import IntersectionEnv, RoundaboutEnv
 from highway_env.envs.common.abstract import AbstractEnv
 
-from scenarios.highway.roads import RegulatedTrafficRoad, TrafficRoad
 from scenarios.highway.vehicles import (
     IntersectionVehicle,
     Network,
+    RegulatedTrafficRoad,
     Road,
     RoundaboutVehicle,
+    TrafficRoad,
     TrafficVehicle,
 )
 
@@ -124,7 +128,7 @@ def populated_road(site: Site, rng: np.random.Generator) -> Road:
     return road
 
 
-def bring_another(site: Site, road: Road, rng: np.random.Generator) -> None:
+def spawn_vehicle(site: Site, road: Road, rng: np.random.Generator) -> None:
     """Brings another vehicle, if the place and chance will have it."""
     if site.spawn is not None:
         _with(site, road, rng, site.spawn)
@@ -139,7 +143,7 @@ def _with(site: Site, road: Road, rng: np.random.Generator, do: Callable[[Any], 
         env.road, env.controlled_vehicles, road.np_random = None, [], None
 
 
-def clear_leavers(site: Site, road: Road, *, ego: int | None = None) -> None:
+def remove_exited(site: Site, road: Road, *, ego: int | None = None) -> None:
     """Takes away those who are about to come to the end of the road and drive themselves.
 
     At highway-env's roundabout they would go on for ever: there it takes nobody away. An ego stays

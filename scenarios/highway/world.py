@@ -7,19 +7,27 @@ from typing import Any
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
-from asp_env.data.clock import frames_per_tick
-from asp_env.data.scenario import Scenario
+from asp_env.data.recording import frames_per_tick
+from asp_env.data.scenarios.scenario import Scenario
+from asp_env.data.scene import EGO
 from asp_env.data.source import Recordings
 from asp_env.dynamics import forward
 from asp_env.errors import AspEnvError, DataError
-from asp_env.sim.kernels import read_obeying
-from asp_env.sim.scenario_world import ScenarioWorld
-from asp_env.sim.world import EGO
-from scenarios.highway.axes import mirror_actions, mirror_states
-from scenarios.highway.hidden import Rows, read_vehicles, revive
-from scenarios.highway.history import WANTED, HiddenHistory, hidden_path, load_history
-from scenarios.highway.rounds import KEPT_EVERY, step_road
-from scenarios.highway.sites import STEP_S, STEPS_PER_S, clear_leavers, empty_road
+from asp_env.sim.episodes import gather_controlled
+from asp_env.sim.world import World
+from scenarios.highway.road_map import mirror_actions, mirror_states
+from scenarios.highway.rounds import (
+    KEPT_EVERY,
+    WANTED,
+    HiddenHistory,
+    Rows,
+    hidden_path,
+    load_history,
+    read_vehicles,
+    restore,
+    step_road,
+)
+from scenarios.highway.sites import STEP_S, STEPS_PER_S, empty_road, remove_exited
 from scenarios.highway.vehicles import Road, TrafficVehicle
 
 APART_M = 15.0
@@ -45,7 +53,7 @@ class _Kept:
     frame: int
 
 
-class HighwayWorld(ScenarioWorld):
+class HighwayWorld(World):
     """B episodes that begin as recorded; from then on highway-env's vehicles drive themselves.
 
     Whom nobody drives is driven by highway-env: its intelligent driver model, its lane changes, its
@@ -85,16 +93,16 @@ class HighwayWorld(ScenarioWorld):
         self,
         scenarios: Sequence[Scenario],
         rngs: Sequence[np.random.Generator],
-        where: Bool[np.ndarray, " b"] | None = None,
+        reset_mask: Bool[np.ndarray, " b"] | None = None,
     ) -> None:
-        """Starts the episodes at `where` (all by default); the others' entries are not read.
+        """Starts the episodes at `reset_mask` (all by default); the others' entries are not read.
 
         Raises:
             AspEnvError: a scenario does not fit its recording.
             DataError: highway-env did not make the recording.
         """
-        super().reset(scenarios, rngs, where)
-        chosen = np.ones(len(self), dtype=bool) if where is None else where
+        super().reset(scenarios, rngs, reset_mask)
+        chosen = np.ones(len(self), dtype=bool) if reset_mask is None else reset_mask
         for b in np.flatnonzero(chosen).tolist():
             history = self._history(scenarios[b].recording)
             frame = scenarios[b].start_tick * self._stride
@@ -116,7 +124,7 @@ class HighwayWorld(ScenarioWorld):
 
     def _begin(self, b: int, history: HiddenHistory, kept: _Kept) -> None:
         road = empty_road(history.site, steps=kept.steps)
-        road.vehicles = revive(kept.rows, road, history.site.vehicle)
+        road.vehicles = restore(kept.rows, road, history.site.vehicle)
         self._runs[b] = _Run(road=road, frame=kept.frame, history=history)
         tracks = self.episodes.tracks[b]
         self._slots[b] = {int(tracks[a]): a for a in np.flatnonzero(tracks >= 0).tolist()}
@@ -138,7 +146,7 @@ class HighwayWorld(ScenarioWorld):
         driven: Bool[np.ndarray, "r a"],
         obeys: Bool[np.ndarray, "r a"],
     ) -> None:
-        states, held, lengths = read_obeying(self.episodes, rows, now, actions, obeys)
+        states, held, lengths = gather_controlled(self.episodes, rows, now, actions, obeys)
         times_s = [*((k + 1) * STEP_S for k in range(self._stride - 1)), self.dt_s]
         ways = np.stack([forward(states, held, lengths, each) for each in times_s])
         poses = mirror_states(ways.astype(np.float64)).swapaxes(0, 1).tolist()
@@ -172,7 +180,7 @@ class HighwayWorld(ScenarioWorld):
             step_road(road)
             run.frame += 1
             if run.frame % STEPS_PER_S == 0:
-                clear_leavers(run.history.site, road, ego=int(self.episodes.tracks[b, EGO]))
+                remove_exited(run.history.site, road, ego=int(self.episodes.tracks[b, EGO]))
                 away = [slot for slot in slots.values() if driven[slot] or gone[slot]]
                 self._let_in(run, {int(self.episodes.tracks[b, slot]) for slot in away})
 
@@ -183,7 +191,7 @@ class HighwayWorld(ScenarioWorld):
             place = np.array([row["x"], row["y"]])
             near = [np.linalg.norm(each.position - place) < APART_M for each in run.road.vehicles]
             if not any(near):
-                run.road.vehicles += revive(row[None], run.road, run.history.site.vehicle)
+                run.road.vehicles += restore(row[None], run.road, run.history.site.vehicle)
 
     def _write(
         self,

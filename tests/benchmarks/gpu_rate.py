@@ -23,13 +23,13 @@ from asp_env import registry
 from asp_env.data.snippets import index_snippets
 from asp_env.data.source import open_data
 from asp_env.views import make_view
-from predictors.checkpoint import shape_for
-from predictors.drawing import hired
-from predictors.hardware import Hardware, make_trainer, quiet
-from predictors.lightning_parts import Fit
-from predictors.network import LearnedPlug
-from predictors.recipes import TrainingConfig, recipe
-from predictors.samples import Batches
+from predictors.inference.checkpoint import shape_for
+from predictors.models.network import LearnedPlug
+from predictors.training.data import Batches
+from predictors.training.data_loading import batch_workers
+from predictors.training.lightning_parts import Fit
+from predictors.training.recipes import TrainingConfig, recipe
+from predictors.training.trainer import Hardware, make_trainer, quiet
 
 WARM_UP = 20
 """Steps that do not count."""
@@ -128,7 +128,7 @@ class GpuRate:
         clock = Clock()
         with (
             tempfile.TemporaryDirectory() as out,
-            hired([training.drawing], processes) as crew,
+            batch_workers([training.drawing], processes) as crew,
             quiet(),
         ):
             if crew is not None:

@@ -17,11 +17,11 @@ from asp_env import registry
 from asp_env.data.snippets import index_snippets
 from asp_env.data.source import open_data
 from asp_env.views import make_view
-from predictors.batch import Batch, Labels
-from predictors.checkpoint import shape_for
-from predictors.network import AbstractNetwork, LearnedPlug, Moment
-from predictors.recipes import recipe
-from predictors.samples import Batches
+from predictors.inference.checkpoint import shape_for
+from predictors.models.batch import Batch, Labels
+from predictors.models.network import AbstractNetwork, LearnedPlug, TrainingProgress
+from predictors.training.data import Batches
+from predictors.training.recipes import recipe
 
 DATA = "sample:intersection"
 BATCH = 32
@@ -52,7 +52,7 @@ class Trial(NamedTuple):
 
     def _learn(self, batch: Batch, labels: Labels) -> None:
         with torch.autocast("cpu", dtype=torch.bfloat16):
-            loss = self.network.training_loss(batch, labels, Moment())["loss"]
+            loss = self.network.training_loss(batch, labels, TrainingProgress())["loss"]
         self.optimizer.zero_grad()
         loss.backward()
         self.optimizer.step()

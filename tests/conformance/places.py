@@ -7,11 +7,9 @@ from typing import Any
 
 import pytest
 
-from asp_env.data.scenario import Scenario, find_scenarios
-from asp_env.sim.replay import ReplayWorld
-from asp_env.sim.scenario_world import ScenarioWorld
+from asp_env.data.scenarios.scenario import Scenario, find_scenarios
 from asp_env.sim.simulation import Simulation
-from asp_env.sim.worlds import world_of
+from asp_env.sim.world import ReplayWorld, World, world_of
 from tests.builders import make_recording
 from tests.highway_folders import highway_data, highway_recordings, highway_scenarios
 from tests.sim.worlds import DT_S, HISTORY, TRAFFICS, scenario, simulate
@@ -30,7 +28,7 @@ class Place:
 
     data: str | None
     """DATA's scheme, if the world is that of one."""
-    kind: Callable[[], type[ScenarioWorld]]
+    kind: Callable[[], type[World]]
     recordings: Callable[[], Sequence[Any]]
     scenarios: Callable[[], list[Scenario]]
     found: Callable[[], list[Scenario]]

@@ -13,8 +13,7 @@ import numpy as np
 import pytest
 
 from asp_env import registry
-from asp_env.data.forecast import Forecast
-from asp_env.data.predictor import Predictor
+from asp_env.data.predictor import Forecast, Predictor
 from asp_env.data.recording import Recording
 from asp_env.data.scene import Scene
 from asp_env.data.snippets import (
@@ -24,8 +23,8 @@ from asp_env.data.snippets import (
     gather_scene,
     index_snippets,
 )
-from predictors.chaining import CHAININGS
-from predictors.recipes import RECIPES
+from predictors.models.chaining import CHAININGS
+from predictors.training.recipes import RECIPES
 from tests.builders import make_recording
 from tests.predictors.tiny import save_random
 

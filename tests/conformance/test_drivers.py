@@ -10,16 +10,14 @@ import numpy as np
 import pytest
 
 from asp_env import registry
-from asp_env.data.scenario import Scenario, find_scenarios
+from asp_env.data.scenarios.scenario import Scenario, find_scenarios
 from asp_env.data.source import open_data
 from asp_env.errors import AspEnvError
-from asp_env.sim.drivers import Driver, DriverPlug
-from asp_env.sim.drivers.driver import vehicles
-from asp_env.sim.replay import ReplayWorld
-from asp_env.sim.scenario_world import ScenarioWorld
 from asp_env.sim.simulation import Simulation
-from asp_env.sim.traffic import make_traffic
-from asp_env.sim.worlds import world_of
+from asp_env.sim.traffic import Driver, DriverPlug
+from asp_env.sim.traffic.assignment import make_traffic
+from asp_env.sim.traffic.driver import vehicles
+from asp_env.sim.world import ReplayWorld, World, world_of
 from tests.builders import make_recording
 from tests.highway_folders import highway_recordings
 from tests.sim.worlds import DT_S, HISTORY, scenario, simulate
@@ -44,7 +42,7 @@ class Stage:
 
     recordings: Sequence[Any]
     scenarios: list[Scenario]
-    kind: type[ScenarioWorld] = ReplayWorld
+    kind: type[World] = ReplayWorld
     steps: int = 30
 
 

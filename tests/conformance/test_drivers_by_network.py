@@ -5,7 +5,7 @@ from pathlib import Path
 import numpy as np
 
 from asp_env.sim.simulation import Simulation
-from asp_env.sim.traffic import make_traffic
+from asp_env.sim.traffic.assignment import make_traffic
 from tests.builders import make_recording
 from tests.conformance.predictor_cases import Case
 from tests.sim.worlds import DT_S, HISTORY, replay, scenario

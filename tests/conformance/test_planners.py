@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from asp_env import registry
-from asp_env.data.forecast import Forecast
+from asp_env.data.predictor import Forecast
 from asp_env.data.scene import Scene
 from asp_env.data.snippets import gather_scene, index_snippets
 from asp_env.dynamics import MAX_ACCELERATION_MPS2, MAX_STEERING_RAD, rollout

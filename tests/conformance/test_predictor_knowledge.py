@@ -11,9 +11,9 @@ from asp_env.data.predictor import Predictor, load_predictor
 from asp_env.data.recording import Recording
 from asp_env.data.road_map import Ragged
 from asp_env.data.snippets import Future, gather_future, gather_scene
-from asp_env.dynamics import wrap_angle
 from asp_env.errors import AspEnvError
-from predictors.chaining import CHAININGS
+from asp_env.geometry import wrap_angle
+from predictors.models.chaining import CHAININGS
 from tests.builders import DRIVES, Drive, make_recording
 from tests.conformance.predictor_cases import (
     LEARNED,
@@ -70,7 +70,7 @@ def test_only_chaining_by_oracle_is_privileged(chaining: str, folder: Path) -> N
     case = Case("ssp-asp", "vectors", chaining)
     predictor = load_predictor(case.save(folder), horizon=case.horizon, dt_s=0.2)
     assert predictor.privileged == (chaining == "oracle")
-    assert predictor.about["chaining"] == chaining
+    assert predictor.metadata["chaining"] == chaining
     if predictor.privileged:
         with pytest.raises(AspEnvError, match="needs the recorded future of 30 ticks"):
             predictor.predict(situations(predictor)[0])

@@ -8,8 +8,8 @@ import pytest
 import torch
 
 from asp_env.data.predictor import load_predictor
-from predictors.network import Moment
-from predictors.recipes import RECIPES
+from predictors.models.network import TrainingProgress
+from predictors.training.recipes import RECIPES
 from tests.conformance.predictor_cases import LEARNED, Case, ask, assert_same, situations
 from tests.predictors.tiny import draw_samples, make_network, tiny_network, tiny_shape
 
@@ -45,7 +45,7 @@ def test_it_overfits_four_snippets(name: str) -> None:
     )
     for _ in range(150):
         optimizer.zero_grad()
-        network.training_loss(batch, labels, Moment())["loss"].backward()
+        network.training_loss(batch, labels, TrainingProgress())["loss"].backward()
         optimizer.step()
         network.after_step()
         falling.step()

@@ -8,9 +8,10 @@ import pytest
 from asp_env.data.classes import PREDICTED
 from asp_env.data.predictor import Predictor
 from asp_env.data.snippets import Future
-from asp_env.dynamics import MAX_ACCELERATION_MPS2, MAX_STEERING_RAD, rollout, wrap_angle
+from asp_env.dynamics import MAX_ACCELERATION_MPS2, MAX_STEERING_RAD, rollout
 from asp_env.dynamics.bicycle import Integrator
 from asp_env.errors import AspEnvError
+from asp_env.geometry import wrap_angle
 from tests.conformance.predictor_cases import (
     LEARNED,
     SEGMENT,
@@ -142,10 +143,10 @@ def test_what_it_tells_of_itself_cannot_be_changed(predictor: Predictor) -> None
     """Trained ones name data, view, preset and weights, others nothing; nobody can set it."""
     fields = {"trained_on", "view", "preset", "weights"} if predictor.trained_on else set()
     chained = {"chaining"} if predictor.trained_on and predictor.horizon > SEGMENT else set()
-    assert set(predictor.about) == fields | chained
-    assert all(predictor.about.values())
+    assert set(predictor.metadata) == fields | chained
+    assert all(predictor.metadata.values())
     with pytest.raises(AttributeError):
-        vars(type(predictor))["about"].__set__(predictor, {})
+        vars(type(predictor))["metadata"].__set__(predictor, {})
 
 
 @every

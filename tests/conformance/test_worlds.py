@@ -6,9 +6,8 @@ import numpy as np
 import pytest
 
 from asp_env import registry
-from asp_env.sim.replay import ReplayWorld
 from asp_env.sim.simulation import Simulation
-from asp_env.sim.world import World
+from asp_env.sim.world import ReplayWorld, World
 from tests.conformance.places import PLACES, every_traffic, everywhere
 from tests.sim.worlds import DT_S, HISTORY
 

@@ -10,14 +10,14 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from jaxtyping import Float
 
-from asp_env.data import cache, causal, tracker
+from asp_env.data import cache, causal
 from asp_env.data.causal import causal_histories, causal_states
 from asp_env.data.classes import AgentClass
 from asp_env.data.recording import Recording
 from asp_env.data.scene import infer_actions
 from asp_env.data.snippets import gather_future, gather_scene, index_snippets
-from asp_env.dynamics import wrap_angle
 from asp_env.errors import DataError
+from asp_env.geometry import wrap_angle
 from tests.builders import DRIVES, Drive, make_recording
 
 REAR_M = 1.35
@@ -29,7 +29,7 @@ def follow(
 ) -> Float[np.ndarray, "n 4"]:
     """The vehicle filter on measurements as they are, without any noise."""
     states = np.empty((len(measured), 4), dtype=np.float32)
-    tracker.follow_vehicle(
+    causal.follow_vehicle(
         np.ascontiguousarray(measured, dtype=np.float64), speed_mps, REAR_M, 1 / rate_hz, states
     )
     return states.astype(np.float64)

@@ -6,7 +6,7 @@ import math
 import numpy as np
 import pytest
 
-from asp_env.data.forecast import Forecast, constant_velocity, fill_missing, make_forecast
+from asp_env.data.predictor import Forecast, constant_velocity, fill_missing, make_forecast
 from asp_env.data.scene import Scene
 from asp_env.data.snippets import gather_scene, index_snippets
 from tests.builders import make_recording

@@ -9,10 +9,10 @@ import numpy as np
 import pytest
 from hypothesis import given
 
-from asp_env.data.parts import TrainedOn, num_ticks, part_of_ticks, snippet_parts, unseen_ticks
 from asp_env.data.recording import Recording
 from asp_env.data.snippets import SnippetIndex
 from asp_env.data.source import Recordings
+from asp_env.data.split import TrainedOn, num_ticks, part_of_ticks, snippet_parts, unseen_ticks
 from asp_env.errors import AspEnvError
 from tests.builders import make_recording
 

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from asp_env.data.rollout import Rollout
-from asp_env.data.scenario import Scenario
+from asp_env.data.scenarios.scenario import Scenario
 from asp_env.errors import DataError
 
 

@@ -9,7 +9,8 @@ import pytest
 import torch
 from hypothesis import given
 
-from asp_env.dynamics import MAX_STEERING_RAD, forward, inverse, rollout, wrap_angle
+from asp_env.dynamics import MAX_STEERING_RAD, forward, inverse, rollout
+from asp_env.geometry import wrap_angle
 from tests.dynamics.motions import ROWS, Motion, apart, between, extremes, motions
 
 Integrator = Literal["heun", "euler"]

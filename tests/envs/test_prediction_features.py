@@ -13,13 +13,12 @@ from gymnasium.vector import VectorEnv
 from stable_baselines3.common.env_checker import check_env as check_env_sb3
 
 import asp_env
-from asp_env.data.forecast import Forecast, make_forecast
-from asp_env.data.geometry import to_frame
-from asp_env.data.predictor import load_predictor
+from asp_env.data.predictor import Forecast, load_predictor, make_forecast
 from asp_env.data.scene import Scene
 from asp_env.data.snippets import Future
-from asp_env.envs.prediction_features import PredictionFeatures, nearest_agents
 from asp_env.envs.replay import ReplayEnv
+from asp_env.envs.wrappers import PredictionFeatures, nearest_agents
+from asp_env.geometry import to_frame
 from tests.conformance.predictor_cases import Case
 from tests.envs.same import same
 
@@ -57,7 +56,7 @@ class Fan:
         """Of as many modes; counts its calls."""
         self.log_probs = np.log(probabilities)
         self.calls = 0
-        self.about: dict[str, str] = {}
+        self.metadata: dict[str, str] = {}
 
     def predict(self, scene: Scene, future: Future | None = None) -> Forecast:
         """All modes of all targets."""

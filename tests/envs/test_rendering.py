@@ -12,7 +12,7 @@ import pygame
 import pytest
 from gymnasium.utils.env_checker import check_env
 
-from asp_env.data.forecast import constant_velocity, make_forecast
+from asp_env.data.predictor import constant_velocity, make_forecast
 from asp_env.envs.replay import ReplayEnv
 from asp_env.errors import AspEnvError, MissingExtraError
 from asp_env.render.frames import draw_frame

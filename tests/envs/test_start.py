@@ -4,7 +4,7 @@ import gymnasium
 import numpy as np
 import pytest
 
-from asp_env.data.scenario_filter import ScenarioFilter
+from asp_env.data.scenarios.scenario import ScenarioFilter
 from asp_env.envs.replay import ReplayEnv
 from asp_env.errors import AspEnvError
 from tests.crossing_files import ON_ROAD, write_crossing

@@ -7,15 +7,15 @@ from pathlib import Path
 
 import numpy as np
 
-from asp_env.data.forecast import Forecast, constant_velocity, make_forecast
-from asp_env.data.geometry import route_along
+from asp_env.data.predictor import Forecast, constant_velocity, make_forecast
 from asp_env.data.recording import Recording
 from asp_env.data.rollout import Rollout
-from asp_env.data.scenario import Scenario
+from asp_env.data.scenarios.scenario import Scenario
 from asp_env.data.scene import Scene
 from asp_env.data.snippets import gather_future, gather_scene, index_snippets
 from asp_env.evaluation.report import ForecastExamples
 from asp_env.evaluation.report.results import COLUMNS
+from asp_env.geometry import route_along
 
 ERRORS_M = {
     "oracle": 0.0,

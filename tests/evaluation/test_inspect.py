@@ -12,8 +12,7 @@ from asp_env.data.classes import AgentClass
 from asp_env.data.recording import Recording
 from asp_env.data.road_map import Ragged, RoadMap
 from asp_env.errors import DataError
-from asp_env.evaluation.drift import drift_m
-from asp_env.evaluation.inspect import Inspect
+from asp_env.evaluation.inspect import Inspect, drift_m
 from tests.data.levelx_files import write_folder
 
 RATE_HZ, DT_S = 25.0, 0.2

@@ -6,10 +6,10 @@ import pytest
 from rich.console import Console
 from rich.table import Table
 
-from asp_env.evaluation.entrants import short_names
-from asp_env.evaluation.output import Row
+from asp_env.evaluation.results import Row
+from asp_env.evaluation.selection import short_names
 from asp_env.evaluation.tables import driving_table, open_loop_tables
-from asp_env.metrics.presets import PDMS, PRESETS
+from asp_env.metrics.driving.rules import PDMS, RULES
 
 SHOWN = PDMS.shown
 
@@ -71,7 +71,7 @@ def test_where_nobody_moves_all_are_shown():
     assert "1.00 [0.90, 1.10]" in lines[-1]
 
 
-@pytest.mark.parametrize("preset", PRESETS.values(), ids=PRESETS)
+@pytest.mark.parametrize("preset", RULES.values(), ids=RULES)
 def test_every_preset_fits(preset):
     """80 columns, with a score where it has one, and its name and version above."""
     names = [*(["score"] if preset.weights else []), *preset.shown]

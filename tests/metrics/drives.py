@@ -6,19 +6,19 @@ import math
 import numpy as np
 
 from asp_env.metrics.boxes import Contact
-from asp_env.metrics.driving import Drives, driving_metrics
+from asp_env.metrics.driving.map_context import MapContext
+from asp_env.metrics.driving.rules import STRICT, Rules
+from asp_env.metrics.driving.scores import Drives, driving_metrics
 from asp_env.metrics.masked import Masked
-from asp_env.metrics.on_map import OnMap
-from asp_env.metrics.presets import STRICT, Preset
 
 TICKS = 8
 DT_S = 0.2
 
 
-def drive(*, lasted: int = TICKS, dt_s: float = DT_S, **changes: object) -> Drives:
+def drive(*, active: int = TICKS, dt_s: float = DT_S, **changes: object) -> Drives:
     """One episode at 5 m/s that is perfect but for its progress of 40 m out of 50 m.
 
-    Fields of `Drives` and `OnMap` are given as values for all ticks, or as arrays; `limit_mps` is
+    Fields of `Drives` and `MapContext` are given as values for all ticks, or as arrays; `limit_mps` is
     `None` where none is known, and `against_m` where the map has no lanes.
     """
     states = np.zeros((1, TICKS, 4))
@@ -39,23 +39,23 @@ def drive(*, lasted: int = TICKS, dt_s: float = DT_S, **changes: object) -> Driv
         "at_crossing": no,
         "against_m": zeros,
         "limit_mps": np.full((1, TICKS), 10.0),
-        "off_ways_m": zeros,
+        "distance_to_route_lanes_m": zeros,
     }
     known = {name: changes.get(name, 0) is not None for name in ("against_m", "limit_mps")}
     for name, change in changes.items():
         if change is not None:
             fields[name] = np.broadcast_to(np.asarray(change), fields[name].shape)
     limited = np.isfinite(fields["limit_mps"]) & known["limit_mps"]
-    on_map = OnMap(
+    on_map = MapContext(
         outside_m=fields.pop("outside_m"),
         several_lanes=fields.pop("several_lanes"),
         at_crossing=fields.pop("at_crossing"),
         against_traffic=Masked(value=fields.pop("against_m"), valid=no | known["against_m"]),
         limits=Masked(value=np.where(limited, fields.pop("limit_mps"), 0), valid=limited),
-        off_ways_m=fields.pop("off_ways_m"),
+        distance_to_route_lanes_m=fields.pop("distance_to_route_lanes_m"),
     )
-    lasts = np.arange(TICKS)[None] < lasted
-    return Drives(**fields, on_map=on_map, lasted=lasts, dt_s=dt_s)
+    lasts = np.arange(TICKS)[None] < active
+    return Drives(**fields, on_map=on_map, active=lasts, dt_s=dt_s)
 
 
 def at_tick(tick: int, value: float, otherwise: float = 0.0) -> np.ndarray:
@@ -70,7 +70,7 @@ def contact(tick: int, kind: Contact) -> np.ndarray:
     return found
 
 
-def values(drives: Drives, preset: Preset = STRICT) -> dict[str, float]:
+def values(drives: Drives, preset: Rules = STRICT) -> dict[str, float]:
     """The metrics of one episode; NaN where missing."""
     return {
         name: float(metric.value[0]) if metric.valid[0] else math.nan
@@ -85,7 +85,7 @@ def joined(episodes: list[Drives]) -> Drives:
         found = {}
         for field in dataclasses.fields(kind):
             values = [getattr(part, field.name) for part in parts]
-            if isinstance(values[0], OnMap | Masked):
+            if isinstance(values[0], MapContext | Masked):
                 found[field.name] = type(values[0])(**side_by_side(type(values[0]), values))
             else:
                 whole = isinstance(values[0], float)

@@ -9,14 +9,8 @@ from hypothesis import assume, given
 from hypothesis.strategies import SearchStrategy
 
 from asp_env.data.classes import AgentClass
-from asp_env.data.geometry import box_corners, from_frame
-from asp_env.metrics.boxes import (
-    AT_FAULT,
-    Contact,
-    ego_contacts,
-    overlaps,
-    touching_trailers,
-)
+from asp_env.geometry import box_corners, from_frame, overlaps
+from asp_env.metrics.boxes import AT_FAULT, Contact, ego_contacts, touching_trailers
 
 CAR = (4.0, 2.0)
 State = tuple[float, float, float, float]

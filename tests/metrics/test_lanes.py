@@ -8,8 +8,9 @@ import numpy as np
 import pytest
 from hypothesis import given
 
-from asp_env.data.geometry import box_corners, from_frame
 from asp_env.data.road_map import Ragged, RoadMap
+from asp_env.geometry import box_corners, from_frame
+from asp_env.metrics.driving.map_context import distance_to_route_lanes_m, reachable
 from asp_env.metrics.lanes import (
     against_traffic_m,
     at_crossing,
@@ -18,7 +19,6 @@ from asp_env.metrics.lanes import (
     lane_table,
     speed_limits,
 )
-from asp_env.metrics.ways import off_ways_m, reachable
 from tests.metrics.streets import (
     CAR,
     EAST,
@@ -189,9 +189,9 @@ def test_distance_to_the_ways() -> None:
     """
     route = np.array([(0.0, 3.0), (120.0, 3.0)])
     states = np.concatenate([at(10, 0), at(20, 4), at(120, 20), at(10, -6)])
-    np.testing.assert_allclose(off_ways_m(STREET, states, route), [0, 1, 0, 6])
+    np.testing.assert_allclose(distance_to_route_lanes_m(STREET, states, route), [0, 1, 0, 6])
     beside = street_map(without=(EAST,))  # of what the log drove on, nothing is missed
-    np.testing.assert_allclose(off_ways_m(beside, states, route)[:2], [3, 1])
+    np.testing.assert_allclose(distance_to_route_lanes_m(beside, states, route)[:2], [3, 1])
 
 
 def test_a_map_of_centre_lines_tells_nothing() -> None:
@@ -202,7 +202,9 @@ def test_a_map_of_centre_lines_tells_nothing() -> None:
     assert not at_crossing(BARE, state, CAR[None]).any()
     assert not against_traffic_m(BARE, np.array([(20.0, 4.0), (30.0, 4.0)])).any()
     assert not speed_limits(BARE, state).valid.any()
-    assert off_ways_m(BARE, state, np.array([(0.0, 0.0), (50.0, 0.0)])).tolist() == [2.0]
+    assert distance_to_route_lanes_m(BARE, state, np.array([(0.0, 0.0), (50.0, 0.0)])).tolist() == [
+        2.0
+    ]
 
 
 @given(

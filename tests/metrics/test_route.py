@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from hypothesis import given
 
-from asp_env.metrics.route import route_coordinates
+from asp_env.geometry import route_coordinates
 
 ANYWHERE = -1.0
 

@@ -5,7 +5,7 @@ import dataclasses
 import numpy as np
 from jaxtyping import Float
 
-from asp_env.data.forecast import Forecast, constant_velocity, make_forecast
+from asp_env.data.predictor import Forecast, constant_velocity, make_forecast
 from asp_env.data.road_map import Ragged, RoadMap
 from asp_env.data.scene import Scene
 from asp_env.planning.planner import Planner

@@ -12,10 +12,10 @@ from typing import Any
 import lightning.pytorch as pl
 from torch import nn
 
-from predictors.checkpoint import save_weights
-from predictors.fitting import train
-from predictors.hardware import Hardware
-from predictors.lightning_parts import Fit, TellEpochs
+from predictors.inference.checkpoint import save_weights
+from predictors.training.fitting import train
+from predictors.training.lightning_parts import EpochLogger, Fit
+from predictors.training.trainer import Hardware
 from tests.predictors.tiny import tiny_config
 
 
@@ -39,7 +39,7 @@ def run(
         path = out.with_name(f"rank-{self.trainer.global_rank}.safetensors")
         save_weights(self.network.state_dict(), path)
 
-    def die(self: TellEpochs, trainer: pl.Trainer, pl_module: pl.LightningModule) -> None:
+    def die(self: EpochLogger, trainer: pl.Trainer, pl_module: pl.LightningModule) -> None:
         del self, pl_module
         if trainer.current_epoch == die_after:
             os._exit(9)
@@ -53,7 +53,7 @@ def run(
 
         nn.Module.compile = traced
     if die_after is not None:
-        TellEpochs.on_train_epoch_end = die
+        EpochLogger.on_train_epoch_end = die
     train(tiny_config(predictor, view, **changes), data, out, hardware=Hardware(**hardware))
 
 

@@ -12,11 +12,11 @@ from asp_env import registry
 from asp_env.data.recording import Recording
 from asp_env.data.snippets import index_snippets
 from asp_env.views import make_view
-from predictors.batch import Batch, Labels
-from predictors.checkpoint import save_learned, shape_for
-from predictors.network import AbstractNetwork, LearnedPlug, NetworkConfig, NetworkShape
-from predictors.recipes import TrainingConfig, recipe
-from predictors.samples import Batches
+from predictors.inference.checkpoint import save_learned, shape_for
+from predictors.models.batch import Batch, Labels
+from predictors.models.network import AbstractNetwork, LearnedPlug, NetworkConfig, NetworkShape
+from predictors.training.data import Batches
+from predictors.training.recipes import TrainingConfig, recipe
 from tests.builders import make_recording
 from tests.data.levelx_files import write_map, write_recording
 

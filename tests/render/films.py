@@ -4,7 +4,7 @@ import numpy as np
 
 from asp_env.data.classes import AgentClass
 from asp_env.data.rollout import Rollout
-from asp_env.data.scenario import Scenario
+from asp_env.data.scenarios.scenario import Scenario
 from asp_env.render.film import Film
 from tests.builders import make_map
 

@@ -7,8 +7,7 @@ import pytest
 
 from asp_env.errors import DataError
 from asp_env.render.film import ALARM, WARNING, frames_of
-from asp_env.render.frames import CLASS_COLOURS, EGO_COLOUR, GHOST, PLAN
-from asp_env.render.labels import FAINT
+from asp_env.render.frames import CLASS_COLOURS, EGO_COLOUR, FAINT, GHOST, PLAN
 from tests.render.films import make_film, make_rollout
 
 FILM = make_film()

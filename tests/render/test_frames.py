@@ -10,7 +10,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from asp_env.data.classes import AgentClass
-from asp_env.data.forecast import Forecast, make_forecast
+from asp_env.data.predictor import Forecast, make_forecast
 from asp_env.data.recording import Background
 from asp_env.data.scene import Scene
 from asp_env.errors import AspEnvError, DataError

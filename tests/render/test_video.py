@@ -15,8 +15,7 @@ from selenium.webdriver.common.by import By
 from selenium.webdriver.support.ui import WebDriverWait
 
 from asp_env.errors import AspEnvError, MissingExtraError
-from asp_env.render.film import frames_of
-from asp_env.render.video import check_video_possible, write_video
+from asp_env.render.film import check_video_possible, frames_of, write_video
 from tests.render.films import make_film
 
 WIDTH, HEIGHT, FPS, COUNT = 160, 120, 10.0, 25
@@ -146,7 +145,7 @@ def test_what_cannot_become_a_video_is_refused(
 
 def test_without_av_the_extra_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
     """One line that says what to install."""
-    monkeypatch.setattr("asp_env.render.video.find_spec", lambda _: None)
+    monkeypatch.setattr("asp_env.render.film.find_spec", lambda _: None)
     with pytest.raises(MissingExtraError, match=r"'av'.*asp-env\[render\]"):
         check_video_possible(Path("film.mp4"), (160, 120), 10.0)
 

@@ -14,8 +14,7 @@ import pytest
 
 from asp_env.errors import AspEnvError, MissingExtraError
 from asp_env.render.film import STILL_S
-from asp_env.render.player import SPEEDS, Playing, play
-from asp_env.render.window import Window
+from asp_env.render.window import SPEEDS, Playing, Window, play
 from tests.render.films import make_film
 from tests.render.screens import open_screen
 

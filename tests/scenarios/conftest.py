@@ -4,7 +4,7 @@ from pathlib import Path
 
 import pytest
 
-from scenarios.synthetic import synthesize
+from scenarios.sumo import synthesize
 
 SITES = ("intersection", "roundabout")
 

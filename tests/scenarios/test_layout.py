@@ -9,7 +9,7 @@ import pytest
 
 from asp_env.data.classes import AgentClass
 from asp_env.data.source import load
-from asp_env.dynamics import wrap_angle
+from asp_env.geometry import wrap_angle
 from asp_env.metrics.drivable import off_road_m
 
 RECORDINGS = ("00", "01")

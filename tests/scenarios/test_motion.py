@@ -5,7 +5,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from scenarios.noise import measure, savitzky_golay
-from scenarios.synthetic.motion import ease_lane_changes, gaussian, reconstruct
+from scenarios.sumo.motion import ease_lane_changes, gaussian, reconstruct
 
 
 def straight(speeds: np.ndarray, *, heading: float = 0.0) -> np.ndarray:

@@ -13,8 +13,8 @@ import pytest
 from asp_env import registry
 from asp_env.data.source import load
 from asp_env.errors import AspEnvError, MissingExtraError
+from scenarios.sumo import dataset, open_source, synthesize
 from scenarios.synthesize import Synthesize
-from scenarios.synthetic import open_source, plugs, synthesize
 
 SAMPLES = Path(__file__).parents[2] / "asp_env" / "samples"
 
@@ -31,7 +31,7 @@ def contents(folder: Path) -> dict[str, str]:
 def test_same_seed_same_bytes_in_another_process(short: Path, tmp_path: Path) -> None:
     """Another process writes the same files, byte for byte."""
     script = (
-        "from pathlib import Path; from scenarios.synthetic import synthesize; "
+        "from pathlib import Path; from scenarios.sumo import synthesize; "
         f"synthesize(Path({str(tmp_path / 'again')!r}), site='intersection', recordings=1, "
         "minutes=0.1, seed=7)"
     )
@@ -147,9 +147,9 @@ def stand_in(marker: str) -> Callable[..., None]:
 def test_the_source_is_made_once(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """The second call finds what the first one made; nothing else is left in the cache."""
     monkeypatch.setenv("ASP_ENV_CACHE", str(tmp_path))
-    monkeypatch.setattr(plugs, "synthesize", stand_in("first"))
+    monkeypatch.setattr(dataset, "synthesize", stand_in("first"))
     folder = open_source("roundabout")
-    monkeypatch.setattr(plugs, "synthesize", stand_in("second"))
+    monkeypatch.setattr(dataset, "synthesize", stand_in("second"))
     assert open_source("roundabout") == folder
     assert (folder / "marker").read_text() == "first"
     assert [path.name for path in folder.parent.iterdir()] == [folder.name]
@@ -163,9 +163,9 @@ def test_the_slower_of_two_takes_what_the_faster_made(
 
     def overtaken(out: Path, **_: object) -> None:
         stand_in("slower")(out)
-        stand_in("faster")(tmp_path / "synthetic" / f"intersection-{plugs.SOURCE_VERSION}")
+        stand_in("faster")(tmp_path / "synthetic" / f"intersection-{dataset.SOURCE_VERSION}")
 
-    monkeypatch.setattr(plugs, "synthesize", overtaken)
+    monkeypatch.setattr(dataset, "synthesize", overtaken)
     folder = open_source("intersection")
     assert (folder / "marker").read_text() == "faster"
     assert [path.name for path in folder.parent.iterdir()] == [folder.name]

@@ -5,11 +5,11 @@ from pathlib import Path
 import numpy as np
 import pandas as pd
 
-from asp_env.data.geometry import box_corners
 from asp_env.dynamics import inverse, rollout
-from scenarios.synthetic.demand import SHARES, demand, right_turn_rad
-from scenarios.synthetic.junctions import crossroads
-from scenarios.synthetic.overlaps import boxes_overlap
+from asp_env.geometry import box_corners
+from scenarios.sumo.dataset import boxes_overlap
+from scenarios.sumo.demand import SHARES, demand, right_turn_rad
+from scenarios.sumo.sites import crossroads
 
 STEP = 5
 """Frames in 0.2 s."""

@@ -7,9 +7,7 @@ import numpy as np
 import pytest
 
 from asp_env.errors import AspEnvError
-from asp_env.sim.observation import Observer
-from asp_env.sim.observed import STATE_FIELDS
-from asp_env.sim.sight import ego_sight
+from asp_env.sim.observation import STATE_FIELDS, Observer, ego_context
 from asp_env.views import make_picture_view
 from tests.builders import make_recording
 from tests.sim.worlds import HISTORY, drive, on_road, scenario, simulate
@@ -20,7 +18,7 @@ VIEW = make_picture_view("chauffeurnet", pixels=(90, 60))
 def _state(simulation) -> dict[str, float]:
     observer = Observer(("state",), VIEW, HISTORY)
     world = simulation.world
-    row = observer.observe(ego_sight(world), world.events())["state"][0]
+    row = observer.observe(ego_context(world), world.events())["state"][0]
     return dict(zip(STATE_FIELDS, row.tolist(), strict=True))
 
 
@@ -62,7 +60,7 @@ def test_actions_are_the_last_three_seconds_oldest_first():
     drive(simulation, [(1.0, 0.0), (0.0, 0.1), (-2.0, -0.2)])
     observer = Observer(("actions",), VIEW, HISTORY)
     world = simulation.world
-    actions = observer.observe(ego_sight(world), world.events())["actions"]
+    actions = observer.observe(ego_context(world), world.events())["actions"]
     assert actions.shape == (1, 15, 2)
     expected = np.array([(0, 0)] * 12 + [(1, 0), (0, 0.1), (-2, -0.2)])
     assert actions[0] == pytest.approx(expected, abs=3e-3)
@@ -82,7 +80,7 @@ def test_observations_lie_in_their_space(names):
     observer = Observer(names, VIEW, HISTORY)
     simulation = simulate(make_recording(), [scenario(3), scenario(5)])
     drive(simulation, [(5.0, 0.7)] * 4)
-    observed = observer.observe(ego_sight(simulation.world), simulation.world.events())
+    observed = observer.observe(ego_context(simulation.world), simulation.world.events())
     assert set(observed) == set(observer.space)
     for row in range(2):
         assert {name: part[row] for name, part in observed.items()} in observer.space
@@ -96,7 +94,7 @@ def test_wild_values_are_clipped_to_the_bounds():
     world.episodes.inferred[0] -= 1
     world.episodes.on_route[0] = (-900.0, -890.0, 0.0)
     observer = Observer(("actions", "state"), VIEW, HISTORY)
-    observed = observer.observe(ego_sight(world), world.events())
+    observed = observer.observe(ego_context(world), world.events())
     assert {name: part[0] for name, part in observed.items()} in observer.space
     assert observed["actions"][0, -1, 0] == 10.0
     assert observed["state"][0, 0] == 60.0

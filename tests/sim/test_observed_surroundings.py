@@ -6,9 +6,13 @@ import numpy as np
 import pytest
 
 from asp_env.errors import AspEnvError
-from asp_env.sim.observation import Observer
-from asp_env.sim.observed import ROUTE_POINTS, ROUTE_STEP_M
-from asp_env.sim.sight import Sight, ego_sight
+from asp_env.sim.observation import (
+    ROUTE_POINTS,
+    ROUTE_STEP_M,
+    ObservationContext,
+    Observer,
+    ego_context,
+)
 from asp_env.views import make_picture_view
 from asp_env.views.vectors import AGENT_FIELDS, VectorView
 from tests.builders import make_recording
@@ -20,7 +24,7 @@ X, Y, SPEED = (AGENT_FIELDS.index(name) for name in ("x", "y", "speed"))
 
 def _observe(simulation, *names: str) -> dict[str, np.ndarray]:
     world = simulation.world
-    return Observer(names, VIEW, HISTORY).observe(ego_sight(world), world.events())
+    return Observer(names, VIEW, HISTORY).observe(ego_context(world), world.events())
 
 
 def test_a_neighbour_by_hand():
@@ -96,10 +100,10 @@ def test_some_episodes_are_seen_as_among_all():
     replay(simulation, 3)
     world, events = simulation.world, simulation.world.events()
     observer = Observer(("vectors", "raster", "actions", "state", "route"), VIEW, HISTORY)
-    everybody = observer.observe(ego_sight(world), events)
+    everybody = observer.observe(ego_context(world), events)
     rows = np.array([2, 0])
     fields = {each.name: getattr(events, each.name)[rows] for each in dataclasses.fields(events)}
-    some = observer.observe(ego_sight(world, rows), type(events)(**fields))
+    some = observer.observe(ego_context(world, rows), type(events)(**fields))
     for name, part in some.items():
         assert part.tobytes() == everybody[name][rows].tobytes()
 
@@ -109,11 +113,11 @@ def test_the_former_content_of_memory_does_not_matter():
     simulation = simulate(make_recording(), [scenario(3), scenario(5)])
     world = simulation.world
     observer = Observer(("vectors", "raster", "actions", "state", "route"), VIEW, HISTORY)
-    fresh = observer.observe(ego_sight(world), world.events())
+    fresh = observer.observe(ego_context(world), world.events())
     memory = observer.memory(2)
     for part in memory.values():
         part.view(np.uint8)[:] = 127
-    told = observer.observe(ego_sight(world), world.events(), memory)
+    told = observer.observe(ego_context(world), world.events(), memory)
     for name, part in told.items():
         assert part is memory[name]
         assert part.tobytes() == fresh[name].tobytes()
@@ -127,9 +131,9 @@ def test_nothing_is_computed_that_nobody_asked_for(monkeypatch):
 
     simulation = simulate(on_road(), scenario())
     monkeypatch.setattr(type(VIEW), "draw", refuse)
-    monkeypatch.setattr("asp_env.sim.scenario_world.ScenarioWorld.scene", refuse)
+    monkeypatch.setattr("asp_env.sim.world.World.scene", refuse)
     _observe(simulation, "actions", "state")
-    monkeypatch.setattr("asp_env.sim.observed.infer_actions", refuse)
+    monkeypatch.setattr("asp_env.sim.observation.infer_actions", refuse)
     _observe(simulation, "vectors", "route")
     with pytest.raises(AssertionError, match="nobody asked"):
         _observe(simulation, "raster")
@@ -139,8 +143,8 @@ def test_a_sight_is_the_scene_without_its_actions():
     """The same states and masks of the last ticks; the egos are the targets."""
     simulation = simulate(make_recording(), [scenario(3), scenario(5)])
     drive(simulation, [(1.0, 0.0)] * 2)
-    sight, scene = ego_sight(simulation.world), simulation.world.scene()
-    assert isinstance(sight, Sight)
+    sight, scene = ego_context(simulation.world), simulation.world.scene()
+    assert isinstance(sight, ObservationContext)
     assert sight.states.tobytes() == (scene.states * scene.valid[..., None]).tobytes()
     assert np.array_equal(sight.valid, scene.valid)
     assert np.array_equal(sight.targets, [(0, 0), (1, 0)])

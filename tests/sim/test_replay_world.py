@@ -6,11 +6,11 @@ import numpy as np
 import pytest
 
 from asp_env.data.classes import FOOTPRINTS_M, AgentClass
-from asp_env.data.scenario import find_scenarios
+from asp_env.data.scenarios.scenario import find_scenarios
+from asp_env.data.scene import EGO
 from asp_env.data.source import open_data
 from asp_env.errors import AspEnvError
 from asp_env.metrics.boxes import Contact
-from asp_env.sim.world import EGO
 from tests.builders import Drive, make_recording
 from tests.real_data import real_data
 from tests.sim.worlds import (

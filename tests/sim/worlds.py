@@ -6,11 +6,10 @@ import numpy as np
 
 from asp_env.data.classes import AgentClass
 from asp_env.data.recording import Recording
-from asp_env.data.scenario import Scenario
-from asp_env.sim.replay import ReplayWorld
-from asp_env.sim.scenario_world import ScenarioWorld
+from asp_env.data.scenarios.scenario import Scenario
 from asp_env.sim.simulation import Simulation
-from asp_env.sim.traffic import TrafficSpec, make_traffic
+from asp_env.sim.traffic.assignment import TrafficSpec, make_traffic
+from asp_env.sim.world import ReplayWorld, World
 from tests.builders import Drive, make_recording
 
 DT_S = 0.2
@@ -58,7 +57,7 @@ def simulate(
     recordings: Sequence[Recording] | Recording,
     scenarios: Sequence[Scenario] | Scenario,
     traffic: TrafficSpec = "log",
-    kind: type[ScenarioWorld] = ReplayWorld,
+    kind: type[World] = ReplayWorld,
 ) -> Simulation:
     """Episodes that have just begun."""
     recordings = [recordings] if isinstance(recordings, Recording) else recordings

@@ -9,9 +9,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from asp_env.views.area import drivable_rings, fill_rings
-from asp_env.views.placed import place
-from asp_env.views.view import View
+from asp_env.views.map_layers import drivable_rings, fill_rings
+from asp_env.views.view import View, place
 from tests.views.scenes import make_map, make_scene, standing
 
 HEIGHT, WIDTH = 20, 30

@@ -4,8 +4,8 @@ import math
 
 import numpy as np
 
-from asp_env.data.road_map import LineType
-from asp_env.views.boundaries import MapCache, boundary_pieces
+from asp_env.data.road_map import LineType, MapCache
+from asp_env.views.map_layers import boundary_pieces
 from tests.views.scenes import make_map
 
 

@@ -11,8 +11,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from asp_env.data.classes import AgentClass
-from asp_env.data.geometry import to_frame
 from asp_env.data.road_map import LineType
+from asp_env.geometry import to_frame
 from asp_env.views import BinaryView, PictureView
 from asp_env.views.chauffeurnet import ChauffeurNet
 from asp_env.views.mtp import MTP

@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 
 from asp_env.errors import AspEnvError
 from asp_env.views.chauffeurnet import ChauffeurNet
-from asp_env.views.packing import pack_bits, unpack_bits
+from asp_env.views.draw import pack_bits, unpack_bits
 from asp_env.views.view import View
 from tests.views.scenes import COARSE, busy_scene
 

@@ -12,12 +12,11 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from asp_env.data.classes import AgentClass
-from asp_env.data.geometry import to_frame
 from asp_env.data.road_map import LineType, Ragged, RoadMap
 from asp_env.data.scene import Scene
 from asp_env.errors import AspEnvError
-from asp_env.views.lane_pieces import KINDS, lane_pieces
-from asp_env.views.vectors import AGENT_FIELDS, LINE_FIELDS, Vectors, VectorView
+from asp_env.geometry import to_frame
+from asp_env.views.vectors import AGENT_FIELDS, KINDS, LINE_FIELDS, Vectors, VectorView, lane_pieces
 from tests.views.scenes import busy_scene, cross_map, make_map, make_scene, standing, traffic
 
 SMALL = VectorView(agents=4, lines=3)

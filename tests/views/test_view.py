@@ -11,8 +11,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from asp_env.data.geometry import from_frame
 from asp_env.errors import AspEnvError
+from asp_env.geometry import from_frame
 from asp_env.views import VIEWS, PictureView, make_picture_view, make_view, view_from_config
 from asp_env.views.chauffeurnet import ChauffeurNet
 from asp_env.views.mtp import MTP

@@ -12,12 +12,9 @@ import numpy as np
 
 from asp_env.data import cache
 from asp_env.data.readers import interaction, levelx
-from asp_env.data.readers.interaction import InteractionFiles, InteractionMeta
-from asp_env.data.readers.interaction_tracks import read_interaction
-from asp_env.data.readers.lanelet2 import read_lanelet2
-from asp_env.data.readers.levelx import LevelxFiles, RecordingMeta
-from asp_env.data.readers.origin import Origin
-from asp_env.data.readers.tracks import TrackTable, read_tracks
+from asp_env.data.readers.interaction import InteractionFiles, InteractionMeta, read_interaction
+from asp_env.data.readers.lanelet2 import Origin, read_lanelet2
+from asp_env.data.readers.levelx import LevelxFiles, RecordingMeta, TrackTable, read_tracks
 from asp_env.data.recording import Background, Recording
 from asp_env.data.road_map import Ragged, RoadMap
 from asp_env.errors import DataError

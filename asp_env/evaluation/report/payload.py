@@ -13,7 +13,7 @@ import numpy as np
 from jaxtyping import Float
 
 from asp_env.data.classes import AgentClass
-from asp_env.data.forecast import Forecast
+from asp_env.data.predictor import Forecast
 from asp_env.data.road_map import LineType, Ragged, RoadMap
 from asp_env.data.rollout import Rollout
 from asp_env.data.scene import Scene

@@ -6,8 +6,7 @@ from collections.abc import Sequence
 import plotly.graph_objects as go
 from plotly.subplots import make_subplots
 
-from asp_env.evaluation.report.notes import note
-from asp_env.evaluation.report.results import Entrant, Result, distinct, entrants
+from asp_env.evaluation.report.results import MethodResult, Result, distinct, entrants, note
 from asp_env.evaluation.report.tables import SELECTIONS, SUBSETS
 
 COLOURS = ("#e8590c", "#7048e8", "#0ca678", "#1c7ed6", "#d6336c", "#c99700", "#5c7cfa", "#74b816")
@@ -135,7 +134,7 @@ def _panels(titles: Sequence[str]) -> go.Figure:
     )
 
 
-def _colour(entrant: Entrant, colour: dict[str, str]) -> str:
+def _colour(entrant: MethodResult, colour: dict[str, str]) -> str:
     return colour.get(entrant.predictor, PRIVILEGED_COLOUR)
 
 

@@ -3,8 +3,15 @@
 from collections.abc import Sequence
 from html import escape
 
-from asp_env.evaluation.report.notes import MetricNote, note
-from asp_env.evaluation.report.results import Entrant, Result, best, distinct, entrants
+from asp_env.evaluation.report.results import (
+    MethodResult,
+    MetricNote,
+    Result,
+    best,
+    distinct,
+    entrants,
+    note,
+)
 
 SUBSETS = ("all", "moving")
 KIND_METRIC = "FDE"
@@ -47,7 +54,7 @@ def kinds(results: Sequence[Result]) -> str:
 
 
 def _kind_table(results: Sequence[Result]) -> str:
-    columns: dict[str, dict[Entrant, Result]] = {}
+    columns: dict[str, dict[MethodResult, Result]] = {}
     for result in results:
         columns.setdefault(result.subset.partition(":")[2], {})[result.entrant] = result
     counts = {kind: max(r.n or 0 for r in column.values()) for kind, column in columns.items()}
@@ -95,7 +102,7 @@ def _table(results: Sequence[Result]) -> str:
 
 
 def _selection_table(heading: str, results: Sequence[Result]) -> str:
-    cells: dict[str, dict[Entrant, Result]] = {}
+    cells: dict[str, dict[MethodResult, Result]] = {}
     for result in results:
         cells.setdefault(result.metric, {})[result.entrant] = result
     names = "".join(
@@ -109,8 +116,8 @@ def _selection_table(heading: str, results: Sequence[Result]) -> str:
 def _grid(
     heading: str,
     names: str,
-    columns: Sequence[dict[Entrant, Result]],
-    rows: Sequence[Entrant],
+    columns: Sequence[dict[MethodResult, Result]],
+    rows: Sequence[MethodResult],
 ) -> str:
     """A table with a row for each entrant; the best value of each column is bold."""
     bold = [_bold(list(column.values())) for column in columns]
@@ -145,7 +152,7 @@ def _bold(column: Sequence[Result]) -> str | None:
     return told.format(winner.value)
 
 
-def _row_head(entrant: Entrant) -> str:
+def _row_head(entrant: MethodResult) -> str:
     details = "".join(f"<small>{escape(detail)}</small>" for detail in entrant.details)
     mark = "<i class='badge'>knows the future</i>" if entrant.privileged else ""
     return f"<th>{escape(entrant.name)}{mark}{details}</th>"

@@ -10,8 +10,8 @@ import numpy as np
 
 from asp_env.data.source import Recordings, open_data
 from asp_env.sim.simulation import Simulation
-from asp_env.sim.traffic import make_traffic
-from asp_env.sim.worlds import world_of
+from asp_env.sim.traffic.assignment import make_traffic
+from asp_env.sim.world import world_of
 from tests.sim.worlds import DT_S, HISTORY
 
 

@@ -4,9 +4,10 @@ import numpy as np
 import pytest
 from hypothesis import given
 
-from asp_env.dynamics import forward, wrap_angle
+from asp_env.dynamics import forward
 from asp_env.dynamics.bicycle import Integrator
-from scenarios.highway.axes import mirror_actions, mirror_points, mirror_states
+from asp_env.geometry import wrap_angle
+from scenarios.highway.road_map import mirror_actions, mirror_points, mirror_states
 from tests.dynamics.motions import Motion, motions
 
 

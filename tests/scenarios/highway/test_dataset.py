@@ -15,12 +15,12 @@ import pytest
 
 from asp_env import registry
 from asp_env.cli import main
-from asp_env.data.scenario import find_scenarios
+from asp_env.data.scenarios.scenario import find_scenarios
 from asp_env.data.source import open_data
 from asp_env.errors import AspEnvError, DataError
-from asp_env.sim.worlds import world_of
-from scenarios.highway import plugs
-from scenarios.highway.history import hidden_path, load_history
+from asp_env.sim.world import world_of
+from scenarios.highway import dataset
+from scenarios.highway.rounds import hidden_path, load_history
 from tests.highway_folders import SITE_NAMES, highway_data, highway_folder, highway_recordings
 from tests.scenarios.highway.environments import make
 from tests.scenarios.test_synthesize import contents, stand_in
@@ -219,14 +219,14 @@ def test_what_was_never_made_here_is_refused(short, tmp_path):
 
 def test_the_source_is_made_once(tmp_path, monkeypatch):
     """The second call finds what the first one made, whose name holds the version."""
-    assert registry.find("sources", "highway") is plugs.open_source
+    assert registry.find("sources", "highway") is dataset.open_source
     monkeypatch.setenv("ASP_ENV_CACHE", str(tmp_path))
-    monkeypatch.setattr(plugs, "synthesize", stand_in("first"))
-    folder = plugs.open_source("roundabout")
-    monkeypatch.setattr(plugs, "synthesize", stand_in("second"))
-    assert plugs.open_source("roundabout") == folder
+    monkeypatch.setattr(dataset, "synthesize", stand_in("first"))
+    folder = dataset.open_source("roundabout")
+    monkeypatch.setattr(dataset, "synthesize", stand_in("second"))
+    assert dataset.open_source("roundabout") == folder
     assert (folder / "marker").read_text() == "first"
-    assert folder == tmp_path / "highway" / f"roundabout-{plugs.SOURCE_VERSION}"
+    assert folder == tmp_path / "highway" / f"roundabout-{dataset.SOURCE_VERSION}"
 
 
 def test_with_noise_the_truth_is_driven(short, tmp_path):

@@ -4,14 +4,12 @@ import numpy as np
 import pytest
 from highway_env.vehicle.kinematics import Vehicle
 
-from asp_env.data.scenario import Scenario
-from asp_env.dynamics import wrap_angle
+from asp_env.data.scenarios.scenario import Scenario
 from asp_env.dynamics.bicycle import AXLE_SHARE_OF_LENGTH
 from asp_env.errors import AspEnvError
-from asp_env.sim.replay import ReplayWorld
-from asp_env.sim.scenario_world import ScenarioWorld
+from asp_env.geometry import wrap_angle
 from asp_env.sim.simulation import Simulation
-from asp_env.sim.worlds import world_of
+from asp_env.sim.world import ReplayWorld, World, world_of
 from scenarios.highway.sites import SITES, empty_road, network
 from scenarios.highway.world import APART_M, HighwayWorld
 from tests.envs.same import same
@@ -183,7 +181,7 @@ def test_nobody_comes_near_somebody_and_who_is_barred_never_comes():
         assert _nearest_comer(world) >= APART_M
 
 
-def _nearest_comer(world: ScenarioWorld) -> float:
+def _nearest_comer(world: World) -> float:
     """The least distance of somebody who has just come to anybody else, metres."""
     valid, states, nearest = world.episodes.valid[0], world.episodes.states[0], np.inf
     for tick in range(HISTORY + 1, len(valid)):

@@ -6,20 +6,14 @@ import numpy as np
 import pytest
 from highway_env.vehicle.kinematics import Vehicle
 
-from asp_env.data.geometry import to_frame
-from asp_env.data.scenario import Scenario
-from asp_env.dynamics import (
-    MAX_ACCELERATION_MPS2,
-    MAX_STEERING_RAD,
-    forward,
-    inverse,
-    wrap_angle,
-)
+from asp_env.data.scenarios.scenario import Scenario
+from asp_env.dynamics import MAX_ACCELERATION_MPS2, MAX_STEERING_RAD, forward, inverse
 from asp_env.dynamics.bicycle import AXLE_SHARE_OF_LENGTH
-from asp_env.sim.worlds import world_of
+from asp_env.geometry import to_frame, wrap_angle
+from asp_env.sim.world import world_of
 from asp_env.views import make_picture_view
-from scenarios.highway.axes import mirror_actions, mirror_states
-from scenarios.highway.history import hidden_path, load_history
+from scenarios.highway.road_map import mirror_actions, mirror_states
+from scenarios.highway.rounds import hidden_path, load_history
 from scenarios.highway.sites import network
 from scenarios.highway.world import HighwayWorld
 from tests.highway_folders import highway_data, highway_recordings, highway_scenarios

@@ -8,10 +8,9 @@ import pytest
 from highway_env.road.lane import LineType, StraightLane
 from highway_env.road.road import RoadNetwork
 
-from asp_env.dynamics import wrap_angle
 from asp_env.errors import AspEnvError
-from scenarios.highway.axes import mirror_points
-from scenarios.highway.lanes import Strip, all_lanes, links, mouths, strips
+from asp_env.geometry import wrap_angle
+from scenarios.highway.road_map import Strip, all_lanes, links, mirror_points, mouths, strips
 from scenarios.polylines import arc_lengths
 from tests.scenarios.highway.maps import Place
 

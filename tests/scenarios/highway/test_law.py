@@ -6,17 +6,17 @@ from highway_env.envs import IntersectionEnv, RoundaboutEnv
 from highway_env.road.road import RoadNetwork
 from highway_env.vehicle.behavior import IDMVehicle
 
-from asp_env.data.scenario import Scenario, find_scenarios
-from asp_env.dynamics import wrap_angle
-from asp_env.sim.worlds import world_of
+from asp_env.data.scenarios.scenario import Scenario, find_scenarios
+from asp_env.geometry import wrap_angle
+from asp_env.sim.world import world_of
 from scenarios.highway.rounds import step_road
 from scenarios.highway.sites import (
     SITES,
     STEPS_PER_S,
-    bring_another,
-    clear_leavers,
     network,
     populated_road,
+    remove_exited,
+    spawn_vehicle,
 )
 from tests.highway_folders import SITE_NAMES, highway_recordings, highway_scenarios
 from tests.sim.worlds import DT_S, HISTORY
@@ -24,7 +24,7 @@ from tests.sim.worlds import DT_S, HISTORY
 every_site = pytest.mark.parametrize("site", SITE_NAMES)
 
 
-def goes_on(site: str, scenarios: list[Scenario], dt_s: float, history: int) -> int:
+def warm_starts_from_3s(site: str, scenarios: list[Scenario], dt_s: float, history: int) -> int:
     """Leaves episodes to themselves and compares them with the log; how many states of it."""
     recordings, kind = highway_recordings(site), world_of("highway:")
     count = len(scenarios)
@@ -50,14 +50,14 @@ def goes_on(site: str, scenarios: list[Scenario], dt_s: float, history: int) -> 
 def test_left_to_itself_everything_goes_on_as_recorded(site):
     """Nobody is driven, the egos neither: presence is the log's, states are within its rounding."""
     scenarios = list(highway_scenarios(site))[1 :: 8 if site == "intersection" else 2]
-    assert goes_on(site, scenarios, DT_S, HISTORY) > 2000
+    assert warm_starts_from_3s(site, scenarios, DT_S, HISTORY) > 2000
 
 
 @every_site
 def test_a_tick_may_be_longer(site):
     """The same with 0.4 s, in the middle of which vehicles come and leave."""
     found = find_scenarios(highway_recordings(site), source=site, dt_s=0.4, history=5)
-    assert goes_on(site, list(found)[::15], 0.4, 5) > 200
+    assert warm_starts_from_3s(site, list(found)[::15], 0.4, 5) > 200
 
 
 class _AsTraffic:
@@ -99,8 +99,8 @@ def _ours(site: str, seed: int, seconds: int) -> list[list[tuple]]:
         for _ in range(STEPS_PER_S):
             step_road(road)
             told.append(_told(road))
-        clear_leavers(SITES[site], road)
-        bring_another(SITES[site], road, rng)
+        remove_exited(SITES[site], road)
+        spawn_vehicle(SITES[site], road, rng)
         told.append(_told(road))
     return told
 

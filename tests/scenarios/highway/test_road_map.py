@@ -6,11 +6,16 @@ import numpy as np
 import pytest
 from highway_env.envs import RoundaboutEnv
 
-from asp_env.data.geometry import resample
+from asp_env.geometry import resample
 from asp_env.metrics.drivable import OFF_ROAD_M, drivable_field, off_road_m
-from scenarios.highway.axes import mirror_states
-from scenarios.highway.lanes import all_lanes, links, strips
-from scenarios.highway.road_map import ORIGIN_LAT_LON_DEG, ORIGIN_UTM_M
+from scenarios.highway.road_map import (
+    ORIGIN_LAT_LON_DEG,
+    ORIGIN_UTM_M,
+    all_lanes,
+    links,
+    mirror_states,
+    strips,
+)
 from scenarios.lanelet2 import to_degrees
 from tests.scenarios.highway.maps import Place
 

@@ -8,9 +8,14 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from scenarios.highway.hidden import read_vehicles, revive
-from scenarios.highway.history import HiddenHistory, hidden_path, load_history
-from scenarios.highway.rounds import KEPT_EVERY
+from scenarios.highway.rounds import (
+    KEPT_EVERY,
+    HiddenHistory,
+    hidden_path,
+    load_history,
+    read_vehicles,
+    restore,
+)
 from scenarios.highway.sites import empty_road, network
 from tests.conformance.places import PLACES
 from tests.highway_folders import SITE_NAMES, highway_data, highway_recordings
@@ -33,7 +38,7 @@ def test_vehicles_that_are_brought_back_are_the_same(site):
         for time in range(len(history.steps)):
             rows, steps = history.at(time * KEPT_EVERY)
             road = empty_road(history.site, steps=steps)
-            road.vehicles = revive(rows, road, history.site.vehicle)
+            road.vehicles = restore(rows, road, history.site.vehicle)
             assert read_vehicles(road).tobytes() == rows.tobytes()
             assert road.steps == steps
 

@@ -1,0 +1,1 @@
+"""`asp-env bench`: the speed of rendering, stepping, environments and predictors."""

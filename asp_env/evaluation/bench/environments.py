@@ -1,0 +1,129 @@
+"""Rates of the environments as their users call them, beside a peer where one is installed."""
+
+import importlib
+import importlib.util
+from collections.abc import Sequence
+from typing import Any
+
+import gymnasium
+import numpy as np
+
+from asp_env.evaluation.bench.timing import Rate, median_s
+
+SINGLE_STEPS = 300
+VECTOR_STEPS = 40
+RASTER_STEPS = 10
+PEER_STEPS = 40
+PEER = "highway_env"
+PEER_ID = "intersection-v2"
+
+
+def environments(data: str, *, num_envs: int, write_bytes_per_s: float) -> list[Rate]:
+    """Single and batched environments, resets included, and highway-env's intersection.
+
+    Args:
+        data: DATA.
+        num_envs: of the batched ones.
+        write_bytes_per_s: what filling rasters reaches: their floor.
+    """
+    bytes_each = 12 * 360 * 240
+    floor = {"beside": write_bytes_per_s / bytes_each, "beside_what": "only writing the pictures"}
+    peer, vehicles = _highway() if importlib.util.find_spec(PEER) else (None, 0)
+    highway = {} if peer is None else {"beside": peer, "beside_what": "highway-env"}
+    single = _single(data, ("vectors",), "log")
+    reacting = _single(data, ("vectors",), "idm")
+    vectors = _batched(data, ("vectors",), num_envs, VECTOR_STEPS)
+    state = _batched(data, ("state",), num_envs, VECTOR_STEPS)
+    raster = _batched(data, ("raster",), num_envs, RASTER_STEPS)
+    found = [
+        Rate(what="gym.make, vectors, log", per_s=single, unit="steps/s"),
+        Rate(what="gym.make, vectors, idm", per_s=reacting, unit="steps/s", **highway),
+        Rate(what=f"gym.make_vec of {num_envs}, state", per_s=state, unit="steps/s"),
+        Rate(what=f"gym.make_vec of {num_envs}, vectors 16 x 64", per_s=vectors, unit="steps/s"),
+        Rate(
+            what=f"gym.make_vec of {num_envs}, raster 12x360x240",
+            per_s=raster,
+            unit="steps/s",
+            bytes_each=bytes_each,
+            **floor,
+        ),
+    ]
+    if peer is not None:
+        told = f"highway-env {PEER_ID}, {vehicles:.0f} vehicles, 5 Hz (15 Hz inside)"
+        found.append(Rate(what=told, per_s=peer, unit="steps/s"))
+    return found
+
+
+def _single(data: str, observations: Sequence[str], traffic: str) -> float:
+    env: gymnasium.Env[Any, Any] = gymnasium.make(
+        "asp_env/Replay-v0",
+        disable_env_checker=True,
+        data=data,
+        observations=observations,
+        traffic=traffic,
+    )
+    env.reset(seed=0)
+    action = np.zeros(2, dtype=np.float32)
+
+    def drive() -> None:
+        for _ in range(SINGLE_STEPS):
+            *_, terminated, truncated, _ = env.step(action)
+            if terminated or truncated:
+                env.reset()
+
+    rate = SINGLE_STEPS / median_s(drive)
+    env.close()
+    return rate
+
+
+def _batched(data: str, observations: Sequence[str], num_envs: int, steps: int) -> float:
+    envs = gymnasium.make_vec(
+        "asp_env/Replay-v0",
+        num_envs=num_envs,
+        vectorization_mode="vector_entry_point",
+        data=data,
+        observations=observations,
+    )
+    envs.reset(seed=0)
+    actions = np.zeros((num_envs, 2), dtype=np.float32)
+
+    def drive() -> None:
+        for _ in range(steps):
+            envs.step(actions)
+
+    rate = steps * num_envs / median_s(drive)
+    envs.close()
+    return rate
+
+
+def _highway() -> tuple[float, float]:
+    """Steps per second of highway-env's intersection, and how many vehicles it had on average.
+
+    The same control rate, a kinematic bicycle, a table of 16 vehicles as observation.
+    """
+    importlib.import_module(PEER)  # registers its environments
+
+    config = {
+        "action": {"type": "ContinuousAction", "dynamical": False},
+        "observation": {"type": "Kinematics", "vehicles_count": 16},
+        "simulation_frequency": 15,
+        "policy_frequency": 5,
+        "initial_vehicle_count": 20,
+        "duration": 1000,
+    }
+    env: gymnasium.Env[Any, Any] = gymnasium.make(PEER_ID, disable_env_checker=True, config=config)
+    road: Any = env.unwrapped
+    env.reset(seed=0)
+    seen: list[int] = []
+    action = np.zeros(2, dtype=np.float32)
+
+    def drive() -> None:
+        for _ in range(PEER_STEPS):
+            *_, terminated, truncated, _ = env.step(action)
+            seen.append(len(road.road.vehicles))
+            if terminated or truncated:
+                env.reset()
+
+    rate = PEER_STEPS / median_s(drive)
+    env.close()
+    return rate, float(np.mean(seen))

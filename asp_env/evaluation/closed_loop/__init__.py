@@ -1,0 +1,1 @@
+"""Closed-loop evaluation: a planner drives the ego by forecasts."""

@@ -1,0 +1,196 @@
+"""`asp-env watch`: rollouts that were driven, in a window or as a video."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated
+
+import numpy as np
+import tyro
+from rich.console import Console
+from rich.progress import track
+from rich.table import Table
+
+from asp_env.data.recording import Recording, frames_per_tick
+from asp_env.data.rollout import Rollout
+from asp_env.data.snippets import gather_window
+from asp_env.data.source import Recordings, open_data
+from asp_env.errors import AspEnvError, DataError
+from asp_env.render.film import MAX_SIDE_PX, Film, check_video_possible, frames_of, write_video
+from asp_env.render.window import Playing, play
+
+SAME_PLACE_M = 1.0
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Watch:
+    """Show rollouts that `asp-env drive` left: in a window, or as a video for browsers."""
+
+    rollout: Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="ROLLOUT")]
+    """An `.npz` of a drive, or a folder: all of them below it, one after the other."""
+    video: Path | None = None
+    """Write a video instead: FILE.mp4 (H.264) or FILE.webm (VP9); must not exist."""
+    list: tyro.conf.FlagCreatePairsOff[bool] = False
+    """Only list what there is."""
+    map: tyro.conf.FlagCreatePairsOff[bool] = False
+    """Show the whole map instead of following the ego."""
+    follow: float = 110.0
+    """Width in metres of what is shown about the ego."""
+    size: tuple[int, int] = (1280, 720)
+    """Width and height in pixels."""
+    fps: float = 25.0
+    """Pictures a second in a video; positions between ticks are interpolated."""
+    speed: float = 1.0
+    """Seconds of the drive per second."""
+    data: str | None = None
+    """DATA of the drive, where its name has changed since."""
+
+    def run(self) -> None:
+        """Plays, writes the video, or lists.
+
+        Raises:
+            AspEnvError: an option is out of range, there is nothing to watch or no screen, or
+                the video cannot be written.
+            DataError: a rollout or its DATA cannot be read.
+        """
+        self._check()
+        rollouts = load_rollouts(self.rollout)
+        console = Console()
+        if self.list:
+            console.print(_table(self.rollout, rollouts))
+            return
+        films = make_films(rollouts, self.data)
+        if self.video is None:
+            playing = Playing(films=films, speed=self.speed, whole_map=self.map)
+            play(playing, size_px=self.size, extent_m=self.follow)
+            return
+        extent_m = None if self.map else self.follow
+        frames = frames_of(
+            films, size_px=self.size, extent_m=extent_m, fps=self.fps, speed=self.speed
+        )
+        total = sum(len(film.times_s(self.fps, self.speed)) for film in films)
+        shown = track(frames, "drawing", total=total, console=console, transient=True)
+        count = write_video(self.video, shown, fps=self.fps)
+        console.print(f"wrote {self.video}: {count / self.fps:.1f} s", soft_wrap=True)
+
+    def _check(self) -> None:
+        if not all(1 <= side <= MAX_SIDE_PX for side in self.size):
+            raise AspEnvError(
+                f"--size {self.size[0]} {self.size[1]}: expected a width and a height from 1 to "
+                f"{MAX_SIDE_PX}"
+            )
+        for name, value in (("follow", self.follow), ("speed", self.speed)):
+            if not 0.01 <= value <= 10_000:
+                raise AspEnvError(f"--{name} {value:g}: expected a number from 0.01 to 10000")
+        if self.video is not None:
+            check_video_possible(self.video, self.size, self.fps)
+            if self.video.exists():
+                raise AspEnvError(f"{self.video}: exists already; choose another or remove it")
+
+
+def load_rollouts(path: Path) -> dict[Path, Rollout]:
+    """The rollout of a file, or those below a folder in the order of their paths.
+
+    Raises:
+        DataError: there is none, or one cannot be read.
+    """
+    if not path.is_dir():
+        return {path: Rollout.load(path)}
+    found = sorted(each for each in path.rglob("*.npz") if not each.name.startswith("."))
+    if not found:
+        raise DataError(f"{path}: no rollouts (.npz) below it; asp-env drive writes them")
+    return {each: Rollout.load(each) for each in found}
+
+
+def make_films(rollouts: Mapping[Path, Rollout], data: str | None) -> list[Film]:
+    """Rollouts with the places where they were driven.
+
+    Args:
+        rollouts: by their paths.
+        data: DATA, where it is not what the rollouts say.
+
+    Raises:
+        DataError: DATA cannot be opened, or they are not those that were driven on.
+    """
+    sources: dict[str, Recordings] = {}
+    films = []
+    for path, rollout in rollouts.items():
+        source = rollout.scenario.source if data is None else data
+        if source not in sources:
+            sources[source] = _open(path, source)
+        recording = _recording(path, rollout, sources[source])
+        try:
+            films.append(
+                Film(
+                    rollout=rollout,
+                    road_map=recording.road_map,
+                    background=recording.background,
+                    title=_title(path, rollout),
+                )
+            )
+        except DataError as error:
+            raise DataError(f"{path}: {error}") from error
+    return films
+
+
+def _open(path: Path, source: str) -> Recordings:
+    try:
+        return open_data(source)
+    except AspEnvError as error:
+        raise DataError(
+            f"{path}: was driven on DATA that cannot be opened ({error}); name it with --data"
+        ) from error
+
+
+def _recording(path: Path, rollout: Rollout, recordings: Recordings) -> Recording:
+    """The recording that a rollout was driven on.
+
+    Raises:
+        DataError: DATA have none of its name, or its ego is not where the rollout says.
+    """
+    scenario = rollout.scenario
+    what = f"{path}: was driven on other DATA than {recordings.source!r}"
+    if scenario.recording_name not in recordings.names:
+        raise DataError(
+            f"{what}, which have no recording {scenario.recording_name!r}; name the "
+            "right one with --data"
+        )
+    recording = recordings[recordings.names.index(scenario.recording_name)]
+    track_number = np.flatnonzero(recording.track_ids == scenario.ego_id)
+    states, valid = gather_window(
+        recording,
+        track_number[:1],
+        first_tick=scenario.start_tick,
+        num_ticks=1,
+        stride=frames_per_tick(recording.frame_rate_hz, rollout.dt_s),
+    )
+    away_m = np.hypot(*(states[valid] - rollout.log_states[:1, 0])[:, :2].T)
+    if not (len(away_m) and away_m[0] < SAME_PLACE_M):
+        raise DataError(
+            f"{what}, whose track {scenario.ego_id} of recording {recording.name} is not there at "
+            f"tick {scenario.start_tick}; name the right one with --data"
+        )
+    return recording
+
+
+def _title(path: Path, rollout: Rollout) -> str:
+    """Who drove, as far as the folder tells, and what."""
+    tags = f" ({', '.join(rollout.scenario.tags)})" if rollout.scenario.tags else ""
+    scenario = rollout.scenario.name + tags
+    driver = path.absolute().parent
+    return f"{driver.name}: {scenario}" if driver.parent.name == "rollouts" else scenario
+
+
+def _table(folder: Path, rollouts: Mapping[Path, Rollout]) -> Table:
+    table = Table(box=None)
+    for name in ("rollout", "seconds", "tags", "what went wrong"):
+        table.add_column(name, overflow="fold")
+    for path, rollout in rollouts.items():
+        happened = np.flatnonzero(rollout.events.any(axis=0)).tolist()
+        table.add_row(
+            str(path.relative_to(folder) if path != folder else path),
+            f"{(len(rollout.states) - 1) * rollout.dt_s:.1f}",
+            ", ".join(rollout.scenario.tags),
+            ", ".join(rollout.event_names[kind] for kind in happened),
+        )
+    return table

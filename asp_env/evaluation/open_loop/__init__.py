@@ -1,0 +1,1 @@
+"""Open-loop evaluation: forecasts against the recorded future."""

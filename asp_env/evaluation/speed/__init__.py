@@ -1,1 +1,0 @@
-"""What `asp-env bench` measures: copying, drawing, stepping, environments, predictors."""

@@ -1,0 +1,1 @@
+"""Metrics of driven episodes: scores, comfort, time to collision and realism."""

@@ -1,0 +1,1 @@
+"""Metrics of forecasts: errors, calibration and feasibility."""

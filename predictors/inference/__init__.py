@@ -1,0 +1,1 @@
+"""Trained predictors: checkpoints, the predictor socket, calibration and export."""

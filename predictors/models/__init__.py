@@ -1,0 +1,1 @@
+"""Networks: encoders, heads, losses and the predictors of the paper."""

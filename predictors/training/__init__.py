@@ -1,0 +1,1 @@
+"""Training with Lightning: recipes, data, optimisation and the command `asp-env train`."""

@@ -1,0 +1,394 @@
+"""Who touches whom: SUMO watches over lanes, not over the corners of boxes that cut them.
+
+MERGED: One recording's road users: demand, simulation, motion, and what the picture shows of it.
+MERGED: A folder of recordings in the inD layout.
+MERGED: What the registry finds here: the source `synthetic:`.
+"""
+
+import shutil
+import tempfile
+from pathlib import Path
+
+import numpy as np
+from jaxtyping import Bool, Float
+from rich.console import Console
+from rich.progress import track as with_progress
+
+from asp_env.data.cache import get_or_create
+from asp_env.errors import AspEnvError, unknown_name
+from asp_env.files import written_aside
+from asp_env.geometry import box_corners
+from scenarios.noise import measure
+from scenarios.sumo.demand import RoadUser, demand
+from scenarios.sumo.motion import FRAME_RATE_HZ, Motion, reconstruct
+from scenarios.sumo.network import Movements, simulate
+from scenarios.sumo.place import METRES_PER_ORTHO_PIXEL, SITES, Place, make_place
+from scenarios.tables import Meta, Track, write_recording_meta, write_tracks, write_tracks_meta
+
+EVERY_FRAMES = 5
+
+
+def overlapping(motions: dict[str, Motion], users: dict[str, RoadUser]) -> set[tuple[str, str]]:
+    """Pairs of names whose boxes overlap at some time; two pedestrians may.
+
+    Args:
+        motions: of all road users, by name.
+        users: size and class of the same names.
+    """
+    names = [name for name in sorted(motions) if len(motions[name].xy)]
+    rows: list[np.ndarray] = []
+    for number, name in enumerate(names):
+        motion, user = motions[name], users[name]
+        first = -motion.first_frame % EVERY_FRAMES
+        xy, heading = motion.xy[first::EVERY_FRAMES], motion.heading_rad[first::EVERY_FRAMES]
+        table = np.empty((len(xy), 7))
+        table[:, 0] = (motion.first_frame + first) // EVERY_FRAMES + np.arange(len(xy))
+        table[:, 1] = number
+        table[:, 2:4], table[:, 4] = xy, heading
+        table[:, 5:] = user.length_m, user.width_m
+        rows.append(table)
+    if not rows:
+        return set()
+    table = np.concatenate(rows)
+    table = table[np.argsort(table[:, 0], kind="stable")]
+    reach = 0.5 * np.hypot(table[:, 5], table[:, 6])
+    crowd = int(np.unique(table[:, 0], return_counts=True)[1].max())
+    pairs: list[np.ndarray] = []
+    for apart in range(1, crowd):
+        near = table[:-apart, 0] == table[apart:, 0]
+        distance = np.hypot(*(table[apart:, 2:4] - table[:-apart, 2:4]).T)
+        near &= distance < reach[:-apart] + reach[apart:]
+        first = np.flatnonzero(near)
+        pairs.append(np.column_stack([first, first + apart]))
+    a, b = np.concatenate([np.empty((0, 2), dtype=np.int64), *pairs]).T
+    corners = box_corners(table[:, 2:5], table[:, 5:])
+    touching = boxes_overlap(corners[a], corners[b])
+    found = {
+        (names[int(one)], names[int(other)])
+        for one, other in np.column_stack([table[a, 1], table[b, 1]])[touching]
+    }
+    feet = "pedestrian"
+    return {(one, other) for one, other in found if {users[one].kind, users[other].kind} != {feet}}
+
+
+def boxes_overlap(
+    a: Float[np.ndarray, "n 4 2"], b: Float[np.ndarray, "n 4 2"]
+) -> Bool[np.ndarray, " n"]:
+    """Whether boxes given by their corners overlap, pair by pair (separating axes)."""
+    overlap = np.ones(len(a), dtype=bool)
+    for box in (a, b):
+        for axis in (box[:, 1] - box[:, 0], box[:, 2] - box[:, 1]):
+            along_a, along_b = (np.einsum("nij,nj->ni", corners, axis) for corners in (a, b))
+            overlap &= along_a.min(axis=1) < along_b.max(axis=1)
+            overlap &= along_b.min(axis=1) < along_a.max(axis=1)
+    return overlap
+
+
+WARM_UP_S = 80.0
+"""Before the recording begins, so that the place is full when it does."""
+_AFTER_S = 4.0
+_FEWEST_FRAMES = 25
+_EDGE_M = 1.0
+_MOST_ATTEMPTS = 12
+
+
+def record(
+    rng: np.random.Generator, place: Place, *, num_frames: int
+) -> tuple[dict[str, Motion], dict[str, RoadUser]]:
+    """Simulates traffic at a place in which nobody touches anybody.
+
+    SUMO's vehicles follow their lanes with the front bumper; the boxes that roll after may still
+    touch. Then the later of the two stays at home and the same traffic is simulated again, which
+    changes nothing before its departure.
+
+    Returns:
+        All motions in the recording's frame, by name, and the road users by name.
+    """
+    seconds = WARM_UP_S + num_frames / FRAME_RATE_HZ + _AFTER_S
+    wanted = demand(rng, place.site, seconds)
+    seed = int(rng.integers(1, 2**31 - 1))
+    motions: dict[str, Motion] = {}
+    late: set[str] = set()
+    for _ in range(_MOST_ATTEMPTS):
+        moved = simulate(place.folder, wanted.routes, seconds=seconds, seed=seed)
+        motions = _motions(moved, place, wanted.users)
+        departs = {name: depart for depart, name, _ in wanted.entries}
+        late = {
+            max(pair, key=lambda name: (departs[name], name))
+            for pair in overlapping(motions, wanted.users)
+        }
+        if not late:
+            break
+        wanted = wanted.without(late)
+    else:  # never seen; whoever still touches somebody is left out of the picture
+        motions = {name: motion for name, motion in motions.items() if name not in late}
+    return motions, wanted.users
+
+
+def _motions(moved: Movements, place: Place, users: dict[str, RoadUser]) -> dict[str, Motion]:
+    motions: dict[str, Motion] = {}
+    for number, name in enumerate(moved.names):
+        rows = slice(moved.starts[number], moved.starts[number + 1])
+        motion = reconstruct(
+            moved.times_s[rows],
+            moved.points[rows] + place.shift_m,
+            kind=users[name].kind,
+            length_m=users[name].length_m,
+        )
+        if motion is not None:
+            motions[name] = motion
+    return motions
+
+
+def tracks_in_view(
+    place: Place,
+    motions: dict[str, Motion],
+    users: dict[str, RoadUser],
+    *,
+    num_frames: int,
+    noise: np.random.Generator | None = None,
+) -> list[Track]:
+    """What a camera above the place sees of the motions, by first appearance.
+
+    Args:
+        place: where.
+        motions: of all road users, by name; frame 0 is the start of the simulation.
+        users: class and size of the same names.
+        num_frames: how long the recording is.
+        noise: draws measurement errors; without it the truth is seen.
+    """
+    tracks: list[tuple[int, str, Track]] = []
+    for name in sorted(motions):
+        motion, user = motions[name], users[name]
+        window = _seen(motion, place, num_frames)
+        if window is None:
+            continue
+        xy, heading = motion.xy, motion.heading_rad
+        if noise is not None:
+            xy, heading = measure(noise, xy, heading)
+        track = make_track(user, xy, heading, motion.first_frame, window)
+        tracks.append((track.first_frame, name, track))
+    tracks.sort(key=lambda entry: entry[:2])
+    return [track for _, _, track in tracks]
+
+
+def make_track(
+    user: RoadUser,
+    xy: Float[np.ndarray, "frames 2"],
+    heading_rad: Float[np.ndarray, " frames"],
+    first_frame: int,
+    window: slice,
+) -> Track:
+    """Derives velocities and accelerations, then keeps the rows of `window`."""
+    velocity = np.gradient(xy, 1.0 / FRAME_RATE_HZ, axis=0)
+    acceleration = np.gradient(velocity, 1.0 / FRAME_RATE_HZ, axis=0)
+    return Track(
+        kind=user.kind,
+        length_m=user.length_m,
+        width_m=user.width_m,
+        first_frame=first_frame + window.start - round(WARM_UP_S * FRAME_RATE_HZ),
+        xy=xy[window],
+        heading_rad=heading_rad[window],
+        velocity_mps=velocity[window],
+        acceleration_mps2=acceleration[window],
+    )
+
+
+def _seen(motion: Motion, place: Place, num_frames: int) -> slice | None:
+    """The longest time without a gap in which a road user is in the picture."""
+    frames = motion.first_frame + np.arange(len(motion.xy)) - round(WARM_UP_S * FRAME_RATE_HZ)
+    half = np.array(place.site.half_size_m) - _EDGE_M
+    seen = np.all(np.abs(motion.xy - place.shift_m) < half, axis=1)
+    seen &= (frames >= 0) & (frames < num_frames)
+    edges = np.flatnonzero(np.diff(np.concatenate([[0], seen.astype(np.int8), [0]])))
+    if not len(edges):
+        return None
+    begins, ends = edges[::2], edges[1::2]
+    longest = int(np.argmax(ends - begins))
+    if ends[longest] - begins[longest] < _FEWEST_FRAMES:
+        return None
+    return slice(int(begins[longest]), int(ends[longest]))
+
+
+def parked_cars(rng: np.random.Generator, place: Place, num_frames: int) -> list[Track]:
+    """Cars that stand in the parking places from the first frame to the last."""
+    tracks = []
+    still = np.zeros((num_frames, 2))
+    for lot in place.parking:
+        along, deep = lot[1] - lot[0], lot[3] - lot[0]
+        stalls = max(1, round(float(np.hypot(*along)) / 2.6))
+        taken = rng.random(stalls) < 0.7
+        taken[rng.integers(stalls)] = True
+        for stall in np.flatnonzero(taken):
+            middle = lot[0] + (stall + 0.5) / stalls * along + 0.5 * deep
+            heading = float(np.arctan2(deep[1], deep[0])) + np.pi * float(rng.integers(2))
+            heading += float(rng.normal(0.0, 0.02))
+            tracks.append(
+                Track(
+                    kind="car",
+                    length_m=round(float(rng.uniform(3.9, 4.8)), 2),
+                    width_m=round(float(rng.uniform(1.7, 1.9)), 2),
+                    first_frame=0,
+                    xy=np.tile(middle, (num_frames, 1)),
+                    heading_rad=np.full(num_frames, heading),
+                    velocity_mps=still,
+                    acceleration_mps2=still,
+                )
+            )
+    return tracks
+
+
+MAX_SECONDS = 24 * 3600.0
+RECORDINGS_PER_LOCATION = 3
+"""At least so many, where there are enough: a split by recording needs three at each location."""
+_DAYS = ("monday", "tuesday", "wednesday", "thursday", "friday")
+
+
+def synthesize(
+    out: Path,
+    *,
+    site: str,
+    recordings: int,
+    minutes: float,
+    seed: int,
+    noise: bool = False,
+    locations: int | None = None,
+    compress: bool = False,
+    progress: bool = False,
+) -> None:
+    """Writes synthetic traffic in the inD layout.
+
+    Args:
+        out: folder to make; may exist if it is empty.
+        site: `intersection` or `roundabout`.
+        recordings: how many.
+        minutes: length of each.
+        seed: same seed, same bytes; another seed, other places and other traffic.
+        noise: whether to write measured instead of true tracks; the truth goes to
+            `truth/XX_trueTracks.csv`, which no reader takes for a recording.
+        locations: how many places; by default one for three recordings.
+        compress: whether to write tracks as `.csv.gz`.
+        progress: whether to show a progress bar.
+
+    Raises:
+        AspEnvError: an unknown site, an impossible number, or a folder that cannot be written.
+        MissingExtraError: SUMO is not installed.
+    """
+    if site not in SITES:
+        raise unknown_name("site", site, SITES)
+    places = max(1, recordings // RECORDINGS_PER_LOCATION) if locations is None else locations
+    if not 1 <= places <= recordings or not 1.0 <= minutes * 60.0 < MAX_SECONDS or seed < 0:
+        raise AspEnvError(
+            f"{recordings} recordings of {minutes} minutes at {places} locations with seed {seed} "
+            "cannot be made: at least one recording of a second and more, at least one location "
+            "and no more than recordings, and a seed of 0 or above"
+        )
+    with written_aside(out) as folder, tempfile.TemporaryDirectory() as scratch:
+        made: dict[int, Place] = {}
+        for recording in with_progress(
+            range(recordings),
+            f"{site} traffic",
+            console=Console(stderr=True),
+            disable=not progress,
+        ):
+            location = recording * places // recordings
+            if location not in made:
+                made[location] = _make_location(folder, Path(scratch), site, seed, location)
+            _write_recording(
+                folder,
+                made[location],
+                _rng(seed, site, 1, recording),
+                recording=recording,
+                location=location,
+                num_frames=round(minutes * 60.0 * FRAME_RATE_HZ),
+                noise=noise,
+                suffix=".csv.gz" if compress else ".csv",
+            )
+
+
+def _rng(seed: int, site: str, purpose: int, number: int) -> np.random.Generator:
+    return np.random.default_rng([seed, list(SITES).index(site), purpose, number])
+
+
+def _make_location(folder: Path, scratch: Path, site: str, seed: int, location: int) -> Place:
+    rng = _rng(seed, site, 0, location)
+    kinds = SITES[site]
+    place = make_place(rng, kinds[location % len(kinds)](rng), scratch / str(location))
+    maps = folder / "maps" / "lanelets" / f"{location:02d}_{place.site.kind}"
+    maps.mkdir(parents=True)
+    place.write_map(maps / f"location{location}.osm")
+    place.write_picture(place.folder / "background.png")
+    return place
+
+
+def _write_recording(
+    folder: Path,
+    place: Place,
+    rng: np.random.Generator,
+    *,
+    recording: int,
+    location: int,
+    num_frames: int,
+    noise: bool,
+    suffix: str,
+) -> None:
+    motions, users = record(rng, place, num_frames=num_frames)
+    parked = parked_cars(rng, place, num_frames)
+    true = parked + tracks_in_view(place, motions, users, num_frames=num_frames)
+    seen = true
+    if noise:
+        moving = tracks_in_view(place, motions, users, num_frames=num_frames, noise=rng)
+        seen = parked + moving
+        (folder / "truth").mkdir(exist_ok=True)
+        write_tracks(folder / "truth" / f"{recording:02d}_trueTracks{suffix}", recording, true)
+    lat, lon = place.lat_lon_deg
+    meta = Meta(
+        recording=recording,
+        location=location,
+        frame_rate_hz=FRAME_RATE_HZ,
+        speed_limit_mps=place.site.speed_limit_mps,
+        weekday=str(rng.choice(_DAYS)),
+        start_hour=int(rng.integers(7, 19)),
+        num_frames=num_frames,
+        lat_deg=lat,
+        lon_deg=lon,
+        utm_origin_m=place.origin_utm_m,
+        metres_per_ortho_pixel=METRES_PER_ORTHO_PIXEL,
+    )
+    stem = str(folder / "data" / f"{recording:02d}_")
+    (folder / "data").mkdir(exist_ok=True)
+    shutil.copyfile(place.folder / "background.png", f"{stem}background.png")
+    write_recording_meta(Path(f"{stem}recordingMeta.csv"), meta, seen)
+    write_tracks_meta(Path(f"{stem}tracksMeta.csv"), recording, seen)
+    write_tracks(Path(f"{stem}tracks{suffix}"), recording, seen)
+
+
+SOURCE_RECORDINGS, SOURCE_MINUTES, SOURCE_SEED = 8, 5.0, 90_521
+"""What `synthetic:` consists of. The seed decides the places: one that nobody else takes."""
+SOURCE_VERSION = 2
+"""Raise when other bytes come of the same seed, so that nobody mixes them with cached ones."""
+
+
+def open_source(argument: str) -> Path:
+    """The folder of `synthetic:ARGUMENT`, made on first use in the user's cache folder.
+
+    Args:
+        argument: `intersection` or `roundabout`.
+
+    Raises:
+        AspEnvError: an unknown site, or a cache folder that cannot be written.
+    """
+    if argument not in SITES:
+        raise unknown_name("synthetic site", argument, SITES)
+    return get_or_create(
+        "synthetic",
+        f"{argument}-{SOURCE_VERSION}",
+        lambda folder: synthesize(
+            folder,
+            site=argument,
+            recordings=SOURCE_RECORDINGS,
+            minutes=SOURCE_MINUTES,
+            seed=SOURCE_SEED,
+            progress=True,
+        ),
+    )

@@ -1,0 +1,178 @@
+"""Who comes, when, where to, and how they drive: every road user is a driver of its own."""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from scenarios.sumo.sites import Arm, Site
+
+VEHICLES_PER_HOUR = {
+    "crossroads": (850.0, 1150.0),
+    "t-junction": (800.0, 1050.0),
+    "roundabout": (1000.0, 1350.0),
+    "two-lane-roundabout": (1050.0, 1400.0),
+}
+PEOPLE_PER_HOUR = (130.0, 260.0)
+SHARES = {
+    "car": 0.74,
+    "van": 0.09,
+    "truck": 0.05,
+    "bus": 0.02,
+    "motorcycle": 0.03,
+    "bicycle": 0.07,
+}
+SIZES_M = {
+    "car": ((3.9, 4.9), (1.7, 1.9)),
+    "van": ((5.0, 6.0), (1.95, 2.1)),
+    "truck": ((7.5, 9.0), (2.4, 2.5)),
+    "bus": ((11.0, 12.0), (2.5, 2.55)),
+    "motorcycle": ((2.0, 2.3), (0.75, 0.85)),
+    "bicycle": ((1.7, 1.9), (0.6, 0.7)),
+    "pedestrian": ((0.4, 0.5), (0.5, 0.6)),
+}
+"""Ranges of length and width."""
+SUMO_CLASSES = {
+    "car": "passenger",
+    "van": "delivery",
+    "truck": "truck",
+    "bus": "bus",
+    "motorcycle": "motorcycle",
+    "bicycle": "bicycle",
+}
+SHARPEST_TURN_RAD = {"bus": np.radians(50.0), "truck": np.radians(110.0)}
+"""Long vehicles choose ways on which they need not turn right more sharply than this."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Demand:
+    """Everybody who will appear."""
+
+    users: dict[str, "RoadUser"]
+    """By name."""
+    entries: tuple[tuple[float, str, str], ...]
+    """(when, name, as sumo reads it), by time."""
+
+    def without(self, names: set[str]) -> "Demand":
+        """The same without some."""
+        entries = tuple(entry for entry in self.entries if entry[1] not in names)
+        return Demand(users=self.users, entries=entries)
+
+    @property
+    def routes(self) -> str:
+        """The content of a routes file."""
+        return "".join(text for _, _, text in self.entries)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class RoadUser:
+    """One who will appear: class name as in the files, and size."""
+
+    kind: str
+    length_m: float
+    width_m: float
+
+
+def demand(rng: np.random.Generator, site: Site, seconds: float) -> Demand:
+    """Draws the traffic of `seconds`."""
+    users: dict[str, RoadUser] = {}
+    entries: list[tuple[float, str, str]] = []
+    hours = seconds / 3600.0
+    kinds, shares = list(SHARES), np.array(list(SHARES.values()))
+    weights = np.array([arm.weight for arm in site.arms])
+    count = rng.poisson(hours * rng.uniform(*VEHICLES_PER_HOUR[site.kind]))
+    for number in range(count):
+        name = f"v{number}"
+        depart = float(rng.uniform(0.0, seconds))
+        kind = str(rng.choice(kinds, p=shares / shares.sum()))
+        begin, end = _way(rng, site.arms, weights, kind)
+        users[name] = _user(rng, kind)
+        entries.append((depart, name, _vehicle_xml(rng, name, users[name], depart, begin, end)))
+    for number in range(rng.poisson(hours * rng.uniform(*PEOPLE_PER_HOUR))):
+        name = f"p{number}"
+        depart = float(rng.uniform(0.0, seconds))
+        users[name] = _user(rng, "pedestrian")
+        entries.append((depart, name, _person_xml(rng, name, users[name], depart, site.arms)))
+    return Demand(users=users, entries=tuple(sorted(entries)))
+
+
+def _user(rng: np.random.Generator, kind: str) -> RoadUser:
+    length, width = SIZES_M[kind]
+    return RoadUser(
+        kind=kind,
+        length_m=round(float(rng.uniform(*length)), 2),
+        width_m=round(float(rng.uniform(*width)), 2),
+    )
+
+
+def right_turn_rad(begin: Arm, end: Arm) -> float:
+    """How far to the right a way from one arm to another turns; negative is left."""
+    return float((begin.angle_rad + np.pi - end.angle_rad + np.pi) % (2.0 * np.pi) - np.pi)
+
+
+def _way(
+    rng: np.random.Generator, arms: tuple[Arm, ...], weights: np.ndarray, kind: str
+) -> tuple[Arm, Arm]:
+    sharpest = SHARPEST_TURN_RAD.get(kind, np.pi)
+    ways = [(a, b) for a in range(len(arms)) for b in range(len(arms)) if a != b]
+    allowed = [(a, b) for a, b in ways if right_turn_rad(arms[a], arms[b]) <= sharpest]
+    chances = np.array([weights[a] * weights[b] for a, b in allowed])
+    begin, end = allowed[int(rng.choice(len(allowed), p=chances / chances.sum()))]
+    return arms[begin], arms[end]
+
+
+def _vehicle_xml(
+    rng: np.random.Generator, name: str, user: RoadUser, depart: float, begin: Arm, end: Arm
+) -> str:
+    heavy = user.kind in ("truck", "bus")
+    top_mps = rng.uniform(4.0, 6.5) if user.kind == "bicycle" else 40.0
+    accel = rng.uniform(1.0, 1.5) if heavy or user.kind == "bicycle" else rng.uniform(1.5, 2.8)
+    driver = {
+        "vClass": SUMO_CLASSES[user.kind],
+        "length": user.length_m,
+        "width": user.width_m,
+        "maxSpeed": top_mps,
+        "accel": accel,
+        "decel": rng.uniform(2.0, 3.5),
+        "emergencyDecel": 8.0,
+        "minGap": rng.uniform(1.2, 2.8),
+        "tau": rng.uniform(0.9, 1.9),
+        "speedFactor": float(np.clip(rng.normal(0.97, 0.12), 0.7, 1.25)),
+        "speedDev": 0.0,
+        "carFollowModel": "EIDM",
+        "treaction": rng.uniform(0.3, 1.0),
+        "tpersdrive": rng.uniform(2.0, 8.0),
+        "sigmaerror": rng.uniform(0.05, 0.25),
+        "lcKeepRight": 0.0,
+        "lcSpeedGain": 0.0,
+        "jmTimegapMinor": rng.uniform(0.5, 1.5),
+        "jmCrossingGap": rng.uniform(2.0, 6.0),
+        "impatience": rng.uniform(0.4, 0.8),
+    }
+    # Lane 0 is the sidewalk. Who goes round more than half of the ring begins on the left.
+    far_round = right_turn_rad(begin, end) < -0.3 and not heavy
+    lane = begin.lanes if far_round and rng.random() < 0.9 else 1
+    attributes = " ".join(
+        f'{key}="{value}"' if isinstance(value, str) else f'{key}="{value:.4f}"'
+        for key, value in driver.items()
+    )
+    return (
+        f'<vType id="t{name}" {attributes}/>'
+        f'<trip id="{name}" type="t{name}" depart="{depart:.3f}" from="{begin.enter}" '
+        f'to="{end.leave}" departSpeed="desired" departPos="base" departLane="{lane}"/>'
+    )
+
+
+def _person_xml(
+    rng: np.random.Generator, name: str, user: RoadUser, depart: float, arms: tuple[Arm, ...]
+) -> str:
+    begin, end = rng.choice(len(arms), 2, replace=False)
+    left_side, left_end = rng.random(2) < 0.5
+    start = arms[begin].leave if left_side else arms[begin].enter
+    goal = arms[end].enter if left_end else arms[end].leave
+    return (
+        f'<vType id="t{name}" vClass="pedestrian" length="{user.length_m}" '
+        f'width="{user.width_m}" maxSpeed="{rng.uniform(1.0, 1.7):.3f}"/>'
+        f'<person id="{name}" type="t{name}" depart="{depart:.3f}" '
+        f'departPos="{-30 if left_side else 30}">'
+        f'<walk from="{start}" to="{goal}" arrivalPos="{30 if left_end else -30}"/></person>'
+    )

@@ -1,0 +1,175 @@
+"""From where SUMO says the front bumper was to how a vehicle with two axles moved.
+
+SUMO moves the middle of the front bumper along the lane and points the body along it, which no
+car does. Here the way is smoothed and kept apart from the progress along it: the front axle
+follows the way, the rear axle rolls after it without slip (a tractrix), and both are then read at
+the smoothed progress. So a vehicle that stands stands exactly still, none moves backwards, and the
+motion is the kinematic bicycle's.
+"""
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Float
+
+from asp_env.dynamics.bicycle import AXLE_SHARE_OF_LENGTH
+from scenarios.polylines import Polyline, arc_lengths
+from scenarios.sumo.network import STEP_S
+
+FRAME_RATE_HZ = 25.0
+SPACING_M = 0.2
+"""Between the points of a smoothed way."""
+WAY_SIGMA_M = {"pedestrian": 0.5, "bicycle": 1.2}
+WAY_SIGMA_DEFAULT_M = 1.8
+PROGRESS_SIGMA_S = 0.25
+JUMP_M = 2.5
+"""No road user gets so far in a step of the simulation; a change of lanes does."""
+CHANGE_S, CHANGE_M = 2.5, (15.0, 28.0)
+"""A change of lanes takes so long, but no less and no more than these distances."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Motion:
+    """How one road user moved, frame by frame; the reference point is the middle of its box."""
+
+    first_frame: int
+    xy: Float[np.ndarray, "frames 2"]
+    heading_rad: Float[np.ndarray, " frames"]
+    """Continuous: not wrapped."""
+
+
+def gaussian(values: np.ndarray, sigma: float) -> np.ndarray:
+    """Smooths columns along the first axis; beyond the ends they go on as straight lines.
+
+    A straight line and a constant stay exactly what they are in the inside.
+    """
+    reach = max(1, int(np.ceil(3.0 * sigma)))
+    kernel = np.exp(-0.5 * (np.arange(-reach, reach + 1) / sigma) ** 2)
+    kernel = kernel / kernel.sum()
+    columns = values.reshape(len(values), -1)
+    before = columns[0] + (columns[1] - columns[0]) * np.arange(-reach, 0)[:, None]
+    after = columns[-1] + (columns[-1] - columns[-2]) * np.arange(1, reach + 1)[:, None]
+    padded = np.concatenate([before, columns, after])
+    smooth = np.stack([np.convolve(column, kernel, "valid") for column in padded.T], axis=1)
+    return smooth.reshape(values.shape)
+
+
+def catmull_rom(table: Float[np.ndarray, "n k"], at: Float[np.ndarray, " m"]) -> np.ndarray:
+    """Reads an evenly spaced table between its rows, smooth to the first derivative."""
+    row = np.clip(at.astype(np.int64), 1, len(table) - 3)
+    u = (at - row)[:, None]
+    a, b, c, d = (table[row + i] for i in (-1, 0, 1, 2))
+    return b + 0.5 * u * (c - a + u * (2 * a - 5 * b + 4 * c - d + u * (3 * (b - c) + d - a)))
+
+
+def reconstruct(
+    times_s: Float[np.ndarray, " n"],
+    points: Float[np.ndarray, "n 2"],
+    *,
+    kind: str,
+    length_m: float,
+) -> Motion | None:
+    """The motion of a road user from its front bumper's reported positions.
+
+    Args:
+        times_s: when it was reported, evenly spaced.
+        points: where the middle of its front bumper was (pedestrians: the middle).
+        kind: class name.
+        length_m: its length.
+
+    Returns:
+        The motion at all whole frames between the first and last time; None if it never moved.
+    """
+    points = ease_lane_changes(points)
+    arc = arc_lengths(points)
+    if arc[-1] < 2.0 or len(points) < 4:
+        return None
+    lead = round((length_m + 6.0) / SPACING_M)
+    way, tangent = _way(points, arc, lead, WAY_SIGMA_M.get(kind, WAY_SIGMA_DEFAULT_M))
+    if kind in ("pedestrian", "bicycle"):
+        behind_m, wheelbase_m = 0.5 * length_m, 0.0
+        heading = tangent
+    else:
+        behind_m = (0.5 - AXLE_SHARE_OF_LENGTH) * length_m
+        wheelbase_m = 2.0 * AXLE_SHARE_OF_LENGTH * length_m
+        heading = _tractrix(tangent, wheelbase_m)
+    first = int(np.ceil(times_s[0] * FRAME_RATE_HZ - 1e-6))
+    last = int(np.floor(times_s[-1] * FRAME_RATE_HZ + 1e-6))
+    frames = np.arange(first, last + 1)
+    progress = gaussian(
+        np.interp(frames / FRAME_RATE_HZ, times_s, arc), PROGRESS_SIGMA_S * FRAME_RATE_HZ
+    )
+    progress = np.maximum.accumulate(progress)
+    at = lead + (np.clip(progress, 0.0, arc[-1]) - behind_m) / SPACING_M
+    table = catmull_rom(np.column_stack([way, heading]), at)
+    ahead = np.stack([np.cos(table[:, 2]), np.sin(table[:, 2])], axis=1)
+    return Motion(
+        first_frame=first,
+        xy=table[:, :2] - 0.5 * wheelbase_m * ahead,
+        heading_rad=table[:, 2],
+    )
+
+
+def ease_lane_changes(points: Polyline) -> Polyline:
+    """Spreads the jumps with which SUMO changes lanes over the metres that follow.
+
+    The sideways offset from the new lane is taken back along the way, not in time, so that
+    nobody slides sideways while standing.
+    """
+    steps = np.diff(points, axis=0)
+    lengths = np.hypot(*steps.T)
+    jumps = np.flatnonzero(lengths > JUMP_M)
+    honest = np.flatnonzero((lengths > 0.02) & (lengths <= JUMP_M))
+    if not len(jumps) or not len(honest):
+        return points
+    # The direction of travel, also while standing and while jumping, is that of the step before.
+    before = honest[np.clip(np.searchsorted(honest, np.arange(len(points)), "right") - 1, 0, None)]
+    ahead = steps[before] / lengths[before, None]
+    left = np.stack([-ahead[:, 1], ahead[:, 0]], axis=1)
+    lengths[jumps] = np.sum(steps[jumps] * ahead[jumps], axis=1).clip(0.0, JUMP_M)
+    travelled = np.concatenate([[0.0], np.cumsum(lengths)])
+    eased = points.copy()
+    for jump in jumps:
+        sideways = float(steps[jump] @ left[jump])
+        speed = float(np.mean(lengths[max(jump - 4, 0) : jump + 1])) / STEP_S
+        over_m = float(np.clip(CHANGE_S * speed, *CHANGE_M))
+        share = np.clip((travelled[jump + 1 :] - travelled[jump + 1]) / over_m, 0.0, 1.0)
+        rest = 1.0 - share**2 * (3.0 - 2.0 * share)
+        eased[jump + 1 :] -= (sideways * rest)[:, None] * left[jump + 1 :]
+    return eased
+
+
+def _way(
+    points: Polyline, arc: np.ndarray, lead: int, sigma_m: float
+) -> tuple[Polyline, np.ndarray]:
+    """The smoothed way from `lead` steps before the first point, and its direction."""
+    kept = [0]
+    for i in range(1, len(arc)):
+        if arc[i] - arc[kept[-1]] >= 0.1:
+            kept.append(i)
+    at = np.arange(-lead, arc[-1] / SPACING_M + 20.0) * SPACING_M
+    line, along = points[kept], arc[kept]
+    raw = np.stack([np.interp(at, along, line[:, axis]) for axis in (0, 1)], axis=1)
+    for outside, end, other in ((at < 0.0, 0, 1), (at > along[-1], -1, -2)):
+        slope = (line[end] - line[other]) / (along[end] - along[other])
+        raw[outside] = line[end] + slope * (at[outside] - along[end])[:, None]
+    way = gaussian(raw, sigma_m / SPACING_M)
+    steps = np.gradient(way, axis=0)
+    return way, np.unwrap(np.arctan2(steps[:, 1], steps[:, 0]))
+
+
+def _tractrix(tangent_rad: Float[np.ndarray, " n"], wheelbase_m: float) -> np.ndarray:
+    """Direction of a body whose front axle follows a way and whose rear axle rolls after it.
+
+    The direction θ obeys dθ/ds = sin(ψ - θ) / wheelbase, ψ the way's direction. For constant ψ
+    tan((ψ - θ)/2) decays exponentially, which makes each step exact for a bend at its middle.
+    """
+    decay = math.exp(-SPACING_M / wheelbase_m)
+    middle = 0.5 * (tangent_rad[1:] + tangent_rad[:-1])
+    heading = np.empty_like(tangent_rad)
+    theta = heading[0] = float(tangent_rad[0])
+    for i, psi in enumerate(middle.tolist(), start=1):
+        theta = psi - 2.0 * math.atan(math.tan(0.5 * (psi - theta)) * decay)
+        heading[i] = theta
+    return heading

@@ -1,0 +1,108 @@
+"""TAF-BW as published, beside the same recordings that others smoothed into the inD layout."""
+
+import gymnasium as gym
+import numpy as np
+import pytest
+from gymnasium.utils.env_checker import check_env
+
+import asp_env
+from asp_env.data.classes import AgentClass
+from asp_env.data.recording import Recording
+from asp_env.data.snippets import find_snippets
+from asp_env.data.source import Recordings
+from asp_env.evaluation.inspect import drift_m
+from asp_env.geometry import wrap_angle
+from tests.real_data import real_data
+
+SAME = {
+    "k733_2020-09-15/000": "00",
+    "k729_2022-03-16/004": "05",
+    "k729_2022-03-16/013": "14",
+}
+"""Of recordings in TAF-BW's own layout: their ids in the inD layout."""
+
+ON_FOOT = (AgentClass.BICYCLE, AgentClass.PEDESTRIAN)
+
+
+@pytest.fixture(scope="module")
+def published() -> Recordings:
+    """The recordings as published."""
+    return asp_env.load(real_data("taf_bw"))
+
+
+@pytest.fixture(scope="module")
+def smoothed() -> Recordings:
+    """All recordings of the same place, in the inD layout."""
+    return asp_env.load(real_data("karlsruhe"))
+
+
+def both(recording: Recording, other: Recording) -> tuple[np.ndarray, np.ndarray]:
+    """The vehicles' states of both where tracks run within 1 m of one another, row by row."""
+    ours, theirs = [], []
+    for j in np.flatnonzero(~np.isin(other.classes, ON_FOOT)).tolist():
+        pairs = []
+        for i in np.flatnonzero(~np.isin(recording.classes, ON_FOOT)).tolist():
+            first = max(recording.first_frames[i], other.first_frames[j])
+            end = min(recording.last_frames[i], other.last_frames[j]) + 1
+            if end - first > 5:
+                one = recording.track(i)[first - recording.first_frames[i] :][: end - first]
+                two = other.track(j)[first - other.first_frames[j] :][: end - first]
+                pairs.append((float(np.median(np.hypot(*(one - two)[:, :2].T))), one, two))
+        apart, one, two = min(pairs, key=lambda pair: pair[0])
+        assert apart < 1.0
+        ours.append(one)
+        theirs.append(two)
+    return np.concatenate(ours).astype(float), np.concatenate(theirs).astype(float)
+
+
+@pytest.mark.parametrize("name", SAME)
+def test_agrees_with_the_smoothed(published: Recordings, smoothed: Recordings, name: str) -> None:
+    """Positions to centimetres, speeds and headings of what moves as far as their noise goes."""
+    recording = published[published.names.index(name)]
+    other = smoothed[smoothed.names.index(SAME[name])]
+    assert recording.frame_rate_hz == other.frame_rate_hz == 10
+    assert recording.speed_limit_mps == pytest.approx(other.speed_limit_mps)
+    np.testing.assert_allclose(
+        recording.road_map.lanes.points, other.road_map.lanes.points, atol=1e-3
+    )
+    one, two = both(recording, other)
+    apart_m = np.hypot(*(one - two)[:, :2].T)
+    apart_mps = np.abs(np.abs(one[:, 3]) - np.abs(two[:, 3]))
+    moves = np.abs(one[:, 3]) > 1
+    apart_deg = np.degrees(np.abs(wrap_angle(one[moves, 2] - two[moves, 2])))
+    assert (np.percentile(apart_m, [50, 90, 99]) < [0.01, 0.08, 0.3]).all()
+    assert (np.percentile(apart_mps, [50, 90]) < [0.02, 0.5]).all()
+    assert (np.percentile(apart_deg, [50, 90]) < [0.6, 5.0]).all()
+
+
+def test_drift_floor(published: Recordings) -> None:
+    """Actions inferred from these states lead along the track: 90 % of what moves to 0.2 m in 6 s.
+
+    Of the states in the inD layout 90 % lie within 4.3 m.
+    """
+    metres, moves = [], []
+    for recording in published:
+        index = find_snippets(recording, dt_s=0.2, history=15, horizon=30, every=3)
+        apart, moving = drift_m(recording, *index, dt_s=0.2, horizon=30)
+        metres.append(apart)
+        moves.append(moving)
+    moving_m = np.concatenate(metres)[np.concatenate(moves)]
+    assert len(moving_m) > 200
+    assert np.percentile(moving_m, 90) < 0.2
+
+
+def test_faults_of_the_files_are_told(published: Recordings) -> None:
+    """Tracker jumps of k733; no vehicle of it is turned around, though velocities are scaled."""
+    told = " ".join(published[published.names.index("k733_2020-09-15/000")].repairs)
+    assert "jumps of over 1.5 m in tracks, split there: 34 after 28000 ms" in told
+    assert "point backwards" not in told
+    for recording in published:
+        assert (recording.states[:, 3] > -1.0).all()
+        assert (np.abs(recording.states[:, 3]) < 30).all()
+
+
+def test_environment(published: Recordings) -> None:
+    """The environment passes Gymnasium's checker on them."""
+    env = gym.make("asp_env/Replay-v0", data=published.source)
+    check_env(env.unwrapped, skip_render_check=True)
+    env.close()

@@ -1,0 +1,63 @@
+"""Frames and their rate from times in milliseconds."""
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from asp_env.data.readers.tables import Clock, read_clock
+from asp_env.errors import DataError
+
+
+def clock_of(*tracks: list[float]) -> Clock:
+    """The clock of some tracks' times."""
+    numbers = np.repeat(np.arange(len(tracks)), [len(times) for times in tracks])
+    times = np.concatenate([np.array(times, dtype=float) for times in tracks])
+    return read_clock(
+        numbers,
+        times,
+        lambda at, what: f"row {at}: " + what.format(track=numbers[at], time=times[at]),
+    )
+
+
+@given(
+    rate=st.sampled_from([1, 5, 10, 12.5, 15, 24, 25, 29.97, 30, 50, 60, 100]),
+    rounded=st.booleans(),
+    begin=st.integers(-5_000, 10**7),
+    frames=st.lists(st.integers(0, 3_000), min_size=1, max_size=40, unique=True),
+)
+def test_round_trip(rate: float, rounded: bool, begin: int, frames: list[int]) -> None:
+    """Frames written as times, whole milliseconds or not, with gaps, are read as these frames."""
+    first = sorted(frames)
+    steady = list(range(4_000, 5_500))
+    times = [[begin + frame * 1000 / rate for frame in track] for track in (first, steady)]
+    if rounded:
+        times = [[float(round(time)) for time in track] for track in times]
+    clock = clock_of(*times)
+    since = np.array([*first, *steady]) - first[0]
+    assert clock.frames.tolist() == since.tolist()
+    assert clock.rate_hz == pytest.approx(rate, rel=2e-3)
+    if rate == int(rate):
+        assert clock.rate_hz == rate
+    assert clock.step_s == 1 / clock.rate_hz
+
+
+@pytest.mark.parametrize(
+    ("tracks", "told"),
+    [
+        ([[0], [100]], "row 0: no track has a second row, so that no frame rate can be told"),
+        ([[0, 0.1, 0.2, 0.3]], "row 0: timestamp_ms of its rows and those after are 0.1 apart"),
+        ([[0, 1, 2, 3]], "makes 1000 Hz; expected 1 to 250 Hz"),
+        ([[0, 5_000, 10_000]], "makes 0.2 Hz"),
+        ([[0, 100, 200, 260, 360]], "row 3: timestamp_ms is 260.0, 60 ms after the one before"),
+        ([[0, 100, 101, 200]], "row 2: a second row of track 0 at 101.0 ms, less than a frame"),
+        ([[0, 100, 200], [50, 150]], "row 3: timestamp_ms is 50.0, 50 ms after"),
+        ([[0, 100, 200, 301.5 + 20, 400]], "expected multiples of 100 ms"),
+    ],
+)
+def test_impossible(tracks: list[list[float]], told: str) -> None:
+    """What no clock takes is refused, with the row where it begins."""
+    with pytest.raises(DataError) as caught:
+        clock_of(*tracks)
+    assert told in str(caught.value)
+    assert "\n" not in str(caught.value)

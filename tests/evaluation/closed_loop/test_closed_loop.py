@@ -1,0 +1,289 @@
+"""Planners driven through scenarios, and what is told of it."""
+
+import csv
+import dataclasses
+import json
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from asp_env.data.predictor import Forecast
+from asp_env.data.rollout import Rollout
+from asp_env.data.scenarios.scenario import Scenario, find_scenarios
+from asp_env.data.scene import Scene
+from asp_env.data.snippets import Future
+from asp_env.data.source import Recordings, open_data
+from asp_env.data.split import TrainedOn
+from asp_env.errors import AspEnvError
+from asp_env.evaluation.closed_loop.drive import ClosedLoop, Drive, drive
+from asp_env.evaluation.closed_loop.episodes import (
+    FORECAST_WITHIN_M,
+    DrivenEpisodes,
+    drive_episodes,
+)
+from asp_env.metrics.driving.rules import PDMS
+from asp_env.metrics.driving.scores import driving_metrics
+from asp_env.planning.planner import load_planner
+from asp_env.sim.world import Ending
+from predictors.physical import ConstantVelocity, Oracle
+from tests.crossing_files import ON_ROAD, write_crossing
+from tests.sim.worlds import DT_S, HISTORY, car
+
+NOWHERE = Path("not-written")
+
+
+@dataclass
+class Spy:
+    """Constant velocity that remembers what it was asked."""
+
+    horizon: int = 15
+    privileged: bool = False
+    name: str = "spy"
+    dt_s: float = DT_S
+    history: int = 0
+    trained_on: TrainedOn | None = None
+    metadata: dict[str, str] = field(default_factory=dict)
+    asked: list[tuple[Scene, Future | None]] = field(default_factory=list)
+
+    def predict(self, scene: Scene, future: Future | None = None) -> Forecast:
+        """Keeps the question, answers with constant velocity."""
+        self.asked.append((scene, future))
+        return ConstantVelocity(horizon=self.horizon, dt_s=self.dt_s).predict(scene)
+
+
+def _scenarios(recordings: Recordings) -> list[Scenario]:
+    return list(find_scenarios(recordings, source="", dt_s=DT_S, history=HISTORY))
+
+
+def _drive(
+    recordings: Recordings, scenarios: list[Scenario], predictor, planner="sampling", traffic="log"
+) -> DrivenEpisodes:
+    return drive_episodes(
+        recordings,
+        scenarios,
+        load_planner(planner),
+        predictor,
+        preset=PDMS,
+        traffic=traffic,
+        horizon=15,
+        history=HISTORY,
+        dt_s=DT_S,
+    )
+
+
+def _values(result: ClosedLoop, planner: str, predictor: str = "") -> dict[str, float]:
+    who = (planner, predictor, "all")
+    mine = [r for r in result.rows if (r.planner, r.predictor, r.subset) == who]
+    return {row.metric: row.value for row in mine}
+
+
+def test_the_expert_keeps_to_its_log(tmp_path):
+    """On a log without collisions: zero divergence, all of the way to the goal; it comes first."""
+    write_crossing(tmp_path, drives=((ON_ROAD[1], car(-95, 8)),))
+    result = drive(Drive(data=str(tmp_path), out=NOWHERE, predictors=("oracle",)))
+    assert result.rows[0].planner == "expert"
+    expert = _values(result, "expert")
+    assert expert["log divergence"] == 0.0
+    assert expert["progress"] == pytest.approx(1.0, abs=1e-3)
+    assert expert["on road"] == 1.0
+    assert list(result.manifest["endings"]) == ["expert", "sampling + oracle"]
+    assert expert["no collision"] == 1.0
+    assert result.manifest["endings"]["expert"] == {"GOAL": 2}
+
+
+def test_every_predictor_has_its_run(crossings):
+    """An expert and two runs of the same scenarios, each with rows, endings and rollouts."""
+    names = ("oracle", "constant-velocity")
+    result = drive(Drive(data=str(crossings), out=NOWHERE, predictors=names, max_scenarios=5))
+    assert len(result.manifest["scenarios"]) == 5
+    drivers = ["expert", "sampling + oracle", "sampling + constant-velocity"]
+    assert list(result.rollouts) == drivers
+    for driver in drivers:
+        assert sum(result.manifest["endings"][driver].values()) == 5
+        names_of = [rollout.scenario.name for rollout in result.rollouts[driver]]
+        assert names_of == [rollout.scenario.name for rollout in result.rollouts["expert"]]
+    for name in names:
+        assert _values(result, "sampling", name)["score"] > 0
+    row = result.rows[-1]
+    assert (row.traffic, row.latency_ticks, row.horizon_s) == ("log", 0, 3.0)
+
+
+def test_a_planner_without_forecasts_runs_once(crossings):
+    """`idm` is driven once, without a predictor's name; `expert` not a second time."""
+    for planner, drivers in (("idm", ["expert", "idm"]), ("expert", ["expert"])):
+        config = Drive(
+            data=str(crossings),
+            out=NOWHERE,
+            planner=planner,
+            predictors=("oracle", "constant-velocity"),
+            max_scenarios=2,
+        )
+        assert list(drive(config).rollouts) == drivers
+
+
+@pytest.mark.parametrize("traffic", ["log", "idm"])
+def test_running_twice_gives_the_same_bits(crossings, traffic):
+    """Rows and rollouts are equal, bit for bit."""
+    config = Drive(data=str(crossings), out=NOWHERE, traffic=traffic, max_scenarios=4)
+    first, second = drive(config), drive(config)
+    assert first.rows == second.rows
+    for driver, rollouts in first.rollouts.items():
+        for one, other in zip(rollouts, second.rollouts[driver], strict=True):
+            assert one.states.tobytes() == other.states.tobytes()
+            assert one.forecast_states.tobytes() == other.forecast_states.tobytes()
+
+
+def test_episodes_side_by_side_equal_episodes_alone(recordings):
+    """Endings, scores and rollouts of all scenarios at once are those of each on its own."""
+    predictor = ConstantVelocity(horizon=15, dt_s=DT_S)
+    scenarios = _scenarios(recordings)[:6]
+    together = _drive(recordings, scenarios, predictor, traffic="idm")
+    scores = driving_metrics(together.drives, PDMS)["score"].value
+    for b, each in enumerate(scenarios):
+        alone = _drive(recordings, [each], predictor, traffic="idm")
+        assert alone.endings.tolist() == together.endings[b : b + 1].tolist()
+        assert driving_metrics(alone.drives, PDMS)["score"].value[0] == scores[b]
+        one, other = alone.rollouts[0], together.rollouts[b]
+        for name in ("states", "valid", "plans", "forecast_states", "forecast_ticks", "events"):
+            assert getattr(one, name).tobytes() == getattr(other, name).tobytes(), name
+
+
+def test_simulated_traffic_has_a_realism(recordings):
+    """From 0 to 1 where somebody was simulated; of replayed traffic there is none to speak of."""
+    scenarios = _scenarios(recordings)[:4]
+    predictor = ConstantVelocity(horizon=15, dt_s=DT_S)
+    simulated = _drive(recordings, scenarios, predictor, planner="expert", traffic="idm").realism
+    assert simulated["realism"].valid.any()
+    for each in simulated.values():
+        assert ((each.value[each.valid] > 0) & (each.value[each.valid] < 1)).all()
+    replayed = _drive(recordings, scenarios, predictor, planner="expert").realism
+    assert not any(each.valid.any() for each in replayed.values())
+
+
+def test_only_those_near_a_running_ego_are_forecast(recordings):
+    """Targets are present, not egos, within 60 m, and in episodes that are not over."""
+    spy = Spy()
+    driven = _drive(recordings, _scenarios(recordings), spy)
+    active = driven.drives.active
+    assert len(spy.asked) == active.shape[1] - 1
+    for k, (scene, future) in enumerate(spy.asked):
+        situation, slot = scene.targets.T
+        assert future is None
+        assert (slot > 0).all()
+        assert scene.valid[situation, slot, -1].all()
+        egos = scene.states[situation, 0, -1, :2]
+        away = np.linalg.norm(scene.states[situation, slot, -1, :2] - egos, axis=-1)
+        assert (away <= FORECAST_WITHIN_M).all()
+        # an episode that lasts through tick k + 1 is running at tick k
+        assert active[situation, k + 1].all()
+
+
+def test_only_the_privileged_are_handed_the_future(recordings):
+    """It holds what the recording holds at the 15 ticks to come, and presence as a mask."""
+    spy = Spy(privileged=True)
+    scenario = _scenarios(recordings)[0]
+    _drive(recordings, [scenario], spy)
+    recording = recordings[scenario.recording]
+    scene, future = spy.asked[3]
+    assert future is not None
+    for row, (b, a) in enumerate(scene.targets.tolist()):
+        track = int(np.flatnonzero(recording.track_ids == scene.ids[b, a])[0])
+        frames = 5 * (int(scene.tick[b]) + 1 + np.arange(15)) - recording.first_frames[track]
+        there = frames < len(recording.track(track))
+        assert future.valid[row].tolist() == there.tolist()
+        assert np.array_equal(future.states[row][there], recording.track(track)[frames[there]])
+
+
+def test_all_plan_equally_far(recordings):
+    """A predictor of 6 s is cut to the 3 s that are planned, and so changes nothing."""
+    scenarios = _scenarios(recordings)[:2]
+    near, far = (
+        _drive(recordings, scenarios, ConstantVelocity(horizon=steps, dt_s=DT_S))
+        for steps in (15, 30)
+    )
+    assert far.rollouts[0].plans.shape[1] == 15
+    assert near.rollouts[0].states.tobytes() == far.rollouts[0].states.tobytes()
+
+
+def test_a_rollout_tells_the_episode(recordings):
+    """Ticks, plans, forecasts and events of one drive fit together."""
+    scenario = _scenarios(recordings)[1]
+    driven = _drive(recordings, [scenario], Oracle(horizon=15, dt_s=DT_S))
+    rollout = driven.rollouts[0]
+    count = int(driven.drives.active[0].sum())
+    assert rollout.scenario == scenario
+    assert rollout.states.shape[0] == rollout.events.shape[0] == count
+    assert rollout.plans.shape == (count - 1, 15, 2)
+    assert rollout.ids[0] == scenario.ego_id
+    assert (rollout.ids >= 0).all()
+    assert set(rollout.forecast_ticks.tolist()) <= set(range(count - 1))
+    assert (rollout.forecast_slots > 0).all()
+    # planned is what is done: the first planned position is the next one
+    assert rollout.plans[:, 0] == pytest.approx(rollout.states[1:, 0, :2], abs=1e-3)
+    assert rollout.states[0].tobytes() == rollout.log_states[0].tobytes()
+
+
+def test_a_blocked_way_is_no_collision(tmp_path):
+    """Behind a car that waits for ever the planner stops: out of data, and no fault."""
+    waiting = car(-20, 0, appears_s=0.2)
+    lane = car(-90, 8, (4.0, 0, 0), (4.0, -2.0, 0.0))  # the log stops 2 m behind it
+    write_crossing(tmp_path, drives=((lane, waiting),), seconds=20.0)
+    recordings = open_data(tmp_path)
+    scenarios = [s for s in _scenarios(recordings) if s.ego_id == 1]
+    for planner in ("sampling", "idm"):
+        driven = _drive(recordings, scenarios, ConstantVelocity(horizon=15, dt_s=DT_S), planner)
+        assert set(driven.endings.tolist()) <= {Ending.OUT_OF_DATA, Ending.GOAL}
+        metrics = driving_metrics(driven.drives, PDMS)
+        assert metrics["no at-fault collision"].value.tolist() == [1.0] * len(scenarios)
+        assert metrics["no collision"].value.tolist() == [1.0] * len(scenarios)
+
+
+def test_a_run_writes_its_folder(crossings, tmp_path):
+    """Metrics, manifest, report, and rollouts by driver that can be read again."""
+    out = tmp_path / "out"
+    Drive(data=str(crossings), out=out, max_scenarios=2).run()
+    names = {"scenarios.json", "metrics.csv", "manifest.json", "report.html", "rollouts"}
+    assert {path.name for path in out.iterdir()} == names
+    drivers = sorted(path.name for path in (out / "rollouts").iterdir())
+    assert drivers == ["expert", "sampling + constant-velocity"]
+    told = json.loads((out / "manifest.json").read_text())
+    for driver in drivers:
+        for path in (out / "rollouts" / driver).iterdir():
+            rollout = Rollout.load(path)
+            assert path.stem == rollout.scenario.name
+            assert path.stem in told["scenarios"]
+    with (out / "metrics.csv").open(newline="") as file:
+        first = next(csv.DictReader(file))
+    assert (first["planner"], first["predictor"], first["subset"]) == ("expert", "", "all")
+
+
+@pytest.mark.parametrize(
+    ("options", "what"),
+    [
+        ({"traffic": "logs"}, r"unknown driver 'logs' \(did you mean 'log'"),
+        ({"planner": "sampler"}, "unknown planner 'sampler'"),
+        ({"max_scenarios": 0}, "0 scenarios: expected at least 1"),
+        ({"predictors": ()}, "none given"),
+        ({"horizon": 0.1}, "no whole number of ticks"),
+        ({"metrics": "nuplna"}, r"unknown metrics 'nuplna' \(did you mean 'nuplan'"),
+        ({"dt": 0.3}, "does not divide recordings of 25 Hz"),
+        ({"jobs": 0}, "--jobs 0: expected at least 1 process"),
+        ({"jobs": -2}, "--jobs -2: expected"),
+    ],
+    ids=lambda value: next(iter(value)) if isinstance(value, dict) else None,
+)
+def test_wrong_options_are_refused(crossings, options, what):
+    """One line that says what was expected."""
+    with pytest.raises(AspEnvError, match=what) as caught:
+        drive(Drive(data=str(crossings), out=NOWHERE, **options))
+    assert "\n" not in str(caught.value)
+
+
+def test_the_fields_of_a_config_are_the_commands_options():
+    """A configuration is what the command line makes: frozen, and equal by value."""
+    config = Drive(data="d", out=NOWHERE)
+    assert config == dataclasses.replace(config)
+    with pytest.raises(dataclasses.FrozenInstanceError):
+        config.__setattr__("planner", "idm")

@@ -1,0 +1,49 @@
+"""One temperature for all logits, found again where it is known."""
+
+import math
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from predictors.inference.calibration import LIMITS, cross_entropy, fit_temperature
+
+
+def drawn(scale: float, count: int = 20_000) -> tuple[np.ndarray, np.ndarray]:
+    """Logits that are `scale` times too big, and modes drawn with the true probabilities."""
+    rng = np.random.default_rng(0)
+    logits = rng.normal(0, 1.5, (count, 3))
+    best = (logits + rng.gumbel(size=logits.shape)).argmax(axis=1)
+    return (scale * logits).astype(np.float32), best
+
+
+@pytest.mark.parametrize("scale", [0.5, 1.0, 2.0])
+def test_logits_too_big_are_divided_by_as_much(scale: float) -> None:
+    """Logits twice too big are given 2.00 ± 0.05, half as big ones 0.5."""
+    assert fit_temperature(*drawn(scale)) == pytest.approx(scale, rel=0.025)
+
+
+@given(shift=st.floats(-5, 5), temperature=st.floats(*LIMITS))
+def test_no_other_temperature_is_better(shift: float, temperature: float) -> None:
+    """Its cross-entropy is the lowest, and does not change when all logits are shifted."""
+    logits, best = drawn(2.0, count=200)
+    found = fit_temperature(logits, best)
+    lowest = cross_entropy(logits + np.float32(shift), best, found)
+    assert lowest <= cross_entropy(logits, best, temperature) + 1e-6
+
+
+def test_cross_entropy_by_hand() -> None:
+    """Logits 2 ln 3 and 0 at temperature 2 give 3/4 and 1/4: (ln 4/3 + ln 4) / 2."""
+    logits = np.array([[2 * math.log(3), 0.0]] * 2)
+    expected = (math.log(4 / 3) + math.log(4)) / 2
+    assert cross_entropy(logits, np.array([0, 1]), 2.0) == pytest.approx(expected)
+
+
+def test_what_cannot_be_calibrated_stays() -> None:
+    """No sample, or one mode: 1; always right or always wrong ends at the limits."""
+    assert fit_temperature(np.zeros((0, 3)), np.zeros(0, dtype=np.int64)) == 1
+    assert fit_temperature(np.zeros((4, 1)), np.zeros(4, dtype=np.int64)) == 1
+    logits = np.array([[3.0, 0.0]] * 4)
+    assert LIMITS[0] <= fit_temperature(logits, np.zeros(4, dtype=np.int64)) < 0.1
+    assert fit_temperature(logits, np.ones(4, dtype=np.int64)) == pytest.approx(20, rel=1e-3)

@@ -1,0 +1,286 @@
+"""Damaged, foreign and unfitting checkpoints: one line each."""
+
+import dataclasses
+import hashlib
+import json
+import pickle
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from safetensors.torch import load_file, save_file
+
+from asp_env.data.predictor import load_predictor
+from asp_env.data.snippets import gather_scene, index_snippets
+from asp_env.errors import AspEnvError, CheckpointError
+from asp_env.views import make_view
+from predictors.training.trainer import SafetensorsIO
+from tests.builders import make_recording
+from tests.predictors.tiny import make_network, save_random, tiny_network, tiny_shape
+
+
+@pytest.fixture
+def run(tmp_path: Path) -> Path:
+    """A checkpoint with random weights."""
+    return save_random(tmp_path / "run")
+
+
+def change(run: Path, **fields: Any) -> None:
+    """Other values for some fields of its configuration."""
+    path = run / "config.json"
+    path.write_text(json.dumps({**json.loads(path.read_text()), **fields}))
+
+
+def change_network(run: Path, **fields: Any) -> None:
+    """Other values for some fields of its network's configuration."""
+    config = json.loads((run / "config.json").read_text())
+    change(run, network={**config["network"], **fields})
+
+
+def change_training(run: Path, **fields: Any) -> None:
+    """Other values for what it says of its training."""
+    provenance = json.loads((run / "config.json").read_text())["provenance"]
+    change(run, provenance={**provenance, "config": {**provenance["config"], **fields}})
+
+
+def drop(run: Path, field: str) -> None:
+    """A configuration without one of its fields."""
+    path = run / "config.json"
+    config = json.loads(path.read_text())
+    del config[field]
+    path.write_text(json.dumps(config))
+
+
+def truncate(run: Path, name: str, size: int) -> None:
+    """Only the first bytes of a file."""
+    (run / name).write_bytes((run / name).read_bytes()[:size])
+
+
+def poison(run: Path) -> None:
+    """A weight that is no number."""
+    weights = load_file(run / "weights.safetensors")
+    weights["norm.bias"][0] = float("nan")
+    save_file(weights, run / "weights.safetensors")
+
+
+FAULTS: dict[str, tuple[Callable[[Path], Any], str]] = {
+    "no configuration": (lambda run: (run / "config.json").unlink(), "holds no trained predictor"),
+    "no weights": (lambda run: (run / "weights.safetensors").unlink(), "is missing: the run"),
+    "truncated configuration": (lambda run: truncate(run, "config.json", 100), "cannot be read"),
+    "truncated weights": (
+        lambda run: truncate(run, "weights.safetensors", 3000),
+        "cannot be read",
+    ),
+    "empty weights": (lambda run: truncate(run, "weights.safetensors", 0), "cannot be read"),
+    "pickled weights": (
+        lambda run: (run / "weights.safetensors").write_bytes(pickle.dumps({"a": 1})),
+        "cannot be read",
+    ),
+    "foreign JSON": (lambda run: (run / "config.json").write_text("[1, 2]"), "no checkpoint of"),
+    "other format": (lambda run: change(run, format=99), "no checkpoint of format 1"),
+    "other predictor": (lambda run: change(run, predictor="mtp"), "holds the predictor 'mtp'"),
+    "predictor without a name": (lambda run: drop(run, "predictor"), "does not name"),
+    "no view": (lambda run: drop(run, "view"), "does not describe a ffw-asp: 'view'"),
+    "unknown view": (lambda run: change(run, view={"name": "moon"}), "unknown view 'moon'"),
+    "view of vectors": (
+        lambda run: change(run, view=make_view("vectors").config()),
+        "encoder small reads pictures, the view draws vectors",
+    ),
+    "view of other pictures": (
+        lambda run: change(run, view=make_view("mtp", pixels=(36, 36)).config()),
+        "does not fit|but it was trained with",
+    ),
+    "no temperature": (lambda run: drop(run, "temperature"), "does not describe a ffw-asp"),
+    "temperature of nothing": (lambda run: change(run, temperature=None), "does not describe"),
+    "no normaliser": (lambda run: change(run, normaliser={}), "does not describe"),
+    "no horizon": (lambda run: drop(run, "horizon"), "does not describe"),
+    "unknown field": (lambda run: change_network(run, colour=1), "colour"),
+    "impossible field": (lambda run: change_network(run, modes=0), "modes is 0"),
+    "field of another type": (lambda run: change_network(run, features="x"), "does not describe"),
+    "other shapes": (lambda run: change_network(run, gru_width=9), "does not fit"),
+    "weights for another horizon": (lambda run: change(run, horizon=30), "does not fit"),
+    "horizon of nothing": (lambda run: change(run, horizon=0), "horizon is 0, expected a positive"),
+    "time step that is no number": (
+        lambda run: change(run, dt_s=float("nan")),
+        "dt_s is nan, expected a positive",
+    ),
+    "endless horizon": (lambda run: change(run, horizon=float("inf")), "horizon is inf"),
+    "temperature that is no number": (
+        lambda run: change(run, temperature=float("nan")),
+        "temperature is nan, expected a positive",
+    ),
+    "temperature of zero": (lambda run: change(run, temperature=0), "temperature is 0"),
+    "negative temperature": (lambda run: change(run, temperature=-1.5), r"temperature is -1\.5"),
+    "normaliser that is no number": (
+        lambda run: change(run, normaliser={"action_range": [float("nan"), 0.5]}),
+        "action_range is nan",
+    ),
+    "view that is a word": (lambda run: change(run, view="moon"), "does not describe"),
+    "provenance that is a list": (lambda run: change(run, provenance=[]), "does not describe"),
+    "other view of the same size": (
+        lambda run: (
+            change_training(run, view="chauffeurnet"),
+            change(run, view=make_view("chauffeurnet-no-trail", pixels=(36, 24)).config()),
+        ),
+        "view is chauffeurnet-no-trail, but it was trained with chauffeurnet",
+    ),
+    "other horizon than trained": (
+        lambda run: change_training(run, horizon_s=6.0),
+        r"horizon_s is 3\.0, but it was trained with 6\.0",
+    ),
+    "weights of another network": (
+        lambda run: save_file({"w": torch.zeros(2)}, run / "weights.safetensors"),
+        "does not fit",
+    ),
+    "weights that are not finite": (poison, "not finite"),
+}
+
+
+@pytest.mark.parametrize("fault", FAULTS, ids=list(FAULTS))
+def test_every_fault_is_one_line(fault: str, run: Path) -> None:
+    """Loading says in one line what is wrong with the folder."""
+    damage, message = FAULTS[fault]
+    damage(run)
+    with pytest.raises(CheckpointError, match=message) as caught:
+        load_predictor(f"ffw-asp:{run}", horizon=15, dt_s=0.2)
+    assert "\n" not in str(caught.value)
+
+
+def test_missing_argument_says_how_to_name_a_run() -> None:
+    """`ffw-asp` alone is not enough."""
+    with pytest.raises(CheckpointError, match="ffw-asp:RUN_DIR"):
+        load_predictor("ffw-asp", horizon=15, dt_s=0.2)
+
+
+def test_six_seconds_with_a_wrong_horizon_are_refused(tmp_path: Path) -> None:
+    """Weights of ssp-asp fit any number of segments; what it was trained for is remembered."""
+    run = save_random(tmp_path / "run", "ssp-asp", horizon=30)
+    change(run, horizon=31)
+    with pytest.raises(CheckpointError, match=r"chains segments of 3 s, the horizon of 6\.2 s"):
+        load_predictor(f"ssp-asp:{run}", horizon=15, dt_s=0.2)
+    change(run, horizon=45)
+    change_training(run, horizon_s=6.0)
+    with pytest.raises(CheckpointError, match=r"horizon_s is 9\.0, but it was trained with 6\.0"):
+        load_predictor(f"ssp-asp:{run}", horizon=15, dt_s=0.2)
+
+
+def test_chaining_is_named_behind_the_last_at(tmp_path: Path) -> None:
+    """By beam without one; a folder with an @ in its name is one; unknown ones are listed."""
+    run = save_random(tmp_path / "runs@home" / "a", "ssp-asp", horizon=30)
+    for name, chaining in ((f"{run}", "beam"), (f"{run}@top1", "top1"), (f"{run}@full", "full")):
+        about = load_predictor(f"ssp-asp:{name}", horizon=15, dt_s=0.2).metadata
+        assert about["chaining"] == chaining
+    assert load_predictor(f"ssp-asp:{run}@oracle", horizon=15, dt_s=0.2).privileged
+    with pytest.raises(AspEnvError, match=r"unknown chaining 'top' \(did you mean 'top1'"):
+        load_predictor(f"ssp-asp:{run}@top", horizon=15, dt_s=0.2)
+    with pytest.raises(CheckpointError, match="runs@work/a holds no trained predictor"):
+        load_predictor(f"ssp-asp:{tmp_path}/runs@work/a", horizon=15, dt_s=0.2)
+    whole = save_random(tmp_path / "b@top1", "ssp-asp", horizon=30)
+    assert load_predictor(f"ssp-asp:{whole}", horizon=15, dt_s=0.2).metadata["chaining"] == "beam"
+
+
+@pytest.mark.parametrize("predictor", ["ffw-asp", "ssp-asp"])
+def test_what_chains_nothing_takes_no_chaining(predictor: str, tmp_path: Path) -> None:
+    """3 s are forecast at once, by ssp-asp too: the line says how to name the run."""
+    run = save_random(tmp_path / "run", predictor)
+    with pytest.raises(AspEnvError, match=f"nothing to chain: .* as {predictor}:{run}$"):
+        load_predictor(f"{predictor}:{run}@top1", horizon=15, dt_s=0.2)
+
+
+def test_other_time_step_is_refused(run: Path) -> None:
+    """A predictor of 0.2 s is not loaded for scenes of 0.1 s."""
+    with pytest.raises(AspEnvError, match=r"time step of 0\.2 s, the scenes have 0\.1 s"):
+        load_predictor(f"ffw-asp:{run}", horizon=30, dt_s=0.1)
+
+
+def test_predictor_keeps_the_horizon_it_was_trained_for(run: Path) -> None:
+    """Asked for 30 ticks, a predictor of 15 forecasts 15."""
+    assert load_predictor(f"ffw-asp:{run}", horizon=30, dt_s=0.2).horizon == 15
+
+
+def test_probabilities_are_those_of_the_temperature(run: Path) -> None:
+    """Logits are divided by what is stored: at 2 the log-odds between modes are half as large."""
+    recordings = [make_recording()]
+    scene = gather_scene(recordings, index_snippets(recordings, dt_s=0.2, horizon_s=3.0))
+    odds = []
+    for temperature in (1.0, 2.0):
+        change(run, temperature=temperature)
+        log_probs = load_predictor(f"ffw-asp:{run}", horizon=15, dt_s=0.2).predict(scene).log_probs
+        odds.append(log_probs[:, 1:] - log_probs[:, :1])
+    assert np.abs(odds[0]).max() > 0.05
+    np.testing.assert_allclose(odds[1], odds[0] / 2, atol=1e-5)
+
+
+def test_network_is_stored_as_it_is(run: Path) -> None:
+    """What is loaded holds the weights, shape and configuration that were saved, bit for bit."""
+    network = make_network("ffw-asp", tiny_network("ffw-asp"), tiny_shape())
+    stored = load_file(run / "weights.safetensors")
+    assert stored.keys() == network.state_dict().keys()
+    for name, value in network.state_dict().items():
+        assert torch.equal(stored[name], value), name
+    config = json.loads((run / "config.json").read_text())
+    assert config["network"] == dataclasses.asdict(network.config)
+    assert (config["history"], config["horizon"], config["dt_s"]) == (15, 15, 0.2)
+    assert tuple(config["normaliser"]["action_range"]) == network.shape.action_range
+
+
+def test_about_names_what_tables_show(run: Path) -> None:
+    """Source, view, preset, and 16 digits that change with the weights; no preset, no entry."""
+    about = load_predictor(f"ffw-asp:{run}", horizon=15, dt_s=0.2).metadata
+    content = (run / "weights.safetensors").read_bytes()
+    assert dict(about) == {
+        "trained_on": "nothing",
+        "view": "chauffeurnet",
+        "preset": "tiny",
+        "weights": hashlib.sha256(content).hexdigest()[:16],
+    }
+    other = save_random(run.with_name("other"), seed=1)
+    assert load_predictor(f"ffw-asp:{other}", horizon=15, dt_s=0.2).metadata != about
+    known = json.loads((run / "config.json").read_text())["provenance"]["trained_on"]
+    change(run, provenance={"trained_on": known})
+    assert "preset" not in load_predictor(f"ffw-asp:{run}", horizon=15, dt_s=0.2).metadata
+
+
+def test_state_of_a_run_survives_the_disk(tmp_path: Path) -> None:
+    """Nested tensors, tuples, integer keys, None and infinities come back as they were."""
+    state = {
+        "epoch": 3,
+        "best": float("inf"),
+        "optimizer": [{"state": {0: {"m": torch.arange(3.0), "step": torch.tensor(7.0)}}}],
+        "betas": (0.9, 0.999),
+        "none": None,
+        "name": "a",
+        "flag": True,
+    }
+    SafetensorsIO().save_checkpoint(state, tmp_path / "state")
+    loaded = SafetensorsIO().load_checkpoint(tmp_path / "state")
+    moments = loaded["optimizer"][0]["state"][0]
+    assert torch.equal(moments["m"], torch.arange(3.0))
+    assert float(moments["step"]) == 7.0
+    assert loaded["betas"] == (0.9, 0.999)
+    rest = ("epoch", "best", "none", "name", "flag")
+    assert [loaded[key] for key in rest] == [state[key] for key in rest]
+
+
+def test_state_refuses_what_would_need_a_pickle(tmp_path: Path) -> None:
+    """An object in the state of a run is an error when it is written, not when it is read."""
+    with pytest.raises(TypeError, match="Path, which is not stored"):
+        SafetensorsIO().save_checkpoint({"where": Path()}, tmp_path / "state")
+
+
+def test_damaged_state_is_one_line(tmp_path: Path) -> None:
+    """A state cut short says to start the run again."""
+    SafetensorsIO().save_checkpoint({"a": torch.zeros(100)}, tmp_path / "state")
+    (tmp_path / "state").write_bytes((tmp_path / "state").read_bytes()[:90])
+    with pytest.raises(CheckpointError, match="start the run again"):
+        SafetensorsIO().load_checkpoint(tmp_path / "state")
+
+
+def test_loading_leaves_the_global_generator_alone(run: Path) -> None:
+    """What torch draws next does not depend on whether a predictor was loaded."""
+    before = torch.random.get_rng_state()
+    load_predictor(f"ffw-asp:{run}", horizon=15, dt_s=0.2)
+    assert torch.equal(torch.random.get_rng_state(), before)

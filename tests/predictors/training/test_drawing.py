@@ -1,0 +1,139 @@
+"""Batches drawn by processes are those that a thread draws, and the processes end with the run."""
+
+import os
+import select
+import subprocess
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from safetensors.torch import load_file
+from torch.utils._pytree import tree_flatten
+
+from asp_env.data.causal import causal_histories
+from asp_env.data.snippets import index_snippets
+from asp_env.data.source import open_data
+from asp_env.errors import AspEnvError
+from asp_env.views import make_view
+from predictors.training.data import Batches
+from predictors.training.data_loading import BatchWorkers, Drawn, batch_workers
+from predictors.training.fitting import train
+from predictors.training.trainer import Hardware
+from tests.builders import make_recording
+from tests.predictors.tiny import PIXELS, tiny_config, write_data
+
+PROCESSES = 2
+
+
+def named(folder: str) -> Batches:
+    """Pictures of causal histories, of recordings that are opened by name."""
+    recordings = open_data(folder)
+    return Batches(
+        recordings,
+        index_snippets(recordings, dt_s=0.2, horizon_s=3.0),
+        view=make_view("chauffeurnet", pixels=PIXELS),
+        batch_size=8,
+        later_ticks=(15,),
+        histories=causal_histories(recordings),
+    )
+
+
+def held() -> Batches:
+    """Vectors of a recording that is nowhere but in memory."""
+    recordings = [make_recording()]
+    index = index_snippets(recordings, dt_s=0.2, horizon_s=3.0)
+    return Batches(recordings, index, view=make_view("vectors"), batch_size=16)
+
+
+@pytest.fixture(scope="module")
+def both(tmp_path_factory: pytest.TempPathFactory) -> Iterator[tuple[BatchWorkers, list[Batches]]]:
+    """A crew that knows two drawings."""
+    batches = [named(write_data(tmp_path_factory.mktemp("data"))), held()]
+    with batch_workers([each.drawing for each in batches], PROCESSES) as crew:
+        assert crew is not None
+        yield crew, batches
+
+
+def same(first: Drawn, second: Drawn) -> bool:
+    """Whether two batches agree in every bit."""
+    pairs = zip(tree_flatten(first)[0], tree_flatten(second)[0], strict=True)
+    return all(torch.equal(one, other) for one, other in pairs)
+
+
+@pytest.mark.parametrize("number", [0, 1], ids=["named, causal", "held"])
+def test_processes_draw_what_a_thread_draws(
+    both: tuple[BatchWorkers, list[Batches]], number: int
+) -> None:
+    """In the same order, bit for bit, also of a share of a shuffle."""
+    crew, batches = both
+    rows = np.random.default_rng(0).permutation(len(batches[number].snippets))
+    alone = batches[number].reordered(rows).dealt(1, 2)
+    together = alone.drawn_by(crew, number)
+    pairs = list(zip(alone, together, strict=True))
+    assert len(pairs) == len(alone) > PROCESSES
+    assert all(same(*pair) for pair in pairs)
+    assert not same(pairs[0][0], pairs[1][0])
+
+
+def test_fault_in_a_process_reaches_the_reader(both: tuple[BatchWorkers, list[Batches]]) -> None:
+    """As it was raised, and the crew goes on drawing."""
+    crew, batches = both
+    index = index_snippets(batches[1].drawing.recordings, dt_s=0.2, horizon_s=3.0, history_s=1.0)
+    with pytest.raises(ValueError, match="needs 15 past ticks"):
+        crew.submit(1, index).result()
+    assert len(crew.submit(1, batches[1].snippets.select(np.arange(3))).result()[1].states) == 3
+
+
+def test_processes_change_no_weights(tmp_path: Path) -> None:
+    """Training ends with the same bits, whoever draws."""
+    data = write_data(tmp_path / "data")
+    config = tiny_config("ssp-asp", "vectors", epochs=1, pretraining_epochs=1)
+    runs = [
+        train(config, data, tmp_path / str(processes), hardware=Hardware(num_workers=processes))
+        for processes in (0, 1)
+    ]
+    weights = [load_file(run / "weights.safetensors") for run in runs]
+    assert weights[0].keys() == weights[1].keys()
+    assert all(torch.equal(value, weights[1][name]) for name, value in weights[0].items())
+
+
+def test_too_few_processes_are_refused() -> None:
+    """None at all is a thread."""
+    with pytest.raises(AspEnvError, match="num_workers is -1, expected 0 or more"):
+        Hardware(num_workers=-1)
+
+
+KILLED = """
+import os, signal
+from predictors.training.data_loading import BatchWorkers
+from tests.predictors.training.test_drawing import held
+
+if __name__ == "__main__":
+    batches = held()
+    crew = BatchWorkers([batches.drawing], 2)
+    crew.submit(0, batches.snippets).result()
+    os.kill(os.getpid(), signal.SIGKILL)
+"""
+
+
+def test_processes_end_when_the_run_is_killed(tmp_path: Path) -> None:
+    """They share its standard output, which ends with the last of them."""
+    script = tmp_path / "killed.py"
+    script.write_text(KILLED)
+    reading, writing = os.pipe()
+    environment = {**os.environ, "PYTHONPATH": os.pathsep.join(path for path in sys.path if path)}
+    process = subprocess.run(
+        [sys.executable, str(script)],
+        stdout=writing,
+        stderr=subprocess.PIPE,
+        env=environment,
+        check=False,
+    )
+    os.close(writing)
+    with os.fdopen(reading, "rb") as output:
+        assert process.returncode < 0, process.stderr
+        assert select.select([output], [], [], 60)[0], "still there after a minute"
+        assert output.read() == b""

@@ -1,0 +1,180 @@
+"""Training: what it writes, and what it refuses."""
+
+import dataclasses
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from safetensors.torch import load_file
+
+from asp_env.data.predictor import load_predictor
+from asp_env.data.snippets import SnippetIndex, gather_scene, index_snippets
+from asp_env.data.source import Recordings, open_data
+from asp_env.data.split import Split, snippet_parts
+from asp_env.errors import AspEnvError
+from predictors.inference.calibration import fit_temperature
+from predictors.inference.trained import TrainedPredictor
+from predictors.models.chaining import Chaining
+from predictors.models.losses import best_mode
+from predictors.models.ssp_asp import SSPASPNetwork
+from predictors.training import data as training_data
+from predictors.training.data import VALIDATION_BATCH, open_training_data
+from predictors.training.fitting import train
+from predictors.training.lightning_parts import one_cycle
+from tests.predictors.tiny import tiny_config, tiny_network, write_data
+
+
+@pytest.fixture(scope="module")
+def data(tmp_path_factory: pytest.TempPathFactory) -> str:
+    """Three recordings: one to learn from, one to select on, one to test."""
+    return write_data(tmp_path_factory.mktemp("data"))
+
+
+@pytest.fixture(scope="module")
+def finished(data: str, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A run of four epochs that nothing interrupted."""
+    return train(tiny_config(), data, tmp_path_factory.mktemp("runs") / "finished")
+
+
+def test_other_seed_gives_other_weights(data: str, finished: Path, tmp_path: Path) -> None:
+    """The seed decides the weights: another one gives others."""
+    other = train(tiny_config(seed=1), data, tmp_path / "run")
+    name = "head.layers.0.weight"
+    weights = [load_file(run / "weights.safetensors")[name] for run in (finished, other)]
+    assert not torch.equal(*weights)
+
+
+def test_run_folder_holds_no_pickles(finished: Path) -> None:
+    """Configuration, weights and logs, and nothing else."""
+    files = {str(path.relative_to(finished)) for path in finished.rglob("*") if path.is_file()}
+    assert "logs/from-epoch-00/metrics.csv" in files
+    logs = {name for name in files if name.startswith("logs/")}
+    assert files - logs == {"config.json", "weights.safetensors", "README.md"}
+    assert all("events" in n or n.endswith(("metrics.csv", "hparams.yaml")) for n in logs)
+
+
+def test_checkpoint_says_what_it_learned_from(data: str, finished: Path) -> None:
+    """Part and content hash of every recording, seed, normaliser, and versions."""
+    config = json.loads((finished / "config.json").read_text())
+    known = config["provenance"]["trained_on"]
+    assert set(known["parts"]) == set(open_data(data).hashes())
+    assert sorted(known["parts"].values()) == ["test", "train", "validation"]
+    assert config["provenance"]["data_hash"] == open_data(data).data_hash()
+    assert config["provenance"]["config"]["seed"] == 0
+    assert config["normaliser"]["action_range"][0] >= 0.5
+    assert "torch" in config["provenance"]["versions"]
+    predictor = load_predictor(f"ffw-asp:{finished}", horizon=15, dt_s=0.2)
+    assert predictor.metadata["trained_on"] == data
+    assert predictor.metadata["preset"] == "cpu"
+    assert predictor.trained_on is not None
+    assert predictor.trained_on.split == "recording"
+    assert dict(predictor.trained_on.parts) == known["parts"]
+
+
+def test_what_merges_modes_is_calibrated_before_and_after(data: str, tmp_path: Path) -> None:
+    """The run keeps both temperatures, each the best one of the modes that it divides."""
+    config = tiny_config("ssp-asp", "vectors", epochs=1, pretraining_epochs=0)
+    config = dataclasses.replace(config, network=tiny_network("ssp-asp", "vectors", kept=3))
+    run = train(config, data, tmp_path / "run")
+    predictor = load_predictor(f"ssp-asp:{run}", horizon=15, dt_s=0.2)
+    assert isinstance(predictor, TrainedPredictor)
+    network = predictor.network
+    assert isinstance(network, SSPASPNetwork)
+    found = network.merging_temperature
+    assert found is not None
+    shown = open_training_data(config, data).validation
+    batches = shown.batches(
+        predictor.view, size=VALIDATION_BATCH, later_ticks=network.later_ticks, config=config
+    )
+    told = json.loads((run / "config.json").read_text())["temperature"]
+    both: tuple[tuple[Chaining, float], ...] = (("full", float(found)), ("beam", told))
+    for chaining, temperature in both:
+        logits, best = [], []
+        with torch.inference_mode():
+            for batch, labels in batches:
+                modes = network.chain(batch, chaining)
+                logits.append(modes.logits.numpy())
+                best.append(best_mode(modes.states[..., :2], labels.states[..., :2], "distance"))
+        expected = fit_temperature(np.concatenate(logits), np.concatenate(best))
+        assert temperature == pytest.approx(expected, rel=1e-3)
+        assert abs(temperature - 1) > 1e-2
+
+
+def test_finished_run_is_refused(data: str, finished: Path) -> None:
+    """Training into a finished run is one line that says so."""
+    with pytest.raises(AspEnvError, match="holds a finished run"):
+        train(tiny_config(), data, finished)
+
+
+def test_other_configuration_is_refused(data: str, tmp_path: Path) -> None:
+    """An unfinished run is gone on with only by its own configuration."""
+    out = tmp_path / "run"
+    (out / "unfinished").mkdir(parents=True)
+    (out / "unfinished" / "run.json").write_text("{}")
+    with pytest.raises(AspEnvError, match="unfinished run of another configuration"):
+        train(tiny_config(), data, out)
+
+
+def test_foreign_folder_is_refused(data: str, tmp_path: Path) -> None:
+    """A folder with other things in it is left alone."""
+    (tmp_path / "letter.txt").write_text("dear")
+    with pytest.raises(AspEnvError, match="something that is no run"):
+        train(tiny_config(), data, tmp_path)
+    assert [path.name for path in tmp_path.iterdir()] == ["letter.txt"]
+
+
+def test_loss_that_is_not_finite_stops_the_run(
+    data: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A NaN loss is one line, and no checkpoint is written."""
+    terms = "predictors.models.losses.regression_loss"
+    monkeypatch.setattr(terms, lambda *_: torch.tensor(float("nan"), requires_grad=True))
+    with pytest.raises(AspEnvError, match="not finite in epoch 0"):
+        train(tiny_config(), data, tmp_path / "run")
+    assert not (tmp_path / "run" / "config.json").exists()
+
+
+def test_too_few_recordings_leave_no_folder(tmp_path: Path) -> None:
+    """Where nothing is left to test on the error names blocks, and nothing is half written."""
+    data = write_data(tmp_path / "data", recordings=1)
+    with pytest.raises(AspEnvError, match="--split blocks"):
+        train(tiny_config(), data, tmp_path / "run")
+    assert not (tmp_path / "run").exists()
+
+
+def test_nothing_to_select_on_is_one_line(
+    data: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A split that leaves no snippet for validation is refused before anything is written."""
+
+    def all_to_train(recordings: Recordings, index: SnippetIndex, split: Split) -> object:
+        _, trained_on = snippet_parts(recordings, index, split)
+        return np.full(len(index), "train"), trained_on
+
+    monkeypatch.setattr(training_data, "snippet_parts", all_to_train)
+    with pytest.raises(AspEnvError, match="no snippet is left for validation") as caught:
+        train(tiny_config(), data, tmp_path / "run")
+    assert "\n" not in str(caught.value)
+    assert not (tmp_path / "run").exists()
+
+
+def test_forecasts_do_not_depend_on_the_batch(data: str, finished: Path) -> None:
+    """A target alone is forecast as among all others, to 1e-5 m."""
+    recordings = open_data(data)
+    scene = gather_scene(recordings, index_snippets(recordings, dt_s=0.2, horizon_s=3.0))
+    predictor = load_predictor(f"ffw-asp:{finished}", horizon=15, dt_s=0.2)
+    together = predictor.predict(scene)
+    for row in (0, 7):
+        alone = predictor.predict(scene.with_targets(scene.targets[row : row + 1]))
+        np.testing.assert_allclose(alone.states[0], together.states[row], atol=2e-5)
+        np.testing.assert_allclose(alone.log_probs[0], together.log_probs[row], atol=1e-5)
+
+
+@pytest.mark.parametrize(
+    ("step", "share"), [(0, 0.1), (4, 0.5), (9, 1.0), (10, 1.0), (55, 0.5), (100, 0.0)]
+)
+def test_one_cycle_by_hand(step: int, share: float) -> None:
+    """Of 100 steps: up over the first ten, half in the middle of the rest, zero at the end."""
+    assert one_cycle(step, 100) == pytest.approx(share, abs=1e-9)

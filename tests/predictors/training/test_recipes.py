@@ -1,0 +1,130 @@
+"""Recipes: the paper's numbers, and configurations that cannot be."""
+
+import dataclasses
+from typing import Any
+
+import pytest
+
+from asp_env.errors import AspEnvError
+from predictors.models.ffw_asp import FFWASPConfig
+from predictors.models.ssp_asp import SSPASPConfig
+from predictors.training.recipes import RECIPES, TrainingConfig, recipe
+from tests.predictors.tiny import tiny_config
+
+
+@pytest.mark.parametrize("predictor", RECIPES)
+@pytest.mark.parametrize("horizon_s", [3.0, 6.0])
+def test_paper_recipes_are_the_papers(predictor: str, horizon_s: float) -> None:
+    """ResNet18 of 512, 3 modes by angle or at random, Euler; Adam 1e-4, batches of 32, 10 epochs.
+
+    Three epochs of pre-training come before those of SSP-ASP, but not where 6 s start from 3 s.
+    """
+    config = recipe(predictor, "paper", view="chauffeurnet", horizon_s=horizon_s)
+    network = config.network
+    assert (network.encoder, network.features, network.modes) == ("resnet18", 512, 3)
+    assert (network.assignment, network.annealed) == ("angle-random", False)
+    assert network.classification == "cross-entropy"
+    assert getattr(network, "integrator", "euler") == "euler"
+    assert (config.learning_rate, config.batch_size, config.epochs) == (1e-4, 32, 10)
+    assert (config.schedule, config.weight_decay) == ("plateau", 0.0)
+    assert (config.pixels, config.snippets_per_epoch) == (None, None)
+    assert (config.standing_share, config.max_snippets) == (1.0, None)
+    assert (config.view, config.horizon_s, config.dt_s) == ("chauffeurnet", horizon_s, 0.2)
+    first = predictor == "ssp-asp" and horizon_s == 3.0
+    assert config.pretraining_epochs == (3 if first else 0)
+
+
+def test_papers_recurrent_networks() -> None:
+    """GRUs of 2x512 without skip or hidden layer; SSP-ASP's four terms weigh alike, both branches.
+
+    Its options beyond the paper are off.
+    """
+    ffw = recipe("ffw-asp", "paper", view="mtp", horizon_s=3.0).network
+    ssp = recipe("ssp-asp", "paper", view="mtp", horizon_s=3.0).network
+    assert isinstance(ffw, FFWASPConfig)
+    assert isinstance(ssp, SSPASPConfig)
+    assert ffw.head == "recurrent"
+    for network in (ffw, ssp):
+        assert (network.gru_width, network.gru_layers) == (512, 2)
+        assert (network.skip, network.hidden) == (False, 0)
+    assert (ssp.action_weight, ssp.feature_weight) == (1.0, 1.0)
+    assert (ssp.regression_weight, ssp.classification_weight) == (1.0, 1.0)
+    assert ssp.encoded_branch
+    assert not any((ssp.normalise, ssp.stop_gradient, ssp.ema, ssp.scheduled))
+
+
+CASES = [(predictor, preset) for predictor, presets in RECIPES.items() for preset in presets]
+
+
+@pytest.mark.parametrize(("predictor", "preset"), CASES)
+def test_every_recipe_is_for_every_view(predictor: str, preset: str) -> None:
+    """Named after predictor and preset; pictures get an encoder of pictures, vectors theirs.
+
+    Small pictures are square pixels of a quarter: 90x60, or 90x90 of the square view.
+    """
+    for view, pixels in (("chauffeurnet", (90, 60)), ("mtp", (90, 90)), ("vectors", None)):
+        config = recipe(predictor, preset, view=view, horizon_s=3.0)
+        assert (config.predictor, config.preset, config.view) == (predictor, preset, view)
+        if preset == "paper":
+            pixels = None
+        assert config.pixels == pixels
+        encoder = "resnet18" if preset == "paper" else "small"
+        assert config.network.encoder == ("vector" if view == "vectors" else encoder)
+
+
+def test_small_pretraining_takes_of_the_epochs() -> None:
+    """Two of SSP-ASP's epochs: with those after them as many as DKM has."""
+    ssp, dkm = (
+        recipe(predictor, "cpu", view="vectors", horizon_s=3.0) for predictor in ("ssp-asp", "dkm")
+    )
+    assert ssp.all_epochs == dkm.all_epochs == dkm.epochs
+    assert ssp.pretraining_epochs == 2
+
+
+def test_small_runs_for_6_s_have_equal_budgets() -> None:
+    """16 epochs each: of SSP-ASP 8 for 3 s and 8 after them, of the others all at once."""
+    small = [(name, preset) for name, of in RECIPES.items() for preset in of if preset != "paper"]
+    assert len(small) == 6
+    for predictor, preset in small:
+        short, long = (
+            recipe(predictor, preset, view="vectors", horizon_s=horizon_s).all_epochs
+            for horizon_s in (3.0, 6.0)
+        )
+        assert (short + long if predictor == "ssp-asp" else long) == 16
+
+
+def test_unknown_names_list_the_known_ones() -> None:
+    """A misspelt predictor or preset is one line with a suggestion."""
+    with pytest.raises(AspEnvError, match="did you mean 'ffw-asp'"):
+        recipe("ffw", "cpu", view="chauffeurnet", horizon_s=3.0)
+    with pytest.raises(AspEnvError, match="known are cpu, ours, paper"):
+        recipe("ffw-asp", "gpu", view="chauffeurnet", horizon_s=3.0)
+
+
+@pytest.mark.parametrize(
+    "field",
+    ["epochs", "batch_size", "snippets_per_epoch", "max_snippets", "max_validation_snippets"],
+)
+def test_numbers_of_nothing_are_refused(field: str) -> None:
+    """No epochs, or none of what is counted, is refused at construction."""
+    nothing: Any = {field: 0}
+    with pytest.raises(AspEnvError, match=f"{field} is 0, expected 1 or more"):
+        tiny_config(**nothing)
+
+
+def test_impossible_shares_are_refused() -> None:
+    """A share of standing targets above one, or negative epochs."""
+    with pytest.raises(AspEnvError, match=r"standing_share is 1\.5"):
+        tiny_config(standing_share=1.5)
+    with pytest.raises(AspEnvError, match="pretraining_epochs is -1"):
+        tiny_config(pretraining_epochs=-1)
+    assert isinstance(tiny_config(), TrainingConfig)
+    assert dataclasses.replace(tiny_config(), pretraining_epochs=2).all_epochs == 6
+
+
+@pytest.mark.parametrize("preset", RECIPES["ssp-asp"])
+@pytest.mark.parametrize("horizon_s", [1.5, 4.0])
+def test_what_cannot_be_chained_is_refused_at_once(preset: str, horizon_s: float) -> None:
+    """1.5 and 4 s are no whole number of segments of 3 s: one line before anything is trained."""
+    with pytest.raises(AspEnvError, match=f"horizon of {horizon_s:g} s is no whole number"):
+        recipe("ssp-asp", preset, view="vectors", horizon_s=horizon_s)

@@ -1,0 +1,177 @@
+"""Training data: which snippets, in which order, and the range of their actions."""
+
+import math
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from asp_env.data.classes import AgentClass
+from asp_env.data.snippets import gather_future, gather_present, gather_scene, index_snippets
+from asp_env.dynamics import inverse
+from asp_env.errors import AspEnvError
+from asp_env.views import make_picture_view
+from asp_env.views.draw import pack_bits
+from predictors.training import data as training_data
+from predictors.training.data import (
+    Batches,
+    action_range,
+    choose_snippets,
+    epoch_rows,
+    moving_snippets,
+)
+from tests.builders import Drive, make_recording
+
+EAST = Drive(kind=AgentClass.CAR, start=(-50.0, 2.0, 0.0, 10.0))
+WAITING = Drive(kind=AgentClass.CAR, start=(20.0, -2.0, 0.0, 0.0), appears_s=0.4)
+"""Stands all the time, but is not there from the first frame: not parked."""
+
+SMALL = make_picture_view("chauffeurnet", pixels=(36, 24))
+
+
+@given(
+    count=st.integers(1, 30),
+    per_epoch=st.integers(1, 70),
+    seed=st.integers(0, 3),
+    epochs=st.integers(1, 4),
+)
+def test_epochs_walk_through_whole_shuffles(
+    count: int, per_epoch: int, seed: int, epochs: int
+) -> None:
+    """Epochs laid end to end show every snippet once before any is shown again."""
+    rows = np.concatenate(
+        [epoch_rows(count, per_epoch=per_epoch, epoch=epoch, seed=seed) for epoch in range(epochs)]
+    )
+    assert len(rows) == per_epoch * epochs
+    whole = len(rows) // count * count
+    for shuffle in rows[:whole].reshape(-1, count):
+        assert sorted(shuffle) == list(range(count))
+    assert len(set(rows[whole:])) == len(rows) - whole
+
+
+def test_epochs_differ_in_order() -> None:
+    """Two epochs of all 50 snippets, and two seeds, are different shuffles."""
+    first, second, other = (
+        epoch_rows(50, per_epoch=50, epoch=epoch, seed=seed)
+        for epoch, seed in ((0, 0), (1, 0), (0, 1))
+    )
+    assert first.tolist() != second.tolist()
+    assert first.tolist() != other.tolist()
+
+
+def test_standing_targets_are_held_back() -> None:
+    """Of as many standing as moving targets, a share of 0.2 keeps one for every four that move."""
+    recordings = [make_recording(drives=(EAST, WAITING), duration_s=16.0)]
+    index = index_snippets(recordings, dt_s=0.2, horizon_s=3.0)
+    is_moving = moving_snippets(recordings, index)
+    going = int(is_moving.sum())
+    assert going == np.sum(index.track == 0)
+    kept = choose_snippets(recordings, index, standing_share=0.2, max_snippets=None, seed=0)
+    assert np.sum(kept.track == 0) == going
+    assert np.sum(kept.track == 1) == going // 4
+    every = choose_snippets(recordings, index, standing_share=1.0, max_snippets=None, seed=0)
+    assert len(every) == len(index)
+
+
+def test_traffic_that_never_moves_is_refused() -> None:
+    """With a share of 0.5 for standing ones and none that moves, nothing would be left."""
+    recordings = [make_recording(drives=(EAST, WAITING), duration_s=16.0)]
+    index = index_snippets(recordings, dt_s=0.2, horizon_s=3.0)
+    index = index.select(index.track == 1)
+    assert len(index) > 0
+    with pytest.raises(
+        AspEnvError, match=rf"none of the {len(index)} snippets .* 0\.5 at"
+    ) as caught:
+        choose_snippets(recordings, index, standing_share=0.5, max_snippets=None, seed=0)
+    assert "\n" not in str(caught.value)
+    every = choose_snippets(recordings, index, standing_share=1.0, max_snippets=None, seed=0)
+    assert len(every) == len(index)
+
+
+def test_max_snippets_keeps_a_random_few_in_order() -> None:
+    """Five of all, the same five for the same seed, still ordered by time."""
+    recordings = [make_recording(duration_s=16.0)]
+    index = index_snippets(recordings, dt_s=0.2, horizon_s=3.0)
+    kept, again = (
+        choose_snippets(recordings, index, standing_share=1.0, max_snippets=5, seed=3)
+        for _ in range(2)
+    )
+    assert len(kept) == 5
+    assert kept.tick.tolist() == again.tick.tolist()
+    assert kept.tick.tolist() == sorted(kept.tick.tolist())
+
+
+def test_action_range_is_that_of_the_futures() -> None:
+    """A car that brakes at 2 m/s² and steers 0.2 rad: the range is (2, 0.2)."""
+    braking = Drive(kind=AgentClass.CAR, start=(0.0, 0.0, 0.0, 25.0), phases=((60.0, -2.0, 0.2),))
+    recordings = [make_recording(drives=(braking,), duration_s=8.0)]
+    index = index_snippets(recordings, dt_s=0.2, horizon_s=3.0)
+    acceleration, steering = action_range(recordings, index)
+    assert acceleration == pytest.approx(2.0, abs=0.01)
+    assert steering == pytest.approx(0.2, abs=0.01)
+
+
+@pytest.mark.parametrize("count", [1, 2, 3, 70, 131])
+def test_action_range_is_the_percentile_of_all(count: int, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Read in chunks of 7 or at once by NumPy: the same to the last bit."""
+    weaving = Drive(
+        kind=AgentClass.CAR,
+        start=(0.0, 0.0, 0.0, 12.0),
+        phases=((9.0, 1.3, 0.1), (14.0, -1.1, -0.3), (80.0, 0.3, 0.2)),
+    )
+    recordings = [make_recording(drives=(weaving, EAST), duration_s=60.0)]
+    index = index_snippets(recordings, dt_s=0.2, horizon_s=3.0)
+    index = index.select(np.arange(count))
+    now, lengths = gather_present(recordings, index)
+    future = gather_future(recordings, index).states
+    before = np.concatenate([now[:, None], future[:, :-1]], axis=1)
+    every = np.abs(inverse(before, future, lengths[:, None], 0.2)).reshape(-1, 2)
+    expected = np.percentile(every.astype(np.float64), 99.9, axis=0)
+    monkeypatch.setattr(training_data, "CHUNK", 7)
+    low = np.array(training_data.MIN_ACTION_RANGE)
+    assert action_range(recordings, index) == tuple(np.maximum(expected, low).tolist())
+
+
+def test_action_range_stays_within_limits() -> None:
+    """Standing still gives the least range, braking at 9 m/s² no more than 5."""
+    wild = Drive(kind=AgentClass.CAR, start=(0.0, 0.0, 0.0, 30.0), phases=((9.0, -9.0, 0.0),))
+    for drive, expected in ((WAITING, (0.5, 0.05)), (wild, (5.0, 0.05))):
+        recordings = [make_recording(drives=(drive,), duration_s=8.0)]
+        index = index_snippets(recordings, dt_s=0.2, horizon_s=3.0)
+        assert action_range(recordings, index) == pytest.approx(expected)
+
+
+def test_batches_hold_every_snippet_in_order() -> None:
+    """Batches of four of ten snippets: 4, 4, 2, equal to what is drawn directly."""
+    recordings = [make_recording()]
+    index = index_snippets(recordings, dt_s=0.2, horizon_s=3.0)
+    chosen = index.select(np.array([9, 3, 50, 41, 7, 60, 2, 1, 80, 30]))
+    batches = Batches(recordings, chosen, view=SMALL, batch_size=4)
+    assert len(batches) == 3
+    found = list(batches)
+    assert [len(batch.actions) for batch, _ in found] == [4, 4, 2]
+    scene = gather_scene(recordings, chosen)
+    packed = np.concatenate([np.asarray(batch.seen) for batch, _ in found])
+    np.testing.assert_array_equal(packed, pack_bits(SMALL.draw(scene)))
+    actions = np.concatenate([batch.actions.numpy() for batch, _ in found])
+    at = (scene.targets[:, 0], scene.targets[:, 1])
+    np.testing.assert_array_equal(actions, scene.actions[at])
+
+
+def test_labels_are_seen_from_the_target() -> None:
+    """A car that heads south at 10 m/s is 30 m straight ahead of itself after 3 s."""
+    south = Drive(kind=AgentClass.CAR, start=(5.0, 60.0, -math.pi / 2, 10.0))
+    recordings = [make_recording(drives=(south,), duration_s=8.0)]
+    index = index_snippets(recordings, dt_s=0.2, horizon_s=3.0)
+    ((_, labels),) = Batches(recordings, index, view=SMALL, batch_size=100)
+    np.testing.assert_allclose(labels.states[:, -1], [[30, 0, 0, 10]] * len(index), atol=1e-3)
+    assert gather_future(recordings, index).valid.all()
+
+
+def test_fault_while_drawing_reaches_the_reader() -> None:
+    """What goes wrong in the drawing thread is raised where batches are asked for."""
+    recordings = [make_recording()]
+    index = index_snippets(recordings, dt_s=0.2, horizon_s=3.0, history_s=1.0)
+    with pytest.raises(ValueError, match="needs 15 past ticks"):
+        next(iter(Batches(recordings, index, view=SMALL, batch_size=4)))
