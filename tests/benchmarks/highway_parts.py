@@ -44,7 +44,7 @@ def replaced(owner: Any, name: str, value: Any) -> Iterator[None]:
 
 def _predict_each_time(vehicle: Any, times: Any) -> Any:
     if vehicle.steered:
-        return vehicle._in_its_curve(times)
+        return vehicle._along_curve(times)
     return IDMVehicle.predict_trajectory_constant_speed(vehicle, times)
 
 
@@ -78,7 +78,7 @@ PARTS: dict[str, list[tuple[Any, str, Any]]] = {
         ),
     ],
     "closest lane by cells": [(Network, "get_closest_lane_index", _plain_closest)],
-    "lane coordinates stored": [(vehicles, "_remembering", lambda locate: locate)],
+    "lane coordinates stored": [(vehicles, "_cached", lambda locate: locate)],
 }
 
 

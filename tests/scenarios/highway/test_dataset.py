@@ -103,7 +103,7 @@ def test_same_seed_same_bytes_in_another_process(short, tmp_path):
     ("options", "what"),
     [
         ({"site": "highway:motorway"}, "known are highway:intersection, highway:roundabout"),
-        ({"locations": 3}, "is a single place"),
+        ({"locations": 3}, "has a single location"),
         ({"recordings": 0}, "cannot be made"),
         ({"seed": -1}, "cannot be made"),
         ({"minutes": "nan"}, "cannot be made"),

@@ -236,7 +236,7 @@ class Short(Vehicle):
 
 
 @pytest.mark.parametrize("steering_rad", [0.0, 0.2, -0.5])
-def test_the_rules_expect_who_is_driven_in_its_curve(steering_rad):
+def test_the_rules_expect_who_is_driven_along_curve(steering_rad):
     """At each quarter of a second, where highway-env expects its plain vehicle, without a copy."""
     site = SITES["intersection"]
     road, times = empty_road(site), np.arange(0.25, 3.0, 0.25)

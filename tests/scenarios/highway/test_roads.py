@@ -7,7 +7,7 @@ import pytest
 from highway_env.vehicle.behavior import IDMVehicle
 
 from scenarios.highway.sites import SITES, STEP_S, Site, empty_road, network
-from scenarios.highway.vehicles import REMEMBERED, Network
+from scenarios.highway.vehicles import CACHED_POSITIONS, Network
 
 
 class IntersectionCar(IDMVehicle):
@@ -97,6 +97,6 @@ def test_what_a_lane_remembers_is_of_the_place_and_not_of_the_array() -> None:
     lane: Any = known.get_lane(known.indices[0])
     fresh: Any = their_road(SITES["roundabout"]).network.get_lane(known.indices[0])
     place = np.array([10.0, 20.0])
-    for _ in range(REMEMBERED + 2):
+    for _ in range(CACHED_POSITIONS + 2):
         assert lane.local_coordinates(place) == fresh.local_coordinates(place)
         place += 0.1

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from scenarios.highway.rounds import (
-    KEPT_EVERY,
+    HIDDEN_EVERY_FRAMES,
     HiddenHistory,
     hidden_path,
     load_history,
@@ -36,7 +36,7 @@ def test_vehicles_that_are_brought_back_are_the_same(site):
     for history in histories(site):
         assert len(history.steps) == 200
         for time in range(len(history.steps)):
-            rows, steps = history.at(time * KEPT_EVERY)
+            rows, steps = history.at(time * HIDDEN_EVERY_FRAMES)
             road = empty_road(history.site, steps=steps)
             road.vehicles = restore(rows, road, history.site.vehicle)
             assert read_vehicles(road).tobytes() == rows.tobytes()
