@@ -23,7 +23,7 @@ Integrator = Literal["heun", "euler"]
 AXLE_SHARE_OF_LENGTH = 0.3
 """Distance from the centre of the box to either axle, as a share of the vehicle's length."""
 
-STANDSTILL_MPS = 0.5
+MIN_STEERING_SPEED_MPS = 0.5
 """Below this mean speed a change of heading says nothing of the steering, which is then 0."""
 
 _MAX_SIN_SLIP = math.sin(math.atan(0.5 * math.tan(MAX_STEERING_RAD)))
@@ -146,7 +146,7 @@ def inverse(
     speed, next_speed = states[..., 3], next_states[..., 3]
     acceleration = (next_speed - speed) / dt_s
     mean = speed if integrator == "euler" else 0.5 * (speed + next_speed)
-    moves = xp.abs(mean) >= STANDSTILL_MPS
+    moves = xp.abs(mean) >= MIN_STEERING_SPEED_MPS
     safe_mean = xp.where(moves, mean, xp.ones_like(mean))
     turned = wrap_angle(next_states[..., 2] - states[..., 2])
     sin_slip = xp.clip(rear_m * turned / (safe_mean * dt_s), -_MAX_SIN_SLIP, _MAX_SIN_SLIP)

@@ -82,7 +82,7 @@ def test_drift_floor(published: Recordings) -> None:
     """
     metres, moves = [], []
     for recording in published:
-        index = find_snippets(recording, dt_s=0.2, history=15, horizon=30, every=3)
+        index = find_snippets(recording, dt_s=0.2, history=15, horizon_ticks=30, interval_ticks=3)
         apart, moving = drift_m(recording, *index, dt_s=0.2, horizon=30)
         metres.append(apart)
         moves.append(moving)
