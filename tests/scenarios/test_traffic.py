@@ -115,5 +115,3 @@ def test_dropping_someone_leaves_the_others() -> None:
     assert len(fewer.entries) == len(wanted.entries) - 1
     assert 'id="v3"' not in fewer.routes
     assert [e for e in wanted.entries if e[1] != "v3"] == list(fewer.entries)
-
-
