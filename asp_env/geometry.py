@@ -263,7 +263,7 @@ def _skip_short_steps(points, step_m, out):
 @njit(cache=True)
 @no_type_check
 def project(route, count, x, y, near_m, reach_m):
-    """Projects a point onto a route, which goes on straight beyond both of its ends.
+    """Projects a point onto a route, which continues straight beyond both of its ends.
 
     Args:
         route: (points, ≥ 2) points 1 m apart, of which the first `count` are valid.
@@ -288,7 +288,7 @@ def project(route, count, x, y, near_m, reach_m):
         if square < 1e-12:
             continue
         share = ((x - ax) * sx + (y - ay) * sy) / square
-        if i > 0:  # both ends go on straight
+        if i > 0:  # the route continues straight at both ends
             share = max(share, 0.0)
         if i < count - 2:
             share = min(share, 1.0)
@@ -310,7 +310,7 @@ def point_on_route(route, count, arc_m, left_m):
     Args:
         route: (points, ≥ 2) points 1 m apart, of which the first `count` are valid.
         count: number of valid points, at least 2.
-        arc_m: arc length; below 0 and beyond the end the route goes on straight.
+        arc_m: arc length; below 0 and beyond the end the route continues straight.
         left_m: lateral offset, m, left positive.
 
     Returns:
@@ -339,7 +339,7 @@ def route_coordinates(
     states: Float[np.ndarray, "b 4"],
     near_m: Float[np.ndarray, " b"],
 ) -> Float[np.ndarray, "b 3"]:
-    """Projects one state onto each route; routes go on straight beyond both of their ends.
+    """Projects one state onto each route; routes continue straight beyond both of their ends.
 
     Args:
         routes: points 1 m apart.

@@ -162,7 +162,7 @@ def limit_speeds(path, desired, stop_m, lateral, braking, limits):
 
 @njit(cache=True, error_model="numpy")
 @no_type_check
-def free_ahead(states, sizes, radii, counts_for, me, path, count, arc, reach_m):
+def free_ahead(states, sizes, radii, is_obstacle, index, path, count, arc, reach_m):
     """Free distance along a path, and the speed of the leader at its end.
 
     The vehicle's box, wider by `SIDE_MARGIN_M` on either side, is swept along the path. The leader
@@ -172,8 +172,8 @@ def free_ahead(states, sizes, radii, counts_for, me, path, count, arc, reach_m):
         states: (agents, 4) [x m, y m, heading rad, speed m/s].
         sizes: (agents, 2) length and width, m.
         radii: (agents,) half the diagonals of the boxes, m.
-        counts_for: (agents,) bool, agents that can be the leader.
-        me: index of the vehicle.
+        is_obstacle: (agents,) bool, agents that can be the leader.
+        index: index of the vehicle.
         path: (points, 4) [x m, y m, cosine, sine of the heading] 1 m apart.
         count: number of valid points of the path.
         arc: arc length of the vehicle, m.
@@ -182,20 +182,20 @@ def free_ahead(states, sizes, radii, counts_for, me, path, count, arc, reach_m):
     Returns:
         Free distance m and the leader's speed along the path m/s; infinity and 0 without a leader.
     """
-    length, width = sizes[me, 0], sizes[me, 1] + 2.0 * SIDE_MARGIN_M
-    x, y = states[me, 0], states[me, 1]
-    cos_me, sin_me = math.cos(states[me, 2]), math.sin(states[me, 2])
+    length, width = sizes[index, 0], sizes[index, 1] + 2.0 * SIDE_MARGIN_M
+    x, y = states[index, 0], states[index, 1]
+    cos, sin = math.cos(states[index, 2]), math.sin(states[index, 2])
     first = int(arc) + 1
     last = min(count - 1, int(arc + reach_m) + 1)
     leader_speed, hit = 0.0, last
     for o in range(states.shape[0]):
-        if o == me or not counts_for[o]:
+        if o == index or not is_obstacle[o]:
             continue
         xo, yo = states[o, 0], states[o, 1]
         dx, dy = xo - x, yo - y
-        touch = radii[me] + radii[o] + SIDE_MARGIN_M
+        touch = radii[index] + radii[o] + SIDE_MARGIN_M
         within = hit - arc + touch + BESIDE_PATH_M
-        if dx * dx + dy * dy > within * within or dx * cos_me + dy * sin_me < 0.0:
+        if dx * dx + dy * dy > within * within or dx * cos + dy * sin < 0.0:
             continue
         cos_o, sin_o = math.cos(states[o, 2]), math.sin(states[o, 2])
         j = first
