@@ -197,7 +197,7 @@ def action_range(recordings: Sequence[Recording], snippets: SnippetIndex) -> tup
     the inverse model ruin a maximum; within the limits of actions, and never quite zero. The same
     to the last bit as `np.percentile` of all, of which only the highest are held.
     """
-    count = len(snippets) * snippets.horizon
+    count = len(snippets) * snippets.horizon_ticks
     if not count:
         return MIN_ACTION_RANGE
     place = (count - 1) * (RANGE_PERCENTILE / 100)

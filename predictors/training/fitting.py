@@ -92,7 +92,7 @@ def train(
     shape = shape_for(
         view,
         history=training.snippets.history,
-        horizon=training.snippets.horizon,
+        horizon=training.snippets.horizon_ticks,
         dt_s=config.dt_s,
         action_range=scale,
     )
@@ -102,7 +102,7 @@ def train(
     new = [] if begin is None else begin.apply(network)
     trained_on = chosen.trained_on
     if begin is not None and begin.trained_on is not None:
-        trained_on = trained_on.after(begin.trained_on)
+        trained_on = trained_on.continued_from(begin.trained_on)
     later = network.later_ticks
     batches = [
         share.batches(view, size=size, later_ticks=later, config=config)
