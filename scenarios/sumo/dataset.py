@@ -16,7 +16,7 @@ from rich.progress import track as with_progress
 
 from asp_env.data.cache import get_or_create
 from asp_env.errors import AspEnvError, unknown_name
-from asp_env.files import written_aside
+from asp_env.files import atomic_folder
 from asp_env.geometry import box_corners
 from scenarios.noise import measure
 from scenarios.sumo.demand import RoadUser, demand
@@ -283,7 +283,7 @@ def synthesize(
             "cannot be made: at least one recording of a second and more, at least one location "
             "and no more than recordings, and a seed of 0 or above"
         )
-    with written_aside(out) as folder, tempfile.TemporaryDirectory() as scratch:
+    with atomic_folder(out) as folder, tempfile.TemporaryDirectory() as scratch:
         made: dict[int, Place] = {}
         for recording in with_progress(
             range(recordings),

@@ -145,5 +145,5 @@ def test_unwritable_folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> N
 def test_entries_differ(tmp_path: Path) -> None:
     """The same name in two folders, or made with another salt, is another file."""
     paths = [tmp_path / "a" / "00_tracks.csv", tmp_path / "b" / "00_tracks.csv"]
-    names = {cache.entry(tmp_path, path, salt) for path in paths for salt in ("x", "y")}
+    names = {cache.entry_path(tmp_path, path, salt) for path in paths for salt in ("x", "y")}
     assert len(names) == 4

@@ -13,6 +13,7 @@ import pytest
 from asp_env.data import cache
 from asp_env.data.causal import causal_histories
 from asp_env.data.source import open_data
+from asp_env.files import leftovers
 from tests.data import interaction_files, levelx_files
 
 READER = """
@@ -90,21 +91,20 @@ def test_readers_at_once(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Non
         assert np.array_equal(recording.states, alone.states)
 
 
-def test_killed_writer(tmp_path: Path) -> None:
-    """Whatever moment a writer is killed in: a whole file or none, and no rest stays for good."""
+def test_a_killed_writer_leaves_a_complete_file_or_none(tmp_path: Path) -> None:
+    """Its temporary files are removed by a later writer once they are old; newer ones stay."""
     path = tmp_path / "a.bin"
     stamp = [["format", 1, 0]]
     for _ in range(3):
         writer = start(WRITER, path)
-        while not any(tmp_path.glob(".a.bin-*")):
+        while not leftovers(path):
             assert writer.poll() is None
         writer.send_signal(signal.SIGKILL)
         writer.communicate()
         found = cache.load(path, stamp)
         assert found is None or (found[1]["states"] == 1).all()
-    left = list(tmp_path.glob(".a.bin-*"))
-    for rest in left:
-        os.utime(rest, ns=(1, 1))
-    (tmp_path / ".a.bin-of-one-that-lives").write_text("")
+    for partial in leftovers(path):
+        os.utime(partial, ns=(1, 1))
+    (tmp_path / ".a.bin.01234567.partial").write_text("")
     cache.save(path, stamp, {}, {"states": np.zeros(3)})
-    assert sorted(each.name for each in tmp_path.iterdir()) == [".a.bin-of-one-that-lives", "a.bin"]
+    assert sorted(each.name for each in tmp_path.iterdir()) == [".a.bin.01234567.partial", "a.bin"]

@@ -172,7 +172,7 @@ def _cached(path: Path, sources: Sequence[Path], make: Callable[[], Entry], salt
     """
     current = cache.stamp(sources)
     try:
-        kept = cache.entry(cache.cache_folder(), path, salt)
+        kept = cache.entry_path(cache.cache_folder(), path, salt)
     except DataError as error:
         warnings.warn(f"nothing is kept for next time: {error}", stacklevel=2)
         return _read_only(make())
