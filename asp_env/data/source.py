@@ -9,7 +9,7 @@ from typing import Any, SupportsIndex, overload
 
 from asp_env import registry
 from asp_env.data.readers import interaction, levelx
-from asp_env.data.readers.opening import Opened, RecordingFiles, content_hash, open_recording
+from asp_env.data.readers.opening import ReaderState, RecordingFiles, content_hash, open_recording
 from asp_env.data.recording import Recording
 from asp_env.errors import DataError, unknown_name
 
@@ -29,7 +29,7 @@ class Recordings(Sequence[Any]):  # not of Recording: checking its items at run 
         source: str,
         files: Sequence[RecordingFiles],
         *,
-        opened: Opened | None = None,
+        opened: ReaderState | None = None,
     ) -> None:
         """Lists recordings; reads none.
 
@@ -41,7 +41,7 @@ class Recordings(Sequence[Any]):  # not of Recording: checking its items at run 
         self.source = source
         self.names = tuple(each.name for each in files)
         self._files = tuple(files)
-        self._opened = Opened() if opened is None else opened
+        self._opened = ReaderState() if opened is None else opened
 
     def __deepcopy__(self, memo: dict[int, Any]) -> "Recordings":
         """Itself: recordings never change."""

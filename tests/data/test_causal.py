@@ -29,7 +29,7 @@ def follow(
 ) -> Float[np.ndarray, "n 4"]:
     """The vehicle filter on measurements as they are, without any noise."""
     states = np.empty((len(measured), 4), dtype=np.float32)
-    causal.follow_vehicle(
+    causal.filter_vehicle(
         np.ascontiguousarray(measured, dtype=np.float64), speed_mps, REAR_M, 1 / rate_hz, states
     )
     return states.astype(np.float64)
@@ -336,6 +336,6 @@ def test_without_a_cache(monkeypatch: pytest.MonkeyPatch) -> None:
 
     recording = make_recording()
     monkeypatch.setattr(cache, "cache_folder", refuse)
-    with pytest.warns(UserWarning, match="nothing is kept for next time: cache folder x"):
+    with pytest.warns(UserWarning, match="results are not cached: cache folder x"):
         states = causal_histories([recording])[0].states
     assert states.tobytes() == causal_states(recording).tobytes()

@@ -147,9 +147,9 @@ FAULTS = {
     "another kind of file": (binary, [TRACKS]),
     "no map": (remove_map, ["no map for location 1", "location1.osm"]),
     "map without lanelets": (osm_is("<osm></osm>"), ["location1.osm", "has no lanelets"]),
-    "map that is no XML": (osm_is("lat,lon\n1,2\n"), ["location1.osm", "is no XML"]),
-    "map that is cut": (osm_is("<osm><node id='1'"), ["location1.osm", "is no XML"]),
-    "map that is empty": (osm_is(""), ["location1.osm", "is no XML"]),
+    "map that is no XML": (osm_is("lat,lon\n1,2\n"), ["location1.osm", "is not XML"]),
+    "map that is cut": (osm_is("<osm><node id='1'"), ["location1.osm", "is not XML"]),
+    "map that is empty": (osm_is(""), ["location1.osm", "is not XML"]),
 }
 
 

@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 
 from asp_env.data.classes import FOOTPRINTS_M, AgentClass
 from asp_env.data.readers.interaction import find_recordings, read_interaction
-from asp_env.data.readers.levelx import TrackTable
+from asp_env.data.readers.layout import TrackTable
 from asp_env.geometry import wrap_angle
 from tests.data.interaction_files import (
     LENGTH_M,
@@ -150,7 +150,7 @@ def test_folded_headings(tmp_path: Path) -> None:
     assert expected.repairs == ()
     assert track(found, 9)[:, 2] == pytest.approx(1.55)
     (repair,) = found.repairs
-    assert "% of the headings of fast vehicles point backwards: which end is" in repair
+    assert "% of the headings of fast vehicles point backwards: the front is" in repair
 
 
 def test_backing_up(tmp_path: Path) -> None:
@@ -209,7 +209,7 @@ def test_gaps_and_jumps(tmp_path: Path) -> None:
     assert table.repairs == (
         "2 gaps in tracks' times, split there: 3 after 1900 ms, 5 after 200 ms",
         "1 jumps of over 1.5 m in tracks, split there: 5 after 3900 ms",
-        "1 tracks with pieces under 0.5 s, these left out: 5",
+        "1 tracks have pieces under 0.5 s, these left out: 5",
     )
 
 
@@ -219,9 +219,7 @@ def test_held_positions(tmp_path: Path) -> None:
     table, _ = read(tmp_path, pd.concat([rows(1, states), rows(2, STRAIGHT)]))
     assert table.first_frames.tolist() == [3, 0]
     assert np.array_equal(track(table, 1), track(table, 2))
-    assert table.repairs == (
-        "1 tracks whose first position is held, left out until they are followed: 1",
-    )
+    assert table.repairs == ("1 tracks repeat their first position, repeated rows left out: 1",)
 
 
 def test_what_files_leave_out(tmp_path: Path) -> None:

@@ -15,7 +15,7 @@ from asp_env.data.readers.interaction import (
     read_interaction,
     read_meta,
 )
-from asp_env.data.readers.levelx import TrackTable
+from asp_env.data.readers.layout import TrackTable
 from asp_env.data.source import open_data
 from asp_env.errors import DataError
 from tests.data.interaction_files import (
@@ -151,13 +151,13 @@ FAULTS = {
     ),
     "a row a track": (
         few_rows(1),
-        [f"{VEHICLES}, line 2", "no track has a second row", "no frame rate can be told"],
+        [f"{VEHICLES}, line 2", "no track has a second row", "so there is no frame rate"],
     ),
     "tracks of no length": (
         few_rows(3),
         [VEHICLES, "no track lasts 0.5 s without a gap or jump"],
     ),
-    "pedestrians alone": (remove(VEHICLES), [VEHICLES, "no such file", f"{WALKERS} is there"]),
+    "pedestrians alone": (remove(VEHICLES), [VEHICLES, "no such file", f"{WALKERS} exists"]),
     "no map": (remove("*.osm"), [f"no map for location {PLACE}", f"maps/{PLACE}.osm"]),
     "map without lanelets": (
         lambda folder: write_map(folder, text="<osm></osm>") and None,
@@ -247,5 +247,7 @@ def test_taf_bw_without_metadata(tmp_path: Path, monkeypatch: pytest.MonkeyPatch
     """A map in Germany of tracks that tell no origin: said, not drawn 5,000 km off."""
     monkeypatch.setenv("ASP_ENV_CACHE", str(tmp_path / "cache"))
     (write_taf_bw(tmp_path / "data") / META).unlink()
-    with pytest.raises(DataError, match=r"lies about 49\.0051, 8\.4\d+, expected .*0\.0000, 0\.0"):
+    with pytest.raises(
+        DataError, match=r"lies at about 49\.0051, 8\.4\d+, expected .*0\.0000, 0\.0"
+    ):
         open_data(tmp_path / "data")[0]

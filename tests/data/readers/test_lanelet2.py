@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from hypothesis import given
 
-from asp_env.data.readers.lanelet2 import Origin, project, read_lanelet2
+from asp_env.data.readers.lanelet2 import Origin, read_lanelet2, to_local
 from asp_env.data.road_map import LineType, RoadMap
 from asp_env.data.source import open_data
 from tests.data.levelx_files import ORIGIN_M, osm, two_lane_road
@@ -46,7 +46,7 @@ def street(count: int, *, gap_m: float = 0.0, swapped: int = -1) -> str:
 def test_projection() -> None:
     """On the equator the zone's middle, 9° east, lies at (500 km, 0 km) of zone 32."""
     origin = Origin(x_m=499_990.0, y_m=-5.0, longitude_deg=9.0, latitude_deg=0.0)
-    np.testing.assert_allclose(project(np.zeros(1), np.full(1, 9.0), origin), [[10.0, 5.0]])
+    np.testing.assert_allclose(to_local(np.zeros(1), np.full(1, 9.0), origin), [[10.0, 5.0]])
 
 
 @pytest.mark.parametrize(
@@ -121,7 +121,7 @@ def test_swapped_sides_are_turned_around(tmp_path: Path, swapped: int) -> None:
     road = read(tmp_path, street(4, swapped=swapped))
     assert all(road.lanes[i][-1, 0] > road.lanes[i][0, 0] for i in range(4))
     assert road.successors.tolist() == [[0, 1], [1, 2], [2, 3]]
-    assert road.repairs == (f"1 lanelets with left and right swapped turned around: {swapped}",)
+    assert road.repairs == (f"1 lanelets with swapped left and right bounds reversed: {swapped}",)
 
 
 def test_two_that_disagree_are_left_alone(tmp_path: Path) -> None:
@@ -271,11 +271,16 @@ def test_centre_line_of_uneven_bounds(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("old", "new", "lanes", "repair"),
     [
-        ("<way id='l1'>", "<way id='gone'>", 2, "1 lanelets left out, a bound is missing: 1"),
-        ("<nd ref='1' />", "<nd ref='1' /><nd ref='999' />", 3, "1 ways name nodes that are"),
-        ("<way id='l1'>", "<way id='l0'><nd ref='3' /></way><way id='l1'>", 3, "1 ids given twice"),
-        ("<way id='l1'>", "<way id='l1' action='delete'>", 2, "1 lanelets left out"),
-        ("<way id='l1'>", "<way id='x'><nd ref='1' /></way><way id='l1'>", 3, "1 ways left out"),
+        (
+            "<way id='l1'>",
+            "<way id='gone'>",
+            2,
+            "1 lanelets without a left or right bound left out: 1",
+        ),
+        ("<nd ref='1' />", "<nd ref='1' /><nd ref='999' />", 3, "1 ways refer to missing nodes"),
+        ("<way id='l1'>", "<way id='l0'><nd ref='3' /></way><way id='l1'>", 3, "1 ids occur twice"),
+        ("<way id='l1'>", "<way id='l1' action='delete'>", 2, "1 lanelets without"),
+        ("<way id='l1'>", "<way id='x'><nd ref='1' /></way><way id='l1'>", 3, "1 ways with fewer"),
     ],
 )
 def test_repairs(tmp_path: Path, old: str, new: str, lanes: int, repair: str) -> None:

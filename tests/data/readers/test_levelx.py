@@ -12,15 +12,15 @@ from hypothesis import given
 
 from asp_env.data.classes import FOOTPRINTS_M, AgentClass
 from asp_env.data.readers import tables
+from asp_env.data.readers.layout import TrackTable
 from asp_env.data.readers.levelx import (
     LevelxFiles,
     RecordingMeta,
-    TrackTable,
     find_map,
     find_recordings,
     metres_per_pixel,
+    read_levelx,
     read_recording_meta,
-    read_tracks,
 )
 from tests.data.levelx_files import track_rows, write_folder, write_map, write_recording
 
@@ -28,7 +28,7 @@ from tests.data.levelx_files import track_rows, write_folder, write_map, write_r
 def read(folder: Path) -> TrackTable:
     """The tracks of a folder's only recording."""
     (files,) = find_recordings(folder)
-    return read_tracks(files)
+    return read_levelx(files)
 
 
 def described(folder: Path) -> list[tuple[LevelxFiles, RecordingMeta]]:
@@ -196,7 +196,7 @@ def test_frames_that_differ_from_the_metadata_are_told(tmp_path: Path) -> None:
     table = read(tmp_path)
     assert table.first_frames.tolist() == [0, 21, 2]
     assert len(table.repairs) == 1
-    assert "than tracksMeta says: 1" in table.repairs[0]
+    assert "than in tracksMeta: 1" in table.repairs[0]
 
 
 def test_names(tmp_path: Path) -> None:

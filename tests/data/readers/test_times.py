@@ -45,11 +45,11 @@ def test_round_trip(rate: float, rounded: bool, begin: int, frames: list[int]) -
 @pytest.mark.parametrize(
     ("tracks", "told"),
     [
-        ([[0], [100]], "row 0: no track has a second row, so that no frame rate can be told"),
-        ([[0, 0.1, 0.2, 0.3]], "row 0: timestamp_ms of its rows and those after are 0.1 apart"),
+        ([[0], [100]], "row 0: no track has a second row, so there is no frame rate"),
+        ([[0, 0.1, 0.2, 0.3]], "row 0: timestamp_ms of its rows and later rows are 0.1 apart"),
         ([[0, 1, 2, 3]], "makes 1000 Hz; expected 1 to 250 Hz"),
         ([[0, 5_000, 10_000]], "makes 0.2 Hz"),
-        ([[0, 100, 200, 260, 360]], "row 3: timestamp_ms is 260.0, 60 ms after the one before"),
+        ([[0, 100, 200, 260, 360]], "row 3: timestamp_ms is 260.0, 60 ms after the previous time"),
         ([[0, 100, 101, 200]], "row 2: a second row of track 0 at 101.0 ms, less than a frame"),
         ([[0, 100, 200], [50, 150]], "row 3: timestamp_ms is 50.0, 50 ms after"),
         ([[0, 100, 200, 301.5 + 20, 400]], "expected multiples of 100 ms"),
