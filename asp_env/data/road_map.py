@@ -89,14 +89,15 @@ class RoadMap:
             )
         if self.successors.size and self.successors.max() >= len(self.lanes):
             raise DataError(
-                f"map {self.name}: a successor names lane {self.successors.max()} of {len(self.lanes)}"
+                f"map {self.name}: a successor names lane {self.successors.max()} "
+                f"of {len(self.lanes)}"
             )
         columns = (self.areas, self.two_way, self.limits_mps, self.limited)
         counts = {len(column) for column in columns}
         if counts not in ({0}, {len(self.lanes)}):
             raise DataError(
-                f"map {self.name}: {sorted(counts)} areas, directions and limits of lanes; expected "
-                f"one of each for all {len(self.lanes)} lanes, or none"
+                f"map {self.name}: {sorted(counts)} areas, directions and limits of lanes; "
+                f"expected one of each for all {len(self.lanes)} lanes, or none"
             )
 
     def __deepcopy__(self, memo: dict[int, Any]) -> "RoadMap":

@@ -1,4 +1,4 @@
-"""Several processes fill the cache at once: each gets what is right, and one copy is left."""
+"""Several processes fill the cache at the same time: all read the same, and one copy remains."""
 
 import json
 import os
@@ -24,13 +24,13 @@ from asp_env.data.source import open_data
 print("ready", flush=True)
 sys.stdin.readline()
 recordings = open_data(sys.argv[1])
-told = {}
+digests = {}
 for recording, causal in zip(recordings, causal_histories(recordings), strict=True):
     digest = hashlib.sha256(recording.states.tobytes())
     digest.update(recording.road_map.lanes.points.tobytes())
     digest.update(causal.states.tobytes())
-    told[recording.name] = digest.hexdigest()
-print(json.dumps([told, recordings.data_hash()]))
+    digests[recording.name] = digest.hexdigest()
+print(json.dumps([digests, recordings.data_hash()]))
 """
 
 WRITER = """
@@ -47,7 +47,7 @@ while True:
 
 
 def start(code: str, *arguments: Path) -> subprocess.Popen[str]:
-    """A process that has imported all it needs and waits for a line."""
+    """Starts a process and waits until it has imported everything."""
     command = [sys.executable, "-W", "error", "-c", code, *map(str, arguments)]
     process = subprocess.Popen(
         command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
@@ -57,15 +57,15 @@ def start(code: str, *arguments: Path) -> subprocess.Popen[str]:
     return process
 
 
-def test_readers_at_once(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Three that begin in the same moment read both layouts alike, and leave one file of each."""
-    kept = tmp_path / "cache"
-    monkeypatch.setenv("ASP_ENV_CACHE", str(kept))
+def test_three_processes_read_alike(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """They start at the same time; both layouts are read, and each file is cached once."""
+    cache_folder = tmp_path / "cache"
+    monkeypatch.setenv("ASP_ENV_CACHE", str(cache_folder))
     folder = tmp_path / "data"
     levelx_files.write_folder(folder / "inD", recordings=2)
     interaction_files.write_folder(folder / "INTERACTION", recordings=2)
     readers = [start(READER, folder) for _ in range(3)]
-    assert not kept.exists()
+    assert not cache_folder.exists()
     for reader in readers:
         assert reader.stdin is not None
         reader.stdin.write("go\n")
@@ -74,15 +74,15 @@ def test_readers_at_once(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Non
     assert [(reader.returncode, err) for reader, (_, err) in zip(readers, ends, strict=True)] == [
         (0, "")
     ] * 3
-    told = [json.loads(out) for out, _ in ends]
-    assert all(each == told[0] for each in told)
+    results = [json.loads(out) for out, _ in ends]
+    assert all(each == results[0] for each in results)
 
-    entries = sorted(kept.iterdir())
+    entries = sorted(cache_folder.iterdir())
     assert len(entries) == 4 * 3 + 2  # tracks, hash and causal states of each recording; two maps
     assert not [path for path in entries if path.name.startswith(".") or path.suffix != ".bin"]
     before = [(path.stat().st_ino, path.stat().st_mtime_ns) for path in entries]
     recordings = open_data(folder)
-    assert recordings.data_hash() == told[0][1]
+    assert recordings.data_hash() == results[0][1]
     assert len(list(causal_histories(recordings))) == 4
     assert [(path.stat().st_ino, path.stat().st_mtime_ns) for path in entries] == before
 
