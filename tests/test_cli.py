@@ -87,7 +87,10 @@ def test_data_that_is_not_there_is_refused(capsys, tmp_path, command):
 def test_an_unwritable_output_is_refused(capsys, tmp_path, command):
     """Before anything is computed: below a file, and where there is something already."""
     (tmp_path / "file").write_text("words")
-    for out, what in (("file/out", "cannot be written"), ("file", "exists already")):
+    for out, what in (
+        ("file/out", "cannot be written"),
+        ("file", "exists and is not an empty folder"),
+    ):
         line = _refused(capsys, command, str(tmp_path), "--out", str(tmp_path / out))
         assert what in line
     assert [path.name for path in tmp_path.iterdir()] == ["file"]
@@ -179,7 +182,9 @@ def test_the_installed_command_exits_with_the_status():
         [*command, "drive", "nowhere", "--out", os.devnull], capture_output=True, text=True
     )
     assert (done.returncode, done.stdout) == (2, "")
-    assert done.stderr == "asp-env: /dev/null: exists already; choose another --out or remove it\n"
+    assert done.stderr == (
+        "asp-env: /dev/null exists and is not an empty folder; choose another name or remove it\n"
+    )
 
 
 @pytest.mark.parametrize(("command", "old"), RENAMED_OPTIONS)

@@ -3,7 +3,6 @@
 import dataclasses
 import json
 import math
-import os
 import zipfile
 import zlib
 from collections.abc import Mapping
@@ -17,6 +16,7 @@ from jaxtyping import Bool, Float, Int
 from asp_env.data.classes import AgentClass
 from asp_env.data.scenarios.scenario import Scenario
 from asp_env.errors import DataError
+from asp_env.files import atomic_file
 
 FORMAT = 1
 """Version of the file format."""
@@ -96,9 +96,8 @@ class Rollout:
             if isinstance(value := getattr(self, field.name), np.ndarray)
         }
         text = np.frombuffer(json.dumps(header).encode(), dtype=np.uint8)
-        aside = path.with_name(f".{path.name}.{os.getpid()}.npz")
-        np.savez_compressed(aside, header=text, **arrays)
-        aside.replace(path)
+        with atomic_file(path) as partial, partial.open("wb") as file:
+            np.savez_compressed(file, header=text, **arrays)
 
     @classmethod
     def load(cls, path: Path) -> "Rollout":

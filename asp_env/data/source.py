@@ -10,7 +10,7 @@ from typing import Any, SupportsIndex, overload
 
 from asp_env import registry
 from asp_env.data.readers import interaction, levelx
-from asp_env.data.readers.opening import Opened, RecordingFiles, content_hash, open_recording
+from asp_env.data.readers.opening import ReaderState, RecordingFiles, content_hash, open_recording
 from asp_env.data.recording import Recording
 from asp_env.errors import DataError, unknown_name
 
@@ -30,7 +30,7 @@ class Recordings(Sequence[Any]):  # not of Recording: run-time checks of its ite
         source: str,
         files: Sequence[RecordingFiles],
         *,
-        opened: Opened | None = None,
+        opened: ReaderState | None = None,
     ) -> None:
         """Creates the sequence without reading any recording.
 
@@ -42,7 +42,7 @@ class Recordings(Sequence[Any]):  # not of Recording: run-time checks of its ite
         self.source = source
         self.names = tuple(each.name for each in files)
         self._files = tuple(files)
-        self._opened = Opened() if opened is None else opened
+        self._opened = ReaderState() if opened is None else opened
 
     def __deepcopy__(self, memo: dict[int, Any]) -> "Recordings":
         """Returns the same object, since recordings are immutable."""

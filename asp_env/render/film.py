@@ -3,9 +3,7 @@
 MERGED: Pictures become a video that browsers play.
 """
 
-import os
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from contextlib import suppress
 from dataclasses import dataclass
 from fractions import Fraction
 from importlib.util import find_spec
@@ -19,6 +17,7 @@ from asp_env.data.recording import Background
 from asp_env.data.road_map import RoadMap
 from asp_env.data.rollout import Rollout
 from asp_env.errors import AspEnvError, DataError, MissingExtraError
+from asp_env.files import atomic_file
 from asp_env.geometry import between_states
 from asp_env.render.canvas import Colour
 from asp_env.render.frames import (
@@ -282,22 +281,16 @@ def write_video(
     if first is None:
         raise AspEnvError(f"video {path}: there is nothing to show")
     check_video_possible(path, (first.shape[1], first.shape[0]), fps)
-    home = next(folder for folder in path.absolute().parents if folder.exists())
-    aside = home / f".{path.name}.{os.getpid()}.partial"
     try:
-        count = _encode(aside, first, pictures, KINDS[path.suffix.lower()], fps)
-        path.parent.mkdir(parents=True, exist_ok=True)
-        aside.replace(path)
+        with atomic_file(path) as partial:
+            count = _encode(partial, first, pictures, KINDS[path.suffix.lower()], fps)
     except OSError as error:
         raise AspEnvError(f"video {path}: cannot be written ({error.strerror or error})") from error
-    finally:
-        with suppress(OSError):
-            aside.unlink()
     return count
 
 
 def _encode(
-    aside: Path, first: np.ndarray, rest: Iterable[np.ndarray], kind: _Kind, fps: float
+    path: Path, first: np.ndarray, rest: Iterable[np.ndarray], kind: _Kind, fps: float
 ) -> int:
     import av
 
@@ -306,7 +299,7 @@ def _encode(
     rate = Fraction(fps).limit_denominator(1001)
     count = 0
     with av.open(
-        str(aside), "w", format=kind.container, options=dict(kind.container_options)
+        str(path), "w", format=kind.container, options=dict(kind.container_options)
     ) as container:
         stream = container.add_stream(kind.codec, rate=rate, options=dict(kind.codec_options))
         assert isinstance(stream, av.VideoStream)

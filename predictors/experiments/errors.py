@@ -1,6 +1,5 @@
 """Errors of forecasts on every snippet of the test recordings, kept for all later questions."""
 
-import os
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -22,6 +21,7 @@ from asp_env.data.source import Recordings
 from asp_env.data.split import snippet_parts
 from asp_env.errors import AspEnvError
 from asp_env.evaluation.open_loop.judging import BATCH, ask
+from asp_env.files import atomic_file
 from asp_env.metrics.forecast.errors import SELECTIONS, moving, open_loop_errors
 
 METRICS = ("MAE", "MSE", "ADE", "FDE")
@@ -52,10 +52,8 @@ class Errors:
         )
 
     def save(self, path: Path) -> None:
-        """Writes aside, then renames."""
-        path.parent.mkdir(parents=True, exist_ok=True)
-        aside = path.with_name(f".{path.name}.part")
-        with aside.open("wb") as file:
+        """Writes one compressed `.npz`, atomically."""
+        with atomic_file(path) as partial, partial.open("wb") as file:
             np.savez_compressed(
                 file,
                 values=self.values,
@@ -65,7 +63,6 @@ class Errors:
                 tick=self.tick,
                 stamp=np.array(self.stamp),
             )
-        os.replace(aside, path)
 
     @classmethod
     def load(cls, path: Path) -> "Errors":

@@ -2,7 +2,6 @@
 
 import fcntl
 import json
-import os
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import MISSING, asdict, dataclass, fields, is_dataclass
@@ -15,6 +14,7 @@ from rich.console import Console
 from asp_env import registry
 from asp_env.data.recording import DEFAULT_DT_S, ticks
 from asp_env.errors import AspEnvError, MissingExtraError, unknown_name
+from asp_env.files import atomic_file, leftovers
 from asp_env.metrics.forecast.errors import MODE_RULES
 from asp_env.views import VIEWS
 from predictors.experiments.campaign import COST, Campaign
@@ -252,7 +252,8 @@ def _claimed(out: Path, fixed: dict[str, Any], *, alone: bool) -> Iterator[None]
         AspEnvError: it holds something else, or another command is at it.
     """
     path = out / PLAN
-    begun = {LOCK, f".{PLAN}.part"}  # all that a command which ends at once leaves behind
+    # An interrupted command may leave only these.
+    begun = {LOCK, *(each.name for each in leftovers(path))}
     foreign = out.exists() and (not out.is_dir() or {each.name for each in out.iterdir()} - begun)
     if foreign and not path.exists():
         raise AspEnvError(f"{out}: holds something that is no table; choose another --out")
@@ -267,9 +268,8 @@ def _claimed(out: Path, fixed: dict[str, Any], *, alone: bool) -> Iterator[None]
             ) from error
         same = json.loads(json.dumps(fixed))
         if not path.exists():
-            aside = path.with_name(f".{PLAN}.part")
-            aside.write_text(json.dumps(fixed, indent=1) + "\n")
-            os.replace(aside, path)
+            with atomic_file(path) as partial:
+                partial.write_text(json.dumps(fixed, indent=1) + "\n")
         elif (found := _read_plan(path)) != same:
             other = ", ".join(name for name in same if found.get(name) != same[name])
             raise AspEnvError(

@@ -5,8 +5,6 @@ MERGED: What is written and printed of findings: long form, page, and tables in 
 """
 
 import io
-import os
-import tempfile
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
 from types import MappingProxyType
@@ -20,6 +18,7 @@ from rich.text import Text
 
 from asp_env.evaluation.results import Row, write_manifest, write_metrics
 from asp_env.evaluation.statistics import Estimate
+from asp_env.files import atomic_file
 from predictors.experiments.cells import Cell, Site
 from predictors.experiments.errors import Errors
 from predictors.experiments.results import (
@@ -410,16 +409,13 @@ def export(
     out: Path, found: Sequence[Row], shown: Sequence[Table], manifest: Mapping[str, Any]
 ) -> None:
     """Replaces the results in the table's folder, each file whole."""
-    with tempfile.TemporaryDirectory(dir=out, prefix=".fresh") as aside:
-        folder = Path(aside)
-        write_metrics(folder, found)
-        write_manifest(folder, "table", **manifest)
-        page = Console(record=True, width=PAGE_WIDTH, file=io.StringIO())
-        for table in shown:
-            page.print(table, "")
-        text = page.export_text(clear=False)
-        (folder / TEXT).write_text(text, encoding="utf-8")
-        html = page.export_html(theme=DEFAULT_TERMINAL_THEME, code_format=PAGE)
-        (folder / REPORT).write_text(html, encoding="utf-8")
-        for path in list(folder.iterdir()):
-            os.replace(path, out / path.name)
+    page = Console(record=True, width=PAGE_WIDTH, file=io.StringIO())
+    for table in shown:
+        page.print(table, "")
+    text = page.export_text(clear=False)
+    html = page.export_html(theme=DEFAULT_TERMINAL_THEME, code_format=PAGE)
+    write_metrics(out, found)
+    write_manifest(out, "table", **manifest)
+    for name, content in ((TEXT, text), (REPORT, html)):
+        with atomic_file(out / name) as partial:
+            partial.write_text(content, encoding="utf-8")

@@ -4,7 +4,6 @@ import dataclasses
 import hashlib
 import json
 import math
-import os
 from pathlib import Path
 from typing import Any
 
@@ -15,6 +14,7 @@ from torch import Tensor
 
 from asp_env.data.split import TrainedOn
 from asp_env.errors import AspEnvError, CheckpointError, unknown_name
+from asp_env.files import atomic_file, remove_stale
 from asp_env.views import BinaryView, SceneView, view_from_config
 from predictors.inference.model_card import model_card
 from predictors.inference.trained import TrainedPredictor
@@ -256,19 +256,19 @@ def _load_weights(network: AbstractNetwork, path: Path) -> None:
 
 
 def save_weights(weights: dict[str, Tensor], path: Path) -> None:
-    """Writes tensors aside, then renames."""
+    """Writes tensors atomically."""
     _write(save({name: tensor.detach().contiguous() for name, tensor in weights.items()}), path)
 
 
 def write_json(content: dict[str, Any], path: Path) -> None:
-    """Writes JSON aside, then renames."""
+    """Writes JSON atomically."""
     _write((json.dumps(content, indent=1, sort_keys=True) + "\n").encode(), path)
 
 
 def _write(content: bytes, path: Path) -> None:
-    aside = path.with_name(path.name + ".part")
-    aside.write_bytes(content)
-    os.replace(aside, path)
+    with atomic_file(path) as partial:
+        partial.write_bytes(content)
+    remove_stale(path)
 
 
 def _brief(error: BaseException) -> str:

@@ -9,7 +9,6 @@ MERGED: The command `asp-env export`.
 
 import json
 import logging
-import os
 import warnings
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
@@ -32,6 +31,7 @@ from torch import Tensor, nn
 from asp_env import registry
 from asp_env.data.classes import PREDICTED, AgentClass
 from asp_env.errors import AspEnvError, MissingExtraError
+from asp_env.files import atomic_file
 from asp_env.views.vectors import VectorShape
 from predictors.inference.checkpoint import folder_and_chaining, load_learned, read_config
 from predictors.inference.trained import TrainedPredictor
@@ -106,9 +106,8 @@ def write_onnx(name: str, out: Path) -> float:
             f"{name} is not exported: onnxruntime would differ from the network by "
             f"{difference:.1g}, more than {TOLERANCE:g}"
         )
-    aside = out.with_name(out.name + ".part")
-    aside.write_bytes(content)
-    os.replace(aside, out)
+    with atomic_file(out) as partial:
+        partial.write_bytes(content)
     return difference
 
 

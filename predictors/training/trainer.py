@@ -31,6 +31,7 @@ from safetensors.torch import save
 from torch import distributed, nn
 
 from asp_env.errors import AspEnvError, CheckpointError
+from asp_env.files import atomic_file, remove_stale
 from predictors.training.recipes import TrainingConfig
 
 
@@ -41,13 +42,13 @@ class SafetensorsIO(CheckpointIO):
     def save_checkpoint(
         self, checkpoint: dict[str, Any], path: _PATH, storage_options: Any | None = None
     ) -> None:
-        """Writes aside, then renames."""
+        """Writes a checkpoint atomically."""
         del storage_options
         tensors: dict[str, torch.Tensor] = {}
         tree = _encode(checkpoint, tensors)
-        aside = Path(f"{path}.part")
-        aside.write_bytes(save(tensors, metadata={"tree": json.dumps(tree)}))
-        os.replace(aside, path)
+        with atomic_file(Path(path)) as partial:
+            partial.write_bytes(save(tensors, metadata={"tree": json.dumps(tree)}))
+        remove_stale(Path(path))
 
     def load_checkpoint(
         self, path: _PATH, map_location: Any | None = None, weights_only: bool | None = None

@@ -9,7 +9,7 @@ from rich.progress import track as with_progress
 
 from asp_env.data.cache import get_or_create
 from asp_env.errors import AspEnvError, unknown_name
-from asp_env.files import written_aside
+from asp_env.files import atomic_folder
 from scenarios.highway.road_map import ORIGIN_LAT_LON_DEG, ORIGIN_UTM_M, write_road_map
 from scenarios.highway.rounds import (
     FOLDER,
@@ -82,7 +82,7 @@ def synthesize(
         )
     place = SITES[site]
     rounds = int(np.ceil(minutes * 60.0 / ROUND_S - 1e-9))
-    with written_aside(out) as folder:
+    with atomic_folder(out) as folder:
         maps = folder / "maps" / "lanelets" / f"00_{site}"
         maps.mkdir(parents=True)
         write_road_map(maps / "location0.osm", network(site), origin_utm_m=ORIGIN_UTM_M)

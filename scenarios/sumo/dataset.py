@@ -11,7 +11,7 @@ from rich.progress import track as with_progress
 
 from asp_env.data.cache import get_or_create
 from asp_env.errors import AspEnvError, unknown_name
-from asp_env.files import written_aside
+from asp_env.files import atomic_folder
 from asp_env.geometry import boxes_overlap
 from scenarios.noise import measure
 from scenarios.sumo.demand import RoadUser, demand
@@ -284,7 +284,7 @@ def synthesize(
             "cannot be made: expected at least one recording of a second or more, at least one "
             "location and no more locations than recordings, and a seed of 0 or more"
         )
-    with written_aside(out) as folder, tempfile.TemporaryDirectory() as scratch:
+    with atomic_folder(out) as folder, tempfile.TemporaryDirectory() as scratch:
         made: dict[int, Place] = {}
         for recording in with_progress(
             range(recordings),

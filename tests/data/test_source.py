@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from asp_env import registry
-from asp_env.data.readers import folders, opening
+from asp_env.data.readers import layout, opening
 from asp_env.data.recording import Recording
 from asp_env.data.source import Recordings, load, open_data
 from asp_env.errors import AspEnvError, DataError
@@ -34,17 +34,17 @@ def folder(tmp_path: Path, cache_folder: Path) -> Path:
 def reads(monkeypatch: pytest.MonkeyPatch) -> list[str]:
     """The files that are read instead of their cache entries, in order."""
     names: list[str] = []
-    read_tracks, read_lanelet2 = opening.read_tracks, opening.read_lanelet2
+    read_levelx, read_lanelet2 = opening.read_levelx, opening.read_lanelet2
 
     def tracks(files):
         names.append(files.tracks.name)
-        return read_tracks(files)
+        return read_levelx(files)
 
     def lanelets(path, origin):
         names.append(path.name)
         return read_lanelet2(path, origin)
 
-    monkeypatch.setattr(opening, "read_tracks", tracks)
+    monkeypatch.setattr(opening, "read_levelx", tracks)
     monkeypatch.setattr(opening, "read_lanelet2", lanelets)
     return names
 
@@ -156,7 +156,7 @@ def test_without_a_cache(
     (tmp_path / "file").write_text("")
     monkeypatch.setenv("ASP_ENV_CACHE", str(tmp_path / "file" / "below"))
     del reads[:]
-    with pytest.warns(UserWarning, match="nothing is kept for next time: cache folder"):
+    with pytest.warns(UserWarning, match="results are not cached: cache folder"):
         after = open_data(folder)[0]
     assert reads == ["location1.osm", "00_tracks.csv"]
     assert equal(before, after)
@@ -217,7 +217,7 @@ def test_background(folder: Path) -> None:
     assert background.path.name == "00_background.png"
     assert background.metres_per_pixel == pytest.approx(0.06)
     assert recordings[1].background is None
-    assert recordings[1].repairs == ("01_background.png left out: its scale cannot be told",)
+    assert recordings[1].repairs == ("01_background.png left out: its scale is unknown",)
     assert recordings[2].background is None
 
 
@@ -256,7 +256,7 @@ def test_folders_are_searched_once(folder: Path, monkeypatch: pytest.MonkeyPatch
         searched.append(root)
         return walk(root, followlinks=followlinks)
 
-    monkeypatch.setattr(folders.os, "walk", counted)
+    monkeypatch.setattr(layout.os, "walk", counted)
     recordings = open_data(folder)
     assert recordings[0].road_map is recordings[1].road_map
     once = len(searched)

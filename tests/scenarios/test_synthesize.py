@@ -94,7 +94,7 @@ def test_a_folder_with_something_in_it_is_refused(tmp_path: Path) -> None:
 def test_an_unwritable_place_is_refused(tmp_path: Path) -> None:
     """A file in the way of the folder: one line."""
     (tmp_path / "file").touch()
-    with pytest.raises(AspEnvError, match="cannot write to") as caught:
+    with pytest.raises(AspEnvError, match="cannot be written") as caught:
         synthesize(tmp_path / "file" / "out", site="roundabout", recordings=1, minutes=1.0, seed=0)
     assert "\n" not in str(caught.value)
 
@@ -138,7 +138,7 @@ def stand_in(marker: str) -> Callable[..., None]:
     """Writes one file instead of traffic."""
 
     def write(out: Path, **_: object) -> None:
-        out.mkdir(parents=True)
+        out.mkdir(parents=True, exist_ok=True)
         (out / "marker").write_text(marker)
 
     return write

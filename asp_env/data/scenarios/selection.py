@@ -6,7 +6,6 @@ computed when the file is read, so that they always follow the current rules.
 """
 
 import json
-import os
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -26,6 +25,7 @@ from asp_env.data.scenarios.scenario import (
 )
 from asp_env.data.source import Recordings
 from asp_env.errors import AspEnvError, DataError
+from asp_env.files import atomic_file
 
 SUFFIX = ".json"
 """Ending of scenario files."""
@@ -199,12 +199,8 @@ def save_scenarios(path: Path, scenarios: ScenarioSet, recordings: Recordings) -
     }
     rows = [json.dumps(row) for row in np.stack(columns, axis=-1).tolist()]
     text = json.dumps(head)[:-1] + ', "scenarios": [\n' + ",\n".join(rows) + "\n]}\n"
-    aside = path.with_name(f".{path.name}.{os.getpid()}.partial")
-    try:
-        aside.write_text(text)
-        aside.replace(path)
-    finally:
-        aside.unlink(missing_ok=True)
+    with atomic_file(path) as partial:
+        partial.write_text(text)
 
 
 def load_scenarios(path: Path, recordings: Recordings, *, dt_s: float, history: int) -> ScenarioSet:

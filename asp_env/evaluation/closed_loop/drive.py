@@ -31,9 +31,10 @@ from asp_env.evaluation.closed_loop.comparison import (
     work_units,
 )
 from asp_env.evaluation.report import check_report_possible, write_report
-from asp_env.evaluation.results import Row, output_folder, write_manifest, write_metrics
+from asp_env.evaluation.results import Row, write_manifest, write_metrics
 from asp_env.evaluation.selection import PartChoice, no_data_error, short_names, ticks_to_judge
 from asp_env.evaluation.tables import driving_table
+from asp_env.files import atomic_folder
 from asp_env.metrics.driving.rules import DEFAULT_PRESET, RULES, Rules
 from asp_env.metrics.masked import Masked
 from asp_env.sim.world import world_of
@@ -80,7 +81,7 @@ class Drive:
     def run(self) -> None:
         """Drives, writes the folder, prints the table; the expert stands first."""
         check_report_possible()
-        with output_folder(self.out) as folder:
+        with atomic_folder(self.out) as folder:
             result = drive(self)
             write_metrics(folder, result.rows)
             write_manifest(folder, "drive", **result.manifest)

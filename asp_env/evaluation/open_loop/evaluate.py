@@ -28,10 +28,11 @@ from asp_env.evaluation.open_loop.judging import (
     judge,
 )
 from asp_env.evaluation.report import ForecastExamples, check_report_possible, write_report
-from asp_env.evaluation.results import Row, output_folder, write_manifest, write_metrics
+from asp_env.evaluation.results import Row, write_manifest, write_metrics
 from asp_env.evaluation.selection import PartChoice, keep_within, load_predictors, ticks_to_judge
 from asp_env.evaluation.statistics import Estimate
 from asp_env.evaluation.tables import open_loop_tables
+from asp_env.files import atomic_folder
 from asp_env.metrics.forecast.calibration import calibration_error, calibration_sums
 from asp_env.metrics.forecast.errors import MODE_RULES, ModeRule
 
@@ -147,7 +148,7 @@ class Evaluate:
     def run(self) -> None:
         """Evaluates, writes the folder, prints the table."""
         check_report_possible()
-        with output_folder(self.out) as folder:
+        with atomic_folder(self.out) as folder:
             result = evaluate(self)
             write_metrics(folder, result.rows)
             write_manifest(folder, "evaluate", **result.manifest)

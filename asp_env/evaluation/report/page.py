@@ -4,7 +4,6 @@ MERGED: The report: one file of HTML that needs no network.
 """
 
 import json
-import os
 from collections.abc import Iterator, Mapping, Sequence
 from html import escape
 from importlib.resources import files
@@ -22,6 +21,7 @@ from asp_env.evaluation.report.payload import (
 )
 from asp_env.evaluation.report.results import Result, Results, best, distinct, note, read_results
 from asp_env.evaluation.report.tables import kinds, tables
+from asp_env.files import atomic_file
 
 BASELINE = "constant-velocity"
 RATIO = "FDE / constant velocity"
@@ -203,9 +203,8 @@ def write_report(
         },
     )
     path = out / "report.html"
-    aside = path.with_name(f".{path.name}.{os.getpid()}")
-    aside.write_text(page, encoding="utf-8")
-    aside.replace(path)
+    with atomic_file(path) as partial:
+        partial.write_text(page, encoding="utf-8")
     return path
 
 
