@@ -19,11 +19,11 @@ from asp_env.data.scene import Scene
 from asp_env.data.snippets import gather_scene, index_snippets
 from asp_env.geometry import from_frame, wrap_angle
 from predictors.inference import export as onnx_file
-from predictors.inference.checkpoint import load_learned
+from predictors.inference.checkpoint import load_trained
 from predictors.inference.export import input_names, inputs_of, write_onnx
 from predictors.inference.trained import TrainedPredictor
 from predictors.models.batch import make_batch
-from predictors.models.network import LearnedPlug
+from predictors.models.network import PredictorSpec
 from predictors.training.recipes import RECIPES
 from tests.builders import make_recording
 from tests.predictors.tiny import save_random
@@ -61,8 +61,8 @@ def exported(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFa
     folder = tmp_path_factory.mktemp("exported")
     run = save_random(folder / "run", name, view, horizon=horizon, preset=preset, temperature=1.7)
     write_onnx(f"{name}:{run}", folder / "file.onnx")
-    plug: LearnedPlug = registry.find("predictors", name)
-    predictor = load_learned(plug, str(run))
+    plug: PredictorSpec = registry.find("predictors", name)
+    predictor = load_trained(plug, str(run))
     return Exported(path=folder / "file.onnx", run=run, predictor=predictor)
 
 

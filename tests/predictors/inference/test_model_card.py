@@ -8,8 +8,8 @@ import pytest
 import yaml
 
 from asp_env import registry
+from predictors.inference.checkpoint import PredictorSpec
 from predictors.inference.model_card import model_card
-from predictors.models.network import LearnedPlug
 from predictors.training.recipes import RECIPES
 from tests.predictors.tiny import save_random
 
@@ -38,7 +38,7 @@ def card_of(run: Path, **provenance: object) -> str:
     """The card of a run that says this of itself."""
     config = json.loads((run / "config.json").read_text())
     config["provenance"] = {**config["provenance"], **provenance}
-    plug: LearnedPlug = registry.find("predictors", config["predictor"])
+    plug: PredictorSpec = registry.find("predictors", config["predictor"])
     return model_card(config, plug, weights="0123456789abcdef")
 
 
@@ -55,7 +55,7 @@ def test_every_run_has_a_card(name: str, tmp_path: Path) -> None:
     card = (save_random(tmp_path / "run", name) / "README.md").read_text()
     assert f"# {name}, 3 s" in card
     assert re.search(r"arXiv:\d{4}\.\d{5}", card)
-    loaded: LearnedPlug = registry.find("predictors", name)
+    loaded: PredictorSpec = registry.find("predictors", name)
     config = json.loads((tmp_path / "run" / "config.json").read_text())
     weights = re.search(r"SHA-256 `([0-9a-f]{16})…`", card)
     assert weights is not None

@@ -14,7 +14,7 @@ from predictors.models.losses import (
     Classification,
     annealed_loss,
     best_mode,
-    chance_mode,
+    best_or_random_mode,
     classification_loss,
     into_frame,
     mode_terms,
@@ -175,13 +175,13 @@ def test_chance_decides_only_where_no_mode_is_within_5_degrees() -> None:
     count = 300
     positions = torch.tensor([[straight_line(end) for end in ends]]).repeat(count, 1, 1, 1)
     aside = torch.tensor([straight_line(at(8 + 0.01 * k, 40)) for k in range(count)])
-    shares = chance_mode(positions, aside).bincount(minlength=3) / count
+    shares = best_or_random_mode(positions, aside).bincount(minlength=3) / count
     np.testing.assert_allclose(shares, 1 / 3, atol=0.1)
-    assert torch.equal(chance_mode(positions, aside), chance_mode(positions, aside))
+    assert torch.equal(best_or_random_mode(positions, aside), best_or_random_mode(positions, aside))
     near = torch.tensor([straight_line(at(9, 2))]).repeat(count, 1, 1)
-    assert torch.equal(chance_mode(positions, near), best_mode(positions, near))
+    assert torch.equal(best_or_random_mode(positions, near), best_mode(positions, near))
     standing = torch.tensor([straight_line(at(1, 120))]).repeat(count, 1, 1)
-    assert torch.equal(chance_mode(positions, standing), best_mode(positions, standing))
+    assert torch.equal(best_or_random_mode(positions, standing), best_mode(positions, standing))
 
 
 def test_losses_alone_leave_it_to_chance() -> None:
@@ -200,5 +200,5 @@ def test_losses_alone_leave_it_to_chance() -> None:
             classification="cross-entropy",
             share=None,
         )
-        drawn = chance_mode(positions, label)
+        drawn = best_or_random_mode(positions, label)
         assert torch.equal(terms["regression"], regression_loss(positions, label, drawn))

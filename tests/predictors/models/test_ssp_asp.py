@@ -11,7 +11,7 @@ import torch
 from asp_env.dynamics import clip_actions, rollout
 from asp_env.errors import AspEnvError
 from asp_env.geometry import states_to_frame
-from predictors.inference.checkpoint import load_learned
+from predictors.inference.checkpoint import load_trained
 from predictors.models.batch import Batch, Labels, VectorTensors
 from predictors.models.chaining import Chains, merge
 from predictors.models.losses import best_mode, into_frame, mode_terms
@@ -139,7 +139,7 @@ def test_all_chains_are_calibrated_as_such(sample: tuple[Batch, Labels], tmp_pat
     run = save_random(
         tmp_path / "run", "ssp-asp", "vectors", horizon=30, preset="ours", temperature=1.7
     )
-    full, kept = (load_learned(SSPASP, f"{run}@{chaining}") for chaining in ("full", "beam"))
+    full, kept = (load_trained(SSPASP, f"{run}@{chaining}") for chaining in ("full", "beam"))
     network = full.network
     assert isinstance(network, SSPASPNetwork)
     with torch.no_grad():

@@ -7,7 +7,7 @@ import pytest
 
 from asp_env.errors import AspEnvError
 from predictors.training.recipes import TrainingConfig, recipe
-from predictors.training.train import Train
+from predictors.training.command import Train
 from predictors.training.variants import VARIANTS, variant, warm_starts_from_3s
 
 EVERY = [(predictor, name) for predictor, names in VARIANTS.items() for name in names]

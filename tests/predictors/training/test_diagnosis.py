@@ -5,14 +5,14 @@ import torch
 from torch import Tensor
 
 from predictors.models.network import Features
-from predictors.training.lightning_parts import Diagnosis, effective_rank
+from predictors.training.lightning_parts import FeatureStatistics, effective_rank
 
 RANK, DEVIATION, R2 = "feature effective rank", "feature standard deviation", "feature R2"
 
 
 def told(encoded: Tensor, predicted: Tensor | None = None) -> dict[str, float]:
     """What a diagnosis says of some features; without predictions, of perfect ones."""
-    diagnosis = Diagnosis()
+    diagnosis = FeatureStatistics()
     diagnosis.add(Features(encoded, encoded if predicted is None else predicted))
     return diagnosis.finish()
 
@@ -63,7 +63,7 @@ def test_r_squared_by_hand() -> None:
 
 def test_diagnosis_gathers_batches() -> None:
     """Two batches of one count as one of two; then it starts again; nothing gives nothing."""
-    diagnosis = Diagnosis()
+    diagnosis = FeatureStatistics()
     assert diagnosis.finish() == {}
     diagnosis.add(None)
     assert diagnosis.finish() == {}
@@ -80,7 +80,7 @@ def test_diagnosis_gathers_batches() -> None:
 def test_diagnoses_join() -> None:
     """What two gathered, one of them nothing of its own, is what one gathers of all."""
     features = torch.tensor([[0.0, 1.0], [2.0, 5.0], [1.0, -1.0]])
-    parts = [Diagnosis(), Diagnosis(), Diagnosis()]
+    parts = [FeatureStatistics(), FeatureStatistics(), FeatureStatistics()]
     parts[0].add(Features(features[:2], features[:2] + 1))
     parts[2].add(Features(features[2:], features[2:] + 1))
     for part in parts[1:]:

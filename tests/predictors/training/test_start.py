@@ -11,7 +11,7 @@ from safetensors.torch import load_file, save_file
 from asp_env import registry
 from asp_env.errors import CheckpointError
 from asp_env.views import make_view
-from predictors.models.network import LearnedPlug
+from predictors.inference.checkpoint import PredictorSpec
 from predictors.training.pretrained import PretrainedWeights
 from tests.predictors.tiny import (
     PIXELS,
@@ -24,7 +24,7 @@ from tests.predictors.tiny import (
 )
 
 
-def plug(predictor: str) -> LearnedPlug:
+def plug(predictor: str) -> PredictorSpec:
     """What is registered under a name."""
     return registry.find("predictors", predictor)
 

@@ -5,7 +5,7 @@ from pathlib import Path
 import pytest
 
 from asp_env.errors import AspEnvError
-from predictors.training.train import Train
+from predictors.training.command import Train
 from tests.predictors.tiny import write_data
 
 
