@@ -158,8 +158,8 @@ def _recipe(provenance: dict[str, Any]) -> dict[str, object]:
         "selected by": None
         if best is None
         else f"{best:.4g} m, the lowest of all epochs, counted from 0: the mean distance of "
-        "the most probable mode from the recorded position at the last tick, over validation snippets that "
-        "move (over 1 m/s now, or over 2 m away at a future tick)",
+        "the most probable mode from the recorded position at the last tick, over validation "
+        "snippets that move (over 1 m/s now, or over 2 m away at a future tick)",
         "versions": ", ".join(
             f"{name} {number}" for name, number in sorted(provenance.get("versions", {}).items())
         )
