@@ -51,8 +51,8 @@ TARGETS = "targets"
 
 MEANINGS: Mapping[str, str] = MappingProxyType(
     {
-        "picture": "The view's picture: channel, row, column; 0 to 255.",
-        "picture_bits": "The view's picture: channel, row, byte of 8 columns; the first column is "
+        "picture": "The view's raster: channel, row, column; 0 to 255.",
+        "picture_bits": "The view's raster: channel, row, byte of 8 columns; the first column is "
         "the highest bit (numpy.packbits along the columns).",
         "agents": "Agents of the vector view: agent (the target first), tick (the last one is "
         "now), field.",

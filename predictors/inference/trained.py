@@ -25,7 +25,7 @@ MAX_CHUNK_TARGETS = 256
 memory is bounded."""
 
 MAX_CHUNK_PIXELS = 64 * 360 * 240
-"""Pixels of pictures that are read at once: 64 pictures of full size, for which ResNet18 takes
+"""Pixels of rasters that are read at once: 64 rasters of full size, for which ResNet18 takes
 about 1.2 GiB."""
 
 

@@ -29,7 +29,7 @@ class VectorTensors(NamedTuple):
 
 
 Observation = UInt8[Tensor, "n c h w"] | VectorTensors
-"""Pictures with values from 0 to 255, or packed to bits along their rows if they are binary; or
+"""Rasters with values from 0 to 255, or packed to bits along their rows if they are binary; or
 the tensors of the vector view."""
 
 
@@ -59,7 +59,7 @@ def make_batch(scene: Scene, view: SceneView, history: int) -> Batch:
 
     Args:
         scene: N targets, each valid at every tick of the history.
-        view: The view that draws the observation.
+        view: The view that renders the observation.
         history: Number of past actions.
 
     Returns:

@@ -1,10 +1,10 @@
 """Encoders φ: from observations to features.
 
-- `resnet18`: ResNet18 (He et al. 2016) for pictures, as in the paper.
-- `small`: four convolutions, for small pictures.
+- `resnet18`: ResNet18 (He et al. 2016) for rasters, as in the paper.
+- `small`: four convolutions, for small rasters.
 - `vector`: a star graph over vectors with the target in its middle, after VectorNet (Gao et al.
   2020). Every agent and every piece of a line is a token; only the target's token attends to the
-  others, so attention costs as much as there are tokens, not their square. All tokens are seen from
+  others, so attention costs as much as there are tokens, not their square. All tokens are in
   the target's frame, so they hold their relation to it already. VectorNet's pooling over the points
   of a polyline is replaced by one layer over all of them: their number is fixed, and differences
   between ticks survive. Normalisation is by layer, so that a forecast does not depend on its batch.
@@ -13,7 +13,7 @@
 The names of modules are keys of the files of weights.
 
 Dimensions: n targets, k tokens of width w, d width of an attention head; c channels, h rows and
-w columns of pictures.
+w columns of rasters.
 """
 
 import math
@@ -31,8 +31,8 @@ from asp_env.views.vectors import VectorShape
 from predictors.models.batch import Observation, VectorTensors
 from predictors.models.network import NetworkShape
 
-PICTURE_ENCODERS = ("resnet18", "small")
-ENCODERS = (*PICTURE_ENCODERS, "vector")
+RASTER_ENCODERS = ("resnet18", "small")
+ENCODERS = (*RASTER_ENCODERS, "vector")
 
 
 def make_encoder(name: str, shape: NetworkShape, features: int) -> nn.Module:
@@ -49,20 +49,20 @@ def make_encoder(name: str, shape: NetworkShape, features: int) -> nn.Module:
     if name not in ENCODERS:
         raise unknown_name("encoder", name, ENCODERS)
     if isinstance(shape.observation, VectorShape):
-        if name in PICTURE_ENCODERS:
-            raise AspEnvError(f"encoder {name} reads pictures, the view draws vectors: take vector")
+        if name in RASTER_ENCODERS:
+            raise AspEnvError(f"encoder {name} reads rasters, the view renders vectors: take vector")
         return VectorEncoder(shape.observation, features)
-    if name not in PICTURE_ENCODERS:
+    if name not in RASTER_ENCODERS:
         raise AspEnvError(
-            f"encoder {name} reads vectors, the view draws pictures: take "
-            f"{' or '.join(PICTURE_ENCODERS)}"
+            f"encoder {name} reads vectors, the view renders rasters: take "
+            f"{' or '.join(RASTER_ENCODERS)}"
         )
-    return PictureEncoder(name, shape.observation, features, packed=shape.packed)
+    return RasterEncoder(name, shape.observation, features, packed=shape.packed)
 
 
 @final
-class PictureEncoder(nn.Module):
-    """ResNet18 or the small encoder; unpacks and scales the pictures on the network's device."""
+class RasterEncoder(nn.Module):
+    """ResNet18 or the small encoder; unpacks and scales the rasters on the network's device."""
 
     def __init__(
         self, name: str, shape: tuple[int, int, int], features: int, *, packed: bool
@@ -70,10 +70,10 @@ class PictureEncoder(nn.Module):
         """Initialises the weights at random.
 
         Args:
-            name: One of `PICTURE_ENCODERS`.
-            shape: Channels, height and width of the pictures.
+            name: One of `RASTER_ENCODERS`.
+            shape: Channels, height and width of the rasters.
             features: Number of features.
-            packed: Whether the pictures are packed to bits along their rows.
+            packed: Whether the rasters are packed to bits along their rows.
         """
         super().__init__()
         self._width = shape[2] if packed else None
@@ -85,16 +85,16 @@ class PictureEncoder(nn.Module):
             same = features == ResNet18.features
             self.ahead = nn.Identity() if same else nn.Linear(ResNet18.features, features)
 
-    def forward(self, pictures: Observation) -> Float[Tensor, "n features"]:
-        """Returns the features of pictures with values from 0 to 255, or packed to bits."""
-        assert isinstance(pictures, Tensor)
-        device = pictures.device.type
+    def forward(self, rasters: Observation) -> Float[Tensor, "n features"]:
+        """Returns the features of rasters with values from 0 to 255, or packed to bits."""
+        assert isinstance(rasters, Tensor)
+        device = rasters.device.type
         dtype = torch.bfloat16 if torch.is_autocast_enabled(device) else torch.float32
         if self._width is None:
             # Bytes are moved to channels-last before they become floats: there is less to move.
-            pixels = pictures.contiguous(memory_format=torch.channels_last).to(dtype) * (1 / 255)
+            pixels = rasters.contiguous(memory_format=torch.channels_last).to(dtype) * (1 / 255)
         else:
-            pixels = unpack_bits(pictures, self._width).to(dtype)
+            pixels = unpack_bits(rasters, self._width).to(dtype)
         return self.ahead(self.body(pixels.contiguous(memory_format=torch.channels_last)))
 
 
@@ -102,11 +102,11 @@ def unpack_bits(packed: UInt8[Tensor, "n c h bytes"], width: int) -> UInt8[Tenso
     """Unpacks bits along rows to 0 and 1, the highest bit first (`asp_env.views.draw` packs them).
 
     Args:
-        packed: Pictures whose rows are bytes of 8 columns.
-        width: Columns of a picture.
+        packed: Rasters whose rows are bytes of 8 columns.
+        width: Columns of a raster.
 
     Returns:
-        Pictures in channels-last memory order, where each bit of all bytes is one operation.
+        Rasters in channels-last memory order, where each bit of all bytes is one operation.
     """
     channels_last = packed.permute(0, 2, 3, 1).contiguous()
     bits = torch.stack([(channels_last >> shift) & 1 for shift in range(7, -1, -1)], dim=3)
@@ -156,14 +156,14 @@ def load_resnet18(network: nn.Module, path: Path) -> None:
 class SmallEncoder(nn.Module):
     """Four convolutions of stride 2 and a linear layer over all positions.
 
-    About 30.7 M multiplications for 12x90x60 pictures and 256 features.
+    About 30.7 M multiplications for 12x90x60 rasters and 256 features.
     """
 
     def __init__(self, shape: tuple[int, int, int], features: int) -> None:
         """Initialises the weights at random.
 
         Args:
-            shape: Channels, height and width of the pictures.
+            shape: Channels, height and width of the rasters.
             features: Number of features.
         """
         super().__init__()
@@ -179,9 +179,9 @@ class SmallEncoder(nn.Module):
         self.convolutions = nn.Sequential(*layers)
         self.linear = nn.Linear(channels * height * width, features)
 
-    def forward(self, pictures: Float[Tensor, "n c h w"]) -> Float[Tensor, "n features"]:
-        """Returns the features of pictures with values in [0, 1]."""
-        return self.linear(self.convolutions(pictures).flatten(1))
+    def forward(self, rasters: Float[Tensor, "n c h w"]) -> Float[Tensor, "n features"]:
+        """Returns the features of rasters with values in [0, 1]."""
+        return self.linear(self.convolutions(rasters).flatten(1))
 
 
 @final
@@ -231,9 +231,9 @@ class ResNet18(nn.Module):
             if isinstance(module, nn.Conv2d):
                 nn.init.kaiming_normal_(module.weight, mode="fan_out", nonlinearity="relu")
 
-    def forward(self, pictures: Float[Tensor, "n c h w"]) -> Float[Tensor, "n 512"]:
-        """Returns the features of pictures with values in [0, 1], averaged over all positions."""
-        x = self.maxpool(self.relu(self.bn1(self.conv1(pictures))))
+    def forward(self, rasters: Float[Tensor, "n c h w"]) -> Float[Tensor, "n 512"]:
+        """Returns the features of rasters with values in [0, 1], averaged over all positions."""
+        x = self.maxpool(self.relu(self.bn1(self.conv1(rasters))))
         x = self.layer4(self.layer3(self.layer2(self.layer1(x))))
         return torch.flatten(x.mean(dim=(2, 3)), 1)
 

@@ -61,9 +61,9 @@ class NetworkShape:
     """Sizes of inputs and outputs, which follow from the view, the data and the horizon."""
 
     observation: tuple[int, int, int] | VectorShape
-    """Channels, height and width of pictures, or the shape of vectors."""
+    """Channels, height and width of rasters, or the shape of vectors."""
     packed: bool
-    """Whether pictures are packed to bits."""
+    """Whether rasters are packed to bits."""
     history: int
     """Past ticks."""
     horizon: int
@@ -78,7 +78,7 @@ class NetworkConfig:
     """Options of all networks; the defaults are those of Janjoš et al. (2021)."""
 
     encoder: str = "resnet18"
-    """`resnet18` or `small` for pictures, `vector` for vectors."""
+    """`resnet18` or `small` for rasters, `vector` for vectors."""
     features: int = 512
     """Number of features z that the encoder returns."""
     modes: int = 3

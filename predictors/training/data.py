@@ -62,7 +62,7 @@ class Batches:
         Args:
             recordings: The recordings that labels are taken from.
             snippets: Snippets of them, in order.
-            view: The view that draws the observations.
+            view: The view that renders the observations.
             batch_size: Snippets of a batch; the last one may be smaller.
             later_ticks: Ticks ahead at which labels hold future inputs.
             histories: The same recordings as the inputs show them; None for the recordings.
@@ -138,7 +138,7 @@ class DatasetSplit:
         """Batches in the order of the snippets.
 
         Args:
-            view: The view that draws the observations.
+            view: The view that renders the observations.
             size: Snippets of a batch.
             later_ticks: Ticks ahead at which labels hold future inputs.
             config: The configuration; its `history` decides what the inputs show.

@@ -214,7 +214,7 @@ def _check_first_stage(start: Path, config: TrainingConfig, data: str) -> None:
     if other := [name for name, value in expected.items() if provenance.get(name) != value]:
         raise AspEnvError(
             f"{start} holds a finished run of another {' and '.join(other)}: delete it to train it "
-            "again, or name it by --start to go on from it"
+            "again, or name it by --start"
         )
 
 

@@ -55,7 +55,7 @@ class PretrainedWeights:
                 f"{path} holds the predictor {config['predictor']!r}, which {spec.name!r} cannot "
                 "start from"
             )
-        # Pictures of the same size may show other things: the weights would fit, and be wrong.
+        # Rasters of the same size may show other things: the weights would fit, and be wrong.
         if config.get("view") != json.loads(json.dumps(view.config())):
             raise CheckpointError(
                 f"{path} has another view than this run: start from one of the same"

@@ -40,7 +40,7 @@ class TrainingConfig:
     network: NetworkConfig
     view: str
     pixels: tuple[int, int] | None
-    """Height and width of pictures; None for the view's own, or for a view without pictures."""
+    """Height and width of rasters; None for the view's own, or for a view without rasters."""
     horizon_s: float
     dt_s: float = DEFAULT_DT_S
     split: Split = "recording"
@@ -264,7 +264,7 @@ def _small(
 ) -> TrainingConfig:
     """Small size, for minutes on two cores; the numbers are chosen by hand.
 
-    Pictures have a quarter of the resolution, the encoder is small, and the schedule is
+    Rasters have a quarter of the resolution, the encoder is small, and the schedule is
     `one-cycle`. A longer horizon takes as many epochs again: after those for 3 s if segments are
     chained, else at once.
     """

@@ -61,7 +61,7 @@ def connected_head(config: TrainingConfig) -> TrainingConfig:
 
 
 def no_trail(config: TrainingConfig) -> TrainingConfig:
-    """Replaces the view by the one that does not draw a target's own past.
+    """Replaces the view by the one that does not show a target's own past.
 
     Raises:
         AspEnvError: There is no such view.

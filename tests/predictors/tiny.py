@@ -28,7 +28,7 @@ SIZES = {"features": 8, "hidden": 8, "gru_width": 8, "gru_layers": 1}
 
 
 def pixels_of(view: str) -> tuple[int, int] | None:
-    """Height and width of the pictures of a view in tests."""
+    """Height and width of the rasters of a view in tests."""
     if view.startswith("vectors"):
         return None
     return (36, 36) if view == "mtp" else PIXELS
@@ -47,7 +47,7 @@ def tiny_network(
 def tiny_config(
     predictor: str = "ffw-asp", view: str = "chauffeurnet", **changes: Any
 ) -> TrainingConfig:
-    """The recipe `cpu` with four epochs of three batches of eight 36x24 pictures."""
+    """The recipe `cpu` with four epochs of three batches of eight 36x24 rasters."""
     config = recipe(predictor, "cpu", view=view, horizon_s=3.0)
     config = dataclasses.replace(
         config,
@@ -61,7 +61,7 @@ def tiny_config(
 
 
 def tiny_shape(view: str = "chauffeurnet", horizon: int = 15) -> NetworkShape:
-    """The shape of a network for small pictures, or for vectors."""
+    """The shape of a network for small rasters, or for vectors."""
     drawn = make_view(view, pixels=pixels_of(view))
     return shape_for(drawn, history=15, horizon=horizon, dt_s=0.2, action_range=RANGE)
 

@@ -87,9 +87,9 @@ FAULTS: dict[str, tuple[Callable[[Path], Any], str]] = {
     "unknown view": (lambda run: change(run, view={"name": "moon"}), "unknown view 'moon'"),
     "view of vectors": (
         lambda run: change(run, view=make_view("vectors").config()),
-        "encoder small reads pictures, the view draws vectors",
+        "encoder small reads rasters, the view renders vectors",
     ),
-    "view of other pictures": (
+    "view of other rasters": (
         lambda run: change(run, view=make_view("mtp", pixels=(36, 36)).config()),
         "does not fit|but it was trained with",
     ),

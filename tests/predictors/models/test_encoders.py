@@ -1,4 +1,4 @@
-"""Picture encoders: sizes, names of weights, loading of ResNet18, packed pictures."""
+"""Raster encoders: sizes, names of weights, loading of ResNet18, packed rasters."""
 
 import pickle
 from pathlib import Path
@@ -11,7 +11,7 @@ from safetensors.torch import load_file, save_file
 from asp_env.errors import AspEnvError, CheckpointError
 from asp_env.views.draw import pack_bits
 from predictors.models.encoders import (
-    PictureEncoder,
+    RasterEncoder,
     ResNet18,
     SmallEncoder,
     load_resnet18,
@@ -57,7 +57,7 @@ def test_resnet18_has_torchvisions_parameters(channels: int) -> None:
 
 @pytest.fixture(scope="module")
 def weights(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A file as torchvision's weights for RGB pictures, with the classifier."""
+    """A file as torchvision's weights for RGB rasters, with the classifier."""
     path = tmp_path_factory.mktemp("weights") / "resnet18.safetensors"
     tensors = {
         name: torch.full(shape, 0.25) if shape else torch.tensor(7)
@@ -69,10 +69,10 @@ def weights(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 def encoder(
     name: str = "resnet18", view: str = "chauffeurnet", features: int = 8
-) -> PictureEncoder:
-    """An encoder for a view's small pictures."""
+) -> RasterEncoder:
+    """An encoder for a view's small rasters."""
     made = make_encoder(name, tiny_shape(view), features)
-    assert isinstance(made, PictureEncoder)
+    assert isinstance(made, RasterEncoder)
     return made
 
 
@@ -118,10 +118,10 @@ def test_weights_that_do_not_fit_are_refused(weights: Path, tmp_path: Path) -> N
 
 def test_other_numbers_of_features_need_a_linear_layer() -> None:
     """A linear layer follows ResNet18 for 64 features, none for its own 512."""
-    pictures = torch.zeros(1, 3, 36, 36, dtype=torch.uint8)
+    rasters = torch.zeros(1, 3, 36, 36, dtype=torch.uint8)
     for features, linears in ((64, 1), (512, 0)):
         made = encoder("resnet18", "mtp", features).eval()
-        assert made(pictures).shape == (1, features)
+        assert made(rasters).shape == (1, features)
         assert sum(isinstance(each, torch.nn.Linear) for each in made.modules()) == linears
 
 
@@ -130,38 +130,38 @@ def test_small_encoder_distinguishes_positions() -> None:
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(0)
         network = SmallEncoder((1, 90, 60), 16).eval()
-    pictures = torch.zeros(2, 1, 90, 60)
-    pictures[0, 0, 10:20, 10:20] = pictures[1, 0, 60:70, 40:50] = 1
+    rasters = torch.zeros(2, 1, 90, 60)
+    rasters[0, 0, 10:20, 10:20] = rasters[1, 0, 60:70, 40:50] = 1
     with torch.no_grad():
-        one, other = network(pictures)
+        one, other = network(rasters)
     assert float((one - other).abs().max()) > 1e-3
 
 
 @pytest.mark.parametrize("width", [1, 8, 24, 29])
 def test_unpacking_inverts_packing(width: int) -> None:
-    """Pictures of 0 and 255 become 0 and 1, also if the last byte is not full."""
-    pictures = np.random.default_rng(width).choice(np.array([0, 255], np.uint8), (2, 3, 4, width))
-    packed = torch.from_numpy(pack_bits(pictures))
-    assert torch.equal(unpack_bits(packed, width), torch.from_numpy(pictures // 255))
+    """Rasters of 0 and 255 become 0 and 1, also if the last byte is not full."""
+    rasters = np.random.default_rng(width).choice(np.array([0, 255], np.uint8), (2, 3, 4, width))
+    packed = torch.from_numpy(pack_bits(rasters))
+    assert torch.equal(unpack_bits(packed, width), torch.from_numpy(rasters // 255))
 
 
-def test_packed_pictures_have_the_same_features() -> None:
+def test_packed_rasters_have_the_same_features() -> None:
     """The same weights give the same features of bits and of bytes of 0 and 255."""
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(0)
-        bits = PictureEncoder("small", (2, 12, 20), 4, packed=True).eval()
-    unpacked = PictureEncoder("small", (2, 12, 20), 4, packed=False).eval()
+        bits = RasterEncoder("small", (2, 12, 20), 4, packed=True).eval()
+    unpacked = RasterEncoder("small", (2, 12, 20), 4, packed=False).eval()
     unpacked.load_state_dict(bits.state_dict())
-    pictures = np.random.default_rng(0).choice(np.array([0, 255], np.uint8), (3, 2, 12, 20))
+    rasters = np.random.default_rng(0).choice(np.array([0, 255], np.uint8), (3, 2, 12, 20))
     with torch.no_grad():
-        one = bits(torch.from_numpy(pack_bits(pictures)))
-        other = unpacked(torch.from_numpy(pictures))
+        one = bits(torch.from_numpy(pack_bits(rasters)))
+        other = unpacked(torch.from_numpy(rasters))
     torch.testing.assert_close(one, other, atol=1e-5, rtol=1e-4)
 
 
 def test_encoder_that_does_not_fit_the_view_is_refused() -> None:
-    """A picture encoder for vectors, a vector encoder for pictures, and an unknown name."""
-    with pytest.raises(AspEnvError, match="reads pictures, the view draws vectors: take vector"):
+    """A raster encoder for vectors, a vector encoder for rasters, and an unknown name."""
+    with pytest.raises(AspEnvError, match="reads rasters, the view renders vectors: take vector"):
         make_encoder("small", tiny_shape("vectors"), 8)
     with pytest.raises(AspEnvError, match="take resnet18 or small"):
         make_encoder("vector", tiny_shape(), 8)

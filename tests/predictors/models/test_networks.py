@@ -53,7 +53,7 @@ def sample() -> tuple[Batch, Labels]:
 
 
 def tiny(predictor: str, **changes: Any) -> AbstractNetwork:
-    """A tiny network for pictures."""
+    """A tiny network for rasters."""
     return make_network(predictor, tiny_network(predictor, **changes), tiny_shape())
 
 

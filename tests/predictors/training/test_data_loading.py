@@ -29,7 +29,7 @@ PROCESSES = 2
 
 
 def opened(folder: str) -> Batches:
-    """Pictures with causal histories, of recordings that processes open by name."""
+    """Rasters with causal histories, of recordings that processes open by name."""
     recordings = open_data(folder)
     return Batches(
         recordings,

@@ -134,8 +134,8 @@ def test_resnet_weights_are_loaded_into_any_resnet(tmp_path: Path) -> None:
         start.apply(make_network("ffw-asp", tiny_network("ffw-asp"), tiny_shape()))
 
 
-def test_pictures_of_another_size_are_another_view(tmp_path: Path) -> None:
-    """ResNet18 reads pictures of any size, but their scale differs."""
+def test_rasters_of_another_size_are_another_view(tmp_path: Path) -> None:
+    """ResNet18 reads rasters of any size, but their scale differs."""
     run = save_random(tmp_path / "run", "dkm")
     drawn = make_view("chauffeurnet", pixels=(2 * PIXELS[0], 2 * PIXELS[1]))
     with pytest.raises(CheckpointError, match="another view"):

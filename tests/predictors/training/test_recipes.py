@@ -58,7 +58,7 @@ CASES = [(predictor, name) for predictor, names in RECIPES.items() for name in n
 
 @pytest.mark.parametrize(("predictor", "name"), CASES)
 def test_every_recipe_is_for_every_view(predictor: str, name: str) -> None:
-    """The encoder fits the view; small pictures have 90x60 pixels, or 90x90 in the square view."""
+    """The encoder fits the view; small rasters have 90x60 pixels, or 90x90 in the square view."""
     for view, pixels in (("chauffeurnet", (90, 60)), ("mtp", (90, 90)), ("vectors", None)):
         config = recipe(predictor, name, view=view, horizon_s=3.0)
         assert (config.predictor, config.preset, config.view) == (predictor, name, view)
