@@ -17,7 +17,7 @@ from asp_env.sim.episodes import gather_controlled
 from asp_env.sim.world import World
 from scenarios.highway.road_map import mirror_actions, mirror_states
 from scenarios.highway.rounds import (
-    KEPT_EVERY,
+    HIDDEN_EVERY_FRAMES,
     WANTED,
     HiddenHistory,
     Rows,
@@ -77,10 +77,10 @@ class HighwayWorld(World):
             raise AspEnvError("recordings in memory: expected those of `highway:…`")
         super().__init__(recordings, num_episodes=num_episodes, dt_s=dt_s, history=history)
         self._stride = frames_per_tick(float(STEPS_PER_S), dt_s)
-        if self._stride % KEPT_EVERY:
+        if self._stride % HIDDEN_EVERY_FRAMES:
             raise AspEnvError(
                 f"time step {dt_s:g} s: what highway-env's vehicles have in mind is kept every "
-                f"{KEPT_EVERY * STEP_S:g} s; choose a multiple of that"
+                f"{HIDDEN_EVERY_FRAMES * STEP_S:g} s; choose a multiple of that"
             )
         self._folder = recordings
         self._runs: list[_Run | None] = [None] * num_episodes

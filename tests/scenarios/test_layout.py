@@ -127,7 +127,7 @@ def test_vehicles_stay_on_the_map(site: Path) -> None:
 
 
 def test_the_map_needs_no_repair(site: Path) -> None:
-    """The reader mends nothing, and every lane but those at the rim goes on."""
+    """The reader repairs nothing, and every lane but those at the rim has a successor."""
     for recording in load(site):
         assert recording.repairs == ()
         assert recording.road_map.repairs == ()

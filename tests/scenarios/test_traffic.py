@@ -48,8 +48,8 @@ def test_inferred_actions_lead_back_to_the_log(site: Path) -> None:
     assert np.median(drift) < 0.03
 
 
-def test_nobody_moves_backwards_or_creeps_while_standing(site: Path) -> None:
-    """Speed along the heading is never negative; who stands is at exactly one place."""
+def test_agents_neither_move_backwards_nor_creep_while_standing(site: Path) -> None:
+    """Speed along the heading is never negative; a standing agent stays at one point."""
     standing = 0
     for name in ("00", "01"):
         for track in vehicles(site, name):
@@ -61,7 +61,7 @@ def test_nobody_moves_backwards_or_creeps_while_standing(site: Path) -> None:
     assert standing > 100
 
 
-def test_nobody_touches_anybody(site: Path) -> None:
+def test_vehicles_do_not_overlap(site: Path) -> None:
     """No two boxes of vehicles overlap in any fifth frame."""
     for name in ("00", "01"):
         rows = pd.concat(vehicles(site, name))
@@ -75,7 +75,7 @@ def test_nobody_touches_anybody(site: Path) -> None:
 
 
 def test_tracks_begin_and_end_at_the_rim(site: Path) -> None:
-    """Who appears or disappears during a recording does so near the picture's edge."""
+    """Agents that appear or disappear during a recording do so near the edge of the image."""
     for name in ("00", "01"):
         meta = pd.read_csv(site / "data" / f"{name}_tracksMeta.csv")
         tracks = pd.read_csv(site / "data" / f"{name}_tracks.csv")
@@ -95,7 +95,7 @@ def test_all_turns_occur(site: Path) -> None:
         assert min((turned < -45).sum(), (np.abs(turned) < 45).sum(), (turned > 45).sum()) >= 1
 
 
-def test_all_classes_are_asked_for() -> None:
+def test_the_demand_has_all_classes() -> None:
     """An hour's demand has every class, cars most, and from every arm to every other."""
     rng = np.random.default_rng(0)
     place = crossroads(rng)
@@ -108,7 +108,7 @@ def test_all_classes_are_asked_for() -> None:
     assert len({round(right_turn_rad(a, b), 6) for a, b in pairs}) == len(pairs)
 
 
-def test_dropping_someone_leaves_the_others() -> None:
+def test_removing_an_agent_leaves_the_others_unchanged() -> None:
     """Demand without a road user is the same but for its line."""
     rng = np.random.default_rng(1)
     wanted = demand(rng, crossroads(rng), 300.0)

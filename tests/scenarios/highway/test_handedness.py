@@ -31,21 +31,23 @@ def test_our_bicycle_with_axles_at_the_bumpers_is_highway_envs(seed):
     """200 steps of Euler's method under random actions agree within a micrometre."""
     rng = np.random.default_rng(seed)
     nowhere: Any = None
-    theirs = Vehicle(nowhere, rng.uniform(-50, 50, 2), rng.uniform(-3, 3), rng.uniform(-10, 20))
-    state = mirror_states(np.array([*theirs.position, theirs.heading, theirs.speed]))
+    reference = Vehicle(nowhere, rng.uniform(-50, 50, 2), rng.uniform(-3, 3), rng.uniform(-10, 20))
+    state = mirror_states(np.array([*reference.position, reference.heading, reference.speed]))
     length = np.array(Vehicle.LENGTH * 0.5 / AXLE_SHARE_OF_LENGTH)
     furthest = 0.0
     for action in rng.uniform((-5.0, -np.pi / 4), (5.0, np.pi / 4), (200, 2)):
-        theirs.act({"acceleration": action[0], "steering": action[1]})
-        theirs.step(STEP_S)
+        reference.act({"acceleration": action[0], "steering": action[1]})
+        reference.step(STEP_S)
         state = forward(
             state, mirror_actions(action), length, STEP_S, integrator="euler", reverse=True
         )
-        expected = mirror_states(np.array([*theirs.position, theirs.heading, theirs.speed]))
+        expected = mirror_states(
+            np.array([*reference.position, reference.heading, reference.speed])
+        )
         away = state - expected
         away[2] = wrap_angle(away[2])
         assert np.abs(away).max() < 1e-6
-        assert abs(theirs.speed) < Vehicle.MAX_SPEED
+        assert abs(reference.speed) < Vehicle.MAX_SPEED
         furthest = max(furthest, np.abs(action).max())
     assert furthest > 4.0
 
@@ -54,7 +56,7 @@ SIDES = pytest.mark.parametrize(("tag", "side"), [("left", 1), ("right", -1)])
 
 
 def _turning(tag: str) -> Scenario:
-    """Somebody who turns without a halt, from before the turn to after it."""
+    """A vehicle that turns without a stop, from before the turn to after it."""
     found = highway_scenarios("intersection").filtered(f"{tag},!stopping,!yielding")
     quarter = np.abs(np.abs(found.column("turn_deg")) - 90.0) < 3.0
     return next(iter(found.select(quarter).sorted_by("length_s", descending=True)))
@@ -80,7 +82,7 @@ def test_left_is_what_highway_env_calls_left(tag, side):
 def test_a_turn_is_seen_to_go_its_way(tag, side):
     """Under its logged actions the heading turns by a quarter, steering and way to its side.
 
-    Behind a left turn the way lies to the left of who has made it; ahead of it, too.
+    After a left turn the path lies to the left of the vehicle; before it, too.
     """
     scenario = _turning(tag)
     recording = highway_recordings("intersection")[scenario.recording]
@@ -115,8 +117,8 @@ def _side(layer: np.ndarray) -> float:
 
 
 @SIDES
-def test_who_is_observed_turns_the_same_way(tag, side):
-    """As a target of somebody else: its inferred steering, its heading, and its own picture."""
+def test_an_observed_vehicle_turns_the_same_way(tag, side):
+    """As a target of another agent: its inferred steering, its heading, and its own raster."""
     turner = _turning(tag)
     scenario = next(
         each
@@ -145,7 +147,7 @@ def test_who_is_observed_turns_the_same_way(tag, side):
 
 
 @pytest.mark.parametrize("side", [1, -1])
-def test_our_steering_turns_the_body_that_others_see(side):
+def test_steering_turns_the_body_that_other_vehicles_see(side):
     """Left is positive: the heading grows here, falls in highway-env, and the box turns left."""
     scenario = highway_scenarios("intersection")[4]
     simulation = simulate(highway_recordings("intersection"), scenario, "own", world_of("highway:"))
@@ -160,11 +162,11 @@ def test_our_steering_turns_the_body_that_others_see(side):
     assert isinstance(simulation.world, HighwayWorld)
     run = simulation.world._runs[0]
     assert run is not None
-    theirs = next(each for each in run.road.vehicles if each.track == scene.ids[0, 0])
-    assert theirs.heading == pytest.approx(-state[2], abs=1e-6)
-    assert theirs.position == pytest.approx(state[:2] * [1, -1], abs=1e-6)
-    assert theirs.action["steering"] == pytest.approx(-side * 0.25)
-    # seen by a target in whose picture the ego's nose is within reach
+    reference = next(each for each in run.road.vehicles if each.track == scene.ids[0, 0])
+    assert reference.heading == pytest.approx(-state[2], abs=1e-6)
+    assert reference.position == pytest.approx(state[:2] * [1, -1], abs=1e-6)
+    assert reference.action["steering"] == pytest.approx(-side * 0.25)
+    # seen by a target in whose raster the front of the ego is in range
     others = scene.targets[:, 1]
     nearest = others[np.argmin(np.hypot(*(scene.states[0, others, -1, :2] - state[:2]).T))]
     picture = make_picture_view("chauffeurnet", pixels=(720, 480)).draw(

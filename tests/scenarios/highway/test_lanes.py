@@ -135,7 +135,7 @@ def test_only_gaps_have_mouths(intersection: Place, roundabout: Place) -> None:
 
 
 def test_a_gap_between_forks_is_refused() -> None:
-    """Two ways lead to m and two away, 3 m further on: nobody says whose the gap is."""
+    """Two ways lead to m and two away, 3 m further on: the gap belongs to none of them."""
     network = straight(
         ("a", "m", [0.0, 0.0], [10.0, 0.0]),
         ("b", "m", [0.0, 5.0], [10.0, 0.0]),
