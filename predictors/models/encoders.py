@@ -50,7 +50,9 @@ def make_encoder(name: str, shape: NetworkShape, features: int) -> nn.Module:
         raise unknown_name("encoder", name, ENCODERS)
     if isinstance(shape.observation, VectorShape):
         if name in RASTER_ENCODERS:
-            raise AspEnvError(f"encoder {name} reads rasters, the view renders vectors: take vector")
+            raise AspEnvError(
+                f"encoder {name} reads rasters, the view renders vectors: take vector"
+            )
         return VectorEncoder(shape.observation, features)
     if name not in RASTER_ENCODERS:
         raise AspEnvError(

@@ -67,9 +67,7 @@ def weights(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return path
 
 
-def encoder(
-    name: str = "resnet18", view: str = "chauffeurnet", features: int = 8
-) -> RasterEncoder:
+def encoder(name: str = "resnet18", view: str = "chauffeurnet", features: int = 8) -> RasterEncoder:
     """An encoder for a view's small rasters."""
     made = make_encoder(name, tiny_shape(view), features)
     assert isinstance(made, RasterEncoder)
