@@ -3,26 +3,17 @@
 import numpy as np
 from jaxtyping import Float
 
+from asp_env.geometry import arc_lengths, points_at
+
 Polyline = Float[np.ndarray, "_ 2"]
 """Points (n, 2), m."""
 
 
-def arc_lengths(line: Float[np.ndarray, "n 2"]) -> Float[np.ndarray, " n"]:
-    """Distance of each point from the first one along the line, m."""
-    steps = np.hypot(*np.diff(line, axis=0).T)
-    return np.concatenate([[0.0], np.cumsum(steps)])
-
-
-def evenly(line: Polyline, count: int) -> Polyline:
-    """Resamples a line to `count` points at equal distances, ends included."""
-    arc = arc_lengths(line)
-    at = np.linspace(0.0, arc[-1], count)
-    return np.stack([np.interp(at, arc, line[:, axis]) for axis in (0, 1)], axis=1)
-
-
 def dense(line: Polyline, spacing_m: float) -> Polyline:
     """Resamples a line to points about `spacing_m` apart, ends included."""
-    return evenly(line, max(2, round(float(arc_lengths(line)[-1]) / spacing_m) + 1))
+    arc = arc_lengths(line)
+    count = max(2, round(float(arc[-1]) / spacing_m) + 1)
+    return points_at(line, arc, np.linspace(0.0, arc[-1], count))
 
 
 def normals(line: Float[np.ndarray, "n 2"]) -> Float[np.ndarray, "n 2"]:

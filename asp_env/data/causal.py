@@ -37,6 +37,7 @@ from asp_env.data.classes import VULNERABLE
 from asp_env.data.recording import Recording
 from asp_env.dynamics.bicycle import AXLE_SHARE_OF_LENGTH
 from asp_env.errors import DataError
+from asp_env.geometry import wrap_scalar
 
 POSITION_SIGMA_M = 0.08
 """Standard deviation of a measured coordinate, white from frame to frame."""
@@ -87,12 +88,6 @@ TURNS_ABOVE_MPS = 0.6
 
 _MAX_SIN_SLIP = 0.6
 _NEVER = 1e-9
-
-
-@njit(cache=True, nogil=True)
-@no_type_check
-def _wrap(angle):
-    return (angle + math.pi) % (2.0 * math.pi) - math.pi
 
 
 @njit(cache=True, nogil=True)
@@ -223,7 +218,7 @@ def _mix(m, p, still, spread, standing, dt):
 @no_type_check
 def _apart(seen, state, j):
     """How far a measurement lies from a state in component j; headings the short way round."""
-    return _wrap(seen[j] - state[j]) if j == 2 else seen[j] - state[j]
+    return wrap_scalar(seen[j] - state[j]) if j == 2 else seen[j] - state[j]
 
 
 @njit(cache=True, nogil=True)
@@ -309,7 +304,7 @@ def follow_vehicle(measured, speed, rear, dt, states):
                     still[j], spread[j] = m[j], p[j, j]
         for j in range(2):
             states[k, j] = m[j] + standing * (still[j] - m[j])
-        states[k, 2] = _wrap(m[2] + standing * _apart(still, m, 2))
+        states[k, 2] = wrap_scalar(m[2] + standing * _apart(still, m, 2))
         states[k, 3] = (1.0 - standing) * m[3]
 
 
@@ -342,7 +337,7 @@ def follow_vulnerable(measured, speed, dt, states):
         if total > TURNS_ABOVE_MPS:
             heading = math.atan2(speed_y, speed_x)
         states[k, 0], states[k, 1] = x, y
-        states[k, 2], states[k, 3] = _wrap(heading), total
+        states[k, 2], states[k, 3] = wrap_scalar(heading), total
 
 
 VERSION = 1

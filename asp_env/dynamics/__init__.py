@@ -8,12 +8,16 @@ from asp_env.dynamics.bicycle import (
     inverse,
     rollout,
 )
+from asp_env.dynamics.car_following import IDM, follow_paths, speed_limits
 
 __all__ = [
+    "IDM",
     "MAX_ACCELERATION_MPS2",
     "MAX_STEERING_RAD",
     "clip_actions",
+    "follow_paths",
     "forward",
     "inverse",
     "rollout",
+    "speed_limits",
 ]

@@ -112,8 +112,8 @@ def keep_within(index: SnippetIndex, allowed: Sequence[Bool[np.ndarray, " _"]]) 
         total = np.concatenate([[0], np.cumsum(ticks)])
         mine = np.flatnonzero(index.recording == number)
         first = index.tick[mine] - index.history
-        after = np.minimum(index.tick[mine] + index.horizon + 1, len(ticks))
-        keep[mine] = total[after] - total[first] == index.history + index.horizon + 1
+        after = np.minimum(index.tick[mine] + index.horizon_ticks + 1, len(ticks))
+        keep[mine] = total[after] - total[first] == index.history + index.horizon_ticks + 1
     if not keep.any():
         raise no_data_error("snippet")
     return index.select(keep)

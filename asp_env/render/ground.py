@@ -10,7 +10,7 @@ from jaxtyping import UInt8
 from asp_env.data.recording import Background
 from asp_env.data.road_map import LineType, Ragged, RoadMap
 from asp_env.errors import DataError
-from asp_env.geometry import path_length
+from asp_env.geometry import arc_lengths, path_length, points_at
 from asp_env.render.canvas import SHIFT, Colour, Frame
 
 GROUND: Colour = (22, 26, 32)
@@ -177,12 +177,11 @@ def _draw_photo(background: Background, frame: Frame, image: UInt8[np.ndarray, "
 def _dashes(line: np.ndarray) -> list[np.ndarray]:
     """Pieces of a polyline, `DASH_M` long and as far apart."""
     length = float(path_length(line))
-    steps = np.hypot(*np.diff(line, axis=0).T)
-    arc = np.concatenate([[0.0], np.cumsum(steps)])
+    arc = arc_lengths(line)
     pieces = []
     for start in np.arange(0.0, length, 2 * DASH_M):
         end = min(start + DASH_M, length)
         inner = arc[(arc > start) & (arc < end)]
         at = np.concatenate([[start], inner, [end]])
-        pieces.append(np.stack([np.interp(at, arc, line[:, i]) for i in (0, 1)], axis=-1))
+        pieces.append(points_at(line, arc, at))
     return pieces

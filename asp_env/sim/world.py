@@ -344,7 +344,7 @@ def recorded_future(world: World, scene: Scene, horizon: int) -> Future:
         tick=scene.tick[b],
         dt_s=world.dt_s,
         history=0,
-        horizon=horizon,
+        horizon_ticks=horizon,
     )
     states, valid = gather_ticks(world.recordings, index, 1 + np.arange(horizon))
     return Future(states=states, valid=valid)

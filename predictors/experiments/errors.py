@@ -167,8 +167,8 @@ def judge_snippets(
         origin = now[:, None, :2]
         truth = future.states[..., :2] - origin
         for name, predictor in predictors.items():
-            forecast = ask(predictor, scene, future, index.horizon)
-            local = forecast.states[:, :, : index.horizon, :2] - origin[:, None]
+            forecast = ask(predictor, scene, future, index.horizon_ticks)
+            local = forecast.states[:, :, : index.horizon_ticks, :2] - origin[:, None]
             for which, selection in enumerate(SELECTIONS):
                 found = open_loop_errors(local, forecast.log_probs, truth, future.valid, selection)
                 values[name][which, :, rows] = [found[metric].value for metric in METRICS]

@@ -15,6 +15,7 @@ from jaxtyping import Float, Int
 from torch import Tensor
 from torch.nn import functional
 
+from asp_env.geometry import to_frame
 from asp_env.metrics.forecast import errors
 from asp_env.metrics.forecast.errors import ModeRule, ends_alike
 
@@ -204,7 +205,4 @@ def into_frame(
         positions: Positions in the frame that the states are given in.
         origin: States [x, y, heading, speed].
     """
-    delta = positions - origin[..., None, :2]
-    cos, sin = origin[..., None, 2].cos(), origin[..., None, 2].sin()
-    ahead = cos * delta[..., 0] + sin * delta[..., 1]
-    return torch.stack([ahead, cos * delta[..., 1] - sin * delta[..., 0]], dim=-1)
+    return to_frame(positions, origin[..., None, :])

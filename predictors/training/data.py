@@ -294,7 +294,7 @@ def action_range(recordings: Sequence[Recording], snippets: SnippetIndex) -> tup
     Returns:
         Acceleration (m/s²) and steering (rad), within `MIN_ACTION_RANGE` and the limits of actions.
     """
-    count = len(snippets) * snippets.horizon
+    count = len(snippets) * snippets.horizon_ticks
     if not count:
         return MIN_ACTION_RANGE
     place = (count - 1) * (RANGE_PERCENTILE / 100)

@@ -98,7 +98,7 @@ def train(
     shape = shape_for(
         view,
         history=training.snippets.history,
-        horizon=training.snippets.horizon,
+        horizon=training.snippets.horizon_ticks,
         dt_s=config.dt_s,
         action_range=scale,
     )
@@ -108,7 +108,7 @@ def train(
     not_loaded = [] if pretrained is None else pretrained.apply(network)
     trained_on = chosen.trained_on
     if pretrained is not None and pretrained.trained_on is not None:
-        trained_on = trained_on.after(pretrained.trained_on)
+        trained_on = trained_on.continued_from(pretrained.trained_on)
     batches = [
         split.batches(view, size=size, later_ticks=network.later_ticks, config=config)
         for split, size in (

@@ -5,14 +5,14 @@ import tempfile
 from pathlib import Path
 
 import numpy as np
-from jaxtyping import Bool, Float
+from jaxtyping import Float
 from rich.console import Console
 from rich.progress import track as with_progress
 
 from asp_env.data.cache import get_or_create
 from asp_env.errors import AspEnvError, unknown_name
 from asp_env.files import written_aside
-from asp_env.geometry import box_corners
+from asp_env.geometry import boxes_overlap
 from scenarios.noise import measure
 from scenarios.sumo.demand import RoadUser, demand
 from scenarios.sumo.motion import FRAME_RATE_HZ, Motion, reconstruct
@@ -84,32 +84,13 @@ def overlapping(motions: dict[str, Motion], users: dict[str, RoadUser]) -> set[t
         first = np.flatnonzero(near)
         pairs.append(np.column_stack([first, first + apart]))
     a, b = np.concatenate([np.empty((0, 2), dtype=np.int64), *pairs]).T
-    corners = box_corners(table[:, 2:5], table[:, 5:])
-    touching = boxes_overlap(corners[a], corners[b])
+    touching = boxes_overlap(table[a, 2:], table[b, 2:])
     found = {
         (names[int(one)], names[int(other)])
         for one, other in np.column_stack([table[a, 1], table[b, 1]])[touching]
     }
     pedestrians = {"pedestrian"}
     return {pair for pair in found if {users[name].kind for name in pair} != pedestrians}
-
-
-def boxes_overlap(
-    a: Float[np.ndarray, "n 4 2"], b: Float[np.ndarray, "n 4 2"]
-) -> Bool[np.ndarray, " n"]:
-    """Whether boxes overlap, pair by pair (separating axis theorem).
-
-    Args:
-        a: (n, 4, 2) corners, m.
-        b: (n, 4, 2) corners, m.
-    """
-    overlap = np.ones(len(a), dtype=bool)
-    for box in (a, b):
-        for axis in (box[:, 1] - box[:, 0], box[:, 2] - box[:, 1]):
-            along_a, along_b = (np.einsum("nij,nj->ni", corners, axis) for corners in (a, b))
-            overlap &= along_a.min(axis=1) < along_b.max(axis=1)
-            overlap &= along_b.min(axis=1) < along_a.max(axis=1)
-    return overlap
 
 
 def record(

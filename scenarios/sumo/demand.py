@@ -4,6 +4,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from asp_env.geometry import wrap_scalar
 from scenarios.sumo.sites import Arm, Site
 
 VEHICLES_PER_HOUR = {
@@ -106,7 +107,7 @@ def _user(rng: np.random.Generator, kind: str) -> RoadUser:
 
 def right_turn_rad(begin: Arm, end: Arm) -> float:
     """Angle of the turn from one arm to another, right positive, rad."""
-    return float((begin.angle_rad + np.pi - end.angle_rad + np.pi) % (2.0 * np.pi) - np.pi)
+    return float(wrap_scalar(begin.angle_rad + np.pi - end.angle_rad))
 
 
 def _route(

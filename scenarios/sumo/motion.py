@@ -14,7 +14,8 @@ import numpy as np
 from jaxtyping import Float
 
 from asp_env.dynamics.bicycle import AXLE_SHARE_OF_LENGTH
-from scenarios.polylines import Polyline, arc_lengths
+from asp_env.geometry import arc_lengths, points_at
+from scenarios.polylines import Polyline
 from scenarios.sumo.network import STEP_S
 
 FRAME_RATE_HZ = 25.0
@@ -163,7 +164,7 @@ def _smoothed_path(
             distinct.append(i)
     at = np.arange(-lead, arc[-1] / SPACING_M + 20.0) * SPACING_M
     line, along = points[distinct], arc[distinct]
-    raw = np.stack([np.interp(at, along, line[:, axis]) for axis in (0, 1)], axis=1)
+    raw = points_at(line, along, at)
     for outside, end, other in ((at < 0.0, 0, 1), (at > along[-1], -1, -2)):
         slope = (line[end] - line[other]) / (along[end] - along[other])
         raw[outside] = line[end] + slope * (at[outside] - along[end])[:, None]

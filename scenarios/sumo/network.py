@@ -16,8 +16,9 @@ import pandas as pd
 from jaxtyping import Float
 
 from asp_env.errors import AspEnvError, MissingExtraError
+from asp_env.geometry import arc_lengths
 from scenarios.lanelet2 import Border, Lanelet, Marking, Subtype
-from scenarios.polylines import Polyline, arc_lengths, dense, offset
+from scenarios.polylines import Polyline, dense, offset
 from scenarios.sumo.sites import Site
 
 STEP_S = 0.1

@@ -11,7 +11,7 @@ import pandas as pd
 import pytest
 
 from asp_env import registry
-from asp_env.data.source import load
+from asp_env.data.source import open_data
 from asp_env.errors import AspEnvError, MissingExtraError
 from scenarios.sumo import dataset, open_source, synthesize
 from scenarios.synthesize import Synthesize
@@ -59,7 +59,7 @@ def test_noise_keeps_the_truth(short: Path, tmp_path: Path) -> None:
     error = np.hypot(measured.xCenter - true.xCenter, measured.yCenter - true.yCenter)
     assert 0.005 < error.mean() < 0.1
     assert error.max() < 0.5
-    assert len(load(tmp_path / "n")) == 1
+    assert len(open_data(tmp_path / "n")) == 1
 
 
 def test_recordings_share_places(tmp_path: Path) -> None:
@@ -69,7 +69,7 @@ def test_recordings_share_places(tmp_path: Path) -> None:
     assert len([name for name in files if name.endswith(".osm")]) == 1
     assert len({files[name] for name in files if name.endswith(".png")}) == 1
     assert len({files[name] for name in files if name.endswith("_tracks.csv")}) == 3
-    assert {recording.location for recording in load(tmp_path / "c")} == {"0"}
+    assert {recording.location for recording in open_data(tmp_path / "c")} == {"0"}
 
 
 def test_an_unknown_site_lists_those_known(tmp_path: Path) -> None:
@@ -180,7 +180,7 @@ def test_the_command_and_the_source_are_registered() -> None:
 @pytest.mark.parametrize("name", ["intersection", "roundabout"])
 def test_samples_ship(name: str) -> None:
     """Two minutes of all classes, read without a repair; both together take under 4 MB."""
-    (recording,) = load(f"sample:{name}")
+    (recording,) = open_data(f"sample:{name}")
     assert recording.num_frames == 3000
     assert len(np.unique(recording.classes)) == 7
     assert recording.parked.any()

@@ -22,6 +22,7 @@ from pyproj import Transformer
 
 from asp_env.data.road_map import LineType, Ragged, RoadMap
 from asp_env.errors import DataError
+from asp_env.geometry import arc_lengths, points_at
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -449,15 +450,12 @@ def _centre_line(lanelet: _Lanelet) -> Float[np.ndarray, "n 2"]:
         return lanelet.centre
     left_at, right_at = _arc_shares(lanelet.left), _arc_shares(lanelet.right)
     at = np.unique(np.concatenate([left_at, right_at]).round(6))
-    sides = [
-        np.stack([np.interp(at, shares, line[:, axis]) for axis in (0, 1)], axis=-1)
-        for shares, line in ((left_at, lanelet.left), (right_at, lanelet.right))
-    ]
-    return 0.5 * (sides[0] + sides[1])
+    left, right = points_at(lanelet.left, left_at, at), points_at(lanelet.right, right_at, at)
+    return 0.5 * (left + right)
 
 
 def _arc_shares(line: Float[np.ndarray, "n 2"]) -> Float[np.ndarray, " n"]:
-    arc = np.concatenate([[0.0], np.cumsum(np.hypot(*np.diff(line, axis=0).T))])
+    arc = arc_lengths(line)
     return arc / arc[-1] if arc[-1] > 0 else np.linspace(0.0, 1.0, len(line))
 
 

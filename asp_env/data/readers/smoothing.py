@@ -16,6 +16,8 @@ import numpy as np
 from jaxtyping import Bool, Float
 from numba import njit
 
+from asp_env.geometry import wrap_scalar
+
 ACCELERATION_SIGMA_MPS2 = 1.5
 ACCELERATION_FADES_S = 1.0
 
@@ -278,7 +280,7 @@ def _pull(heading, course, way, rear, least, headings):
     """Pulls the rear axle along; on a straight step the tractrix is known in closed form."""
     headings[0] = heading
     for k in range(len(way)):
-        off = (heading - course[k] + math.pi) % (2.0 * math.pi) - math.pi
+        off = wrap_scalar(heading - course[k])
         if way[k] > least and abs(off) < 0.5 * math.pi:
             heading = course[k] + 2.0 * math.atan(math.tan(0.5 * off) * math.exp(-way[k] / rear))
         headings[k + 1] = heading

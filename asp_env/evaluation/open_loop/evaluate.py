@@ -232,7 +232,7 @@ def _examples(
         scene=scene,
         future=future,
         forecasts={
-            name: ask(predictor, scene, future, index.horizon)
+            name: ask(predictor, scene, future, index.horizon_ticks)
             for name, predictor in predictors.items()
         },
         captions=tuple(where),

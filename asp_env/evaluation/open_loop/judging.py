@@ -19,7 +19,7 @@ from asp_env.data.recording import Recording, frames_per_tick, ticks
 from asp_env.data.road_map import RoadMap
 from asp_env.data.scene import Scene
 from asp_env.data.snippets import (
-    EVERY_S,
+    SNIPPET_INTERVAL_S,
     Future,
     SnippetIndex,
     gather_scene,
@@ -86,7 +86,7 @@ def gather_ground_truth(recordings: Sequence[Any], index: SnippetIndex) -> Groun
     keys = np.stack([index.recording, index.tick], axis=-1)
     found, inverse = np.unique(keys, axis=0, return_inverse=True)
     situation = inverse.reshape(-1)
-    offsets = np.arange(-index.history, index.horizon + 1)
+    offsets = np.arange(-index.history, index.horizon_ticks + 1)
     states, valid = gather_ticks(recordings, index, offsets)
     sizes = np.zeros((len(index), 2), dtype=np.float32)
     classes = np.zeros(len(index), dtype=np.int64)
@@ -108,8 +108,8 @@ def gather_ground_truth(recordings: Sequence[Any], index: SnippetIndex) -> Groun
             around.append((recording.sizes[tracks], others, there))
     shape = (len(found), max((len(each[0]) for each in around), default=0))
     others_sizes = np.zeros((*shape, 2), dtype=np.float32)
-    others = np.zeros((*shape, index.horizon, 4), dtype=np.float32)
-    others_valid = np.zeros((*shape, index.horizon), dtype=bool)
+    others = np.zeros((*shape, index.horizon_ticks, 4), dtype=np.float32)
+    others_valid = np.zeros((*shape, index.horizon_ticks), dtype=bool)
     for number, each in enumerate(around):
         count = len(each[0])
         others_sizes[number, :count], others[number, :count], others_valid[number, :count] = each
@@ -134,9 +134,9 @@ def _after(
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """(tracks, states, presence) of everybody seen after a tick."""
     stride = frames_per_tick(recording.frame_rate_hz, index.dt_s)
-    tracks = recording.tracks_between((tick + 1) * stride, (tick + index.horizon) * stride)
+    tracks = recording.tracks_between((tick + 1) * stride, (tick + index.horizon_ticks) * stride)
     window = gather_window(
-        recording, tracks, first_tick=tick + 1, num_ticks=index.horizon, stride=stride
+        recording, tracks, first_tick=tick + 1, num_ticks=index.horizon_ticks, stride=stride
     )
     return (tracks, *window)
 
@@ -159,7 +159,7 @@ class ForecastHistory:
 
     def __init__(self, index: SnippetIndex) -> None:
         """Finds, for every snippet, the one of the same track 0.6 s before."""
-        self.apart = ticks(EVERY_S, index.dt_s)
+        self.apart = ticks(SNIPPET_INTERVAL_S, index.dt_s)
         count = len(index)
         order = np.lexsort((index.tick, index.track, index.recording))
         before, after = order[:-1], order[1:]
@@ -358,8 +358,8 @@ def judge(
         kinds.put(rows, truth)
         on_road = keeps_to_road(truth)
         for name, predictor in predictors.items():
-            forecast = ask(predictor, scene, truth.future, index.horizon)
-            states = forecast.states[:, :, : index.horizon]
+            forecast = ask(predictor, scene, truth.future, index.horizon_ticks)
+            states = forecast.states[:, :, : index.horizon_ticks]
             said = ForecastSample(
                 states=states, log_probs=forecast.log_probs, now=scene.target_states
             )

@@ -9,7 +9,7 @@ from numba import njit
 
 from asp_env.data.scene import EGO
 from asp_env.dynamics import MAX_ACCELERATION_MPS2
-from asp_env.geometry import overlaps
+from asp_env.geometry import overlaps, point_on_route, wrap_scalar
 from asp_env.sim.traffic.driver import BaseDriver, Control, check_replayed, resized, vehicles
 from asp_env.sim.traffic.idm import IDMDriver
 from asp_env.sim.world import World
@@ -26,29 +26,18 @@ OFF_ROUTE_M, OFF_ROUTE_RAD = 2.0, math.pi / 4
 
 @njit(cache=True)
 @no_type_check
-def _on_route(route, count, s, offset):
-    """(x, y, heading) at an arc length, so far to the left."""
-    i = min(max(int(s), 0), count - 2)
-    dx, dy = route[i + 1, 0] - route[i, 0], route[i + 1, 1] - route[i, 1]
-    norm = max(math.hypot(dx, dy), 1e-6)
-    x = route[i, 0] + (s - i) * dx - offset * dy / norm
-    y = route[i, 1] + (s - i) * dy + offset * dx / norm
-    return x, y, math.atan2(dy, dx)
-
-
-@njit(cache=True)
-@no_type_check
 def _expect(states, now, a, route, count, on_route, dt, ways):
     """Fills in where somebody will be at the coming ticks at its present speed."""
     x, y, heading, speed = states[now, a]
-    turned = (heading - on_route[2] + math.pi) % (2.0 * math.pi) - math.pi
+    turned = wrap_scalar(heading - on_route[2])
     follows = a == EGO and abs(on_route[1]) < OFF_ROUTE_M and abs(turned) < OFF_ROUTE_RAD
     for h in range(len(ways)):
         way = speed * dt * (h + 1)
         if follows:
-            ways[h, 0], ways[h, 1], ways[h, 2] = _on_route(
+            ways[h, 0], ways[h, 1], dx, dy = point_on_route(
                 route, count, on_route[0] + way, on_route[1]
             )
+            ways[h, 2] = math.atan2(dy, dx)
         else:
             ways[h, 0] = x + way * math.cos(heading)
             ways[h, 1] = y + way * math.sin(heading)

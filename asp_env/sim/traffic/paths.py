@@ -12,7 +12,7 @@ from jaxtyping import Bool, Float, Int
 from numba import njit
 
 from asp_env.data.recording import Recording
-from asp_env.data.scenarios.tags import STANDING_MPS
+from asp_env.data.scenarios.tags import MANOEUVRE_STANDING_MPS
 from asp_env.dynamics.car_following import IDM, limit_speeds
 from asp_env.geometry import MIN_STEP_M, turned_overlaps
 from asp_env.sim.episodes import BEYOND_M
@@ -146,7 +146,7 @@ class Paths:
         points = np.zeros((firsts[-1], 4), dtype=np.float32)
         _lay(states, starts, arcs, firsts, points)
         speeds = np.abs(states[:, 3])
-        halts = speeds[starts[1:] - 1] < STANDING_MPS
+        halts = speeds[starts[1:] - 1] < MANOEUVRE_STANDING_MPS
         ends = counts - 1 - BEYOND_M
         desired = np.maximum(np.maximum.reduceat(speeds, starts[:-1]), MIN_DESIRED_MPS)
         limits = np.zeros(len(points), dtype=np.float32)

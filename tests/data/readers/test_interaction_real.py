@@ -5,11 +5,10 @@ import numpy as np
 import pytest
 from gymnasium.utils.env_checker import check_env
 
-import asp_env
 from asp_env.data.classes import AgentClass
 from asp_env.data.recording import Recording
 from asp_env.data.snippets import find_snippets
-from asp_env.data.source import Recordings
+from asp_env.data.source import Recordings, open_data
 from asp_env.evaluation.inspect import drift_m
 from asp_env.geometry import wrap_angle
 from tests.real_data import real_data
@@ -27,13 +26,13 @@ ON_FOOT = (AgentClass.BICYCLE, AgentClass.PEDESTRIAN)
 @pytest.fixture(scope="module")
 def published() -> Recordings:
     """The recordings as published."""
-    return asp_env.load(real_data("taf_bw"))
+    return open_data(real_data("taf_bw"))
 
 
 @pytest.fixture(scope="module")
 def smoothed() -> Recordings:
     """All recordings of the same place, in the inD layout."""
-    return asp_env.load(real_data("karlsruhe"))
+    return open_data(real_data("karlsruhe"))
 
 
 def both(recording: Recording, other: Recording) -> tuple[np.ndarray, np.ndarray]:
@@ -82,7 +81,7 @@ def test_drift_floor(published: Recordings) -> None:
     """
     metres, moves = [], []
     for recording in published:
-        index = find_snippets(recording, dt_s=0.2, history=15, horizon=30, every=3)
+        index = find_snippets(recording, dt_s=0.2, history=15, horizon_ticks=30, interval_ticks=3)
         apart, moving = drift_m(recording, *index, dt_s=0.2, horizon=30)
         metres.append(apart)
         moves.append(moving)

@@ -262,7 +262,7 @@ def test_earlier_forecasts_are_kept_no_longer_than_needed() -> None:
         tick=np.array([0, 0, 3, 3, 6, 9]),
         dt_s=DT_S,
         history=15,
-        horizon=15,
+        horizon_ticks=15,
     )
     earlier = ForecastHistory(index)
     assert earlier.apart == 3

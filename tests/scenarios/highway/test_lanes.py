@@ -9,9 +9,8 @@ from highway_env.road.lane import LineType, StraightLane
 from highway_env.road.road import RoadNetwork
 
 from asp_env.errors import AspEnvError
-from asp_env.geometry import wrap_angle
+from asp_env.geometry import arc_lengths, wrap_angle
 from scenarios.highway.road_map import Strip, all_lanes, links, mirror_points, mouths, strips
-from scenarios.polylines import arc_lengths
 from tests.scenarios.highway.maps import Place
 
 
