@@ -23,11 +23,10 @@ from asp_env import registry
 from asp_env.data.snippets import index_snippets
 from asp_env.data.source import open_data
 from asp_env.views import make_view
-from predictors.inference.checkpoint import shape_for
-from predictors.models.network import LearnedPlug
+from predictors.inference.checkpoint import PredictorSpec, shape_for
 from predictors.training.data import Batches
 from predictors.training.data_loading import batch_workers
-from predictors.training.lightning_parts import Fit
+from predictors.training.lightning_parts import TrainingModule
 from predictors.training.recipes import TrainingConfig, recipe
 from predictors.training.trainer import Hardware, make_trainer, quiet
 
@@ -128,22 +127,24 @@ class GpuRate:
         clock = Clock()
         with (
             tempfile.TemporaryDirectory() as out,
-            batch_workers([training.drawing], processes) as crew,
+            batch_workers([training.source], processes) as crew,
             quiet(),
         ):
             if crew is not None:
-                training = training.drawn_by(crew, 0)
+                training = training.with_workers(crew, 0)
             trainer = make_trainer(
                 config, Hardware(), out=Path(out), started="trial", callbacks=[clock]
             )
-            trainer.fit(Fit(network, config=config, training=training, validation=validation))
+            trainer.fit(
+                TrainingModule(network, config=config, training=training, validation=validation)
+            )
         return clock.found()
 
     def _parts(self, config: TrainingConfig) -> tuple[Batches, Batches, Any]:
         """As many snippets as steps need, some more than once, and a network."""
         view = make_view(config.view, pixels=config.pixels)
         shape = shape_for(view, history=15, horizon=15, dt_s=0.2, action_range=(4.0, 0.5))
-        plug: LearnedPlug = registry.find("predictors", self.predictor)
+        plug: PredictorSpec = registry.find("predictors", self.predictor)
         network = plug.network(config.network, shape)
         recordings = open_data(self.data)
         index = index_snippets(recordings, dt_s=0.2, horizon_s=3.0)

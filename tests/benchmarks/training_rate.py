@@ -17,9 +17,9 @@ from asp_env import registry
 from asp_env.data.snippets import index_snippets
 from asp_env.data.source import open_data
 from asp_env.views import make_view
-from predictors.inference.checkpoint import shape_for
+from predictors.inference.checkpoint import PredictorSpec, shape_for
 from predictors.models.batch import Batch, Labels
-from predictors.models.network import AbstractNetwork, LearnedPlug, TrainingProgress
+from predictors.models.network import AbstractNetwork, TrainingProgress
 from predictors.training.data import Batches
 from predictors.training.recipes import recipe
 
@@ -63,7 +63,7 @@ def make_trial(view_name: str, encoder: str, pixels: tuple[int, int] | None) -> 
     config = recipe("ssp-asp", "cpu", view=view_name, horizon_s=3.0)
     view = make_view(view_name, pixels=pixels)
     shape = shape_for(view, history=15, horizon=15, dt_s=0.2, action_range=(4.0, 0.5))
-    plug: LearnedPlug = registry.find("predictors", "ssp-asp")
+    plug: PredictorSpec = registry.find("predictors", "ssp-asp")
     network = plug.network(dataclasses.replace(config.network, encoder=encoder), shape)
     recordings = open_data(DATA)
     index = index_snippets(recordings, dt_s=0.2, horizon_s=3.0)
