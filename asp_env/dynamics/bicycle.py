@@ -160,3 +160,31 @@ def clip_actions(actions: Float[Any, "*batch 2"]) -> Float[Any, "*batch 2"]:
     acceleration = xp.clip(actions[..., 0], -MAX_ACCELERATION_MPS2, MAX_ACCELERATION_MPS2)
     steering = xp.clip(actions[..., 1], -MAX_STEERING_RAD, MAX_STEERING_RAD)
     return xp.stack([acceleration, steering], axis=-1)
+
+
+def normalize_actions(actions: Float[Any, "*batch 2"]) -> Float[Any, "*batch 2"]:
+    """Converts actions in physical units to the action space of the environments, [-1, 1].
+
+    Args:
+        actions: [acceleration m/s², steering rad], as planners return them.
+
+    Returns:
+        The actions divided by `MAX_ACCELERATION_MPS2` and `MAX_STEERING_RAD`; not clipped.
+    """
+    xp = namespace(actions)
+    acceleration = actions[..., 0] / MAX_ACCELERATION_MPS2
+    return xp.stack([acceleration, actions[..., 1] / MAX_STEERING_RAD], axis=-1)
+
+
+def denormalize_actions(actions: Float[Any, "*batch 2"]) -> Float[Any, "*batch 2"]:
+    """Converts actions of the environments' action space to physical units.
+
+    Args:
+        actions: [acceleration, steering] in [-1, 1].
+
+    Returns:
+        [acceleration m/s², steering rad]: the inverse of `normalize_actions`.
+    """
+    xp = namespace(actions)
+    acceleration = actions[..., 0] * MAX_ACCELERATION_MPS2
+    return xp.stack([acceleration, actions[..., 1] * MAX_STEERING_RAD], axis=-1)
