@@ -85,7 +85,7 @@ def _parse(name: str, command: Any, args: Sequence[str]) -> Any:
         lines = [line.strip("│─ ") or ";" for line in stderr.getvalue().splitlines()[1:-1]]
         text = " ".join(lines).replace(" ;", ";")
         problem = re.split("; (?:For full|Argument) helptext", text)[0].rstrip(".")
-        raise AspEnvError(f"{problem}; asp-env {name} --help lists its options") from None
+        raise AspEnvError(f"{problem}; see asp-env {name} --help") from None
 
 
 def _report(message: str) -> int:
