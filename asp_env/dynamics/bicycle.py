@@ -162,29 +162,27 @@ def clip_actions(actions: Float[Any, "*batch 2"]) -> Float[Any, "*batch 2"]:
     return xp.stack([acceleration, steering], axis=-1)
 
 
+_ACTION_LIMITS = (MAX_ACCELERATION_MPS2, MAX_STEERING_RAD)
+
+
 def normalize_actions(actions: Float[Any, "*batch 2"]) -> Float[Any, "*batch 2"]:
-    """Converts actions in physical units to the action space of the environments, [-1, 1].
+    """Actions in the action space [-1, 1] of the environments, of the same type.
 
     Args:
-        actions: [acceleration m/s², steering rad], as planners return them.
-
-    Returns:
-        The actions divided by `MAX_ACCELERATION_MPS2` and `MAX_STEERING_RAD`; not clipped.
+        actions: [acceleration m/s², steering rad]. Actions beyond the limits are not clipped; the
+            environments do that.
     """
-    xp = namespace(actions)
-    acceleration = actions[..., 0] / MAX_ACCELERATION_MPS2
-    return xp.stack([acceleration, actions[..., 1] / MAX_STEERING_RAD], axis=-1)
+    if namespace(actions) is np:
+        return (actions / np.array(_ACTION_LIMITS)).astype(actions.dtype)
+    return actions / actions.new_tensor(_ACTION_LIMITS)
 
 
 def denormalize_actions(actions: Float[Any, "*batch 2"]) -> Float[Any, "*batch 2"]:
-    """Converts actions of the environments' action space to physical units.
+    """Actions [acceleration m/s², steering rad]; the inverse of `normalize_actions`.
 
     Args:
-        actions: [acceleration, steering] in [-1, 1].
-
-    Returns:
-        [acceleration m/s², steering rad]: the inverse of `normalize_actions`.
+        actions: in the action space [-1, 1] of the environments.
     """
-    xp = namespace(actions)
-    acceleration = actions[..., 0] * MAX_ACCELERATION_MPS2
-    return xp.stack([acceleration, actions[..., 1] * MAX_STEERING_RAD], axis=-1)
+    if namespace(actions) is np:
+        return actions * np.array(_ACTION_LIMITS, dtype=actions.dtype)
+    return actions * actions.new_tensor(_ACTION_LIMITS)
