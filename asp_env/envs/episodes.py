@@ -259,8 +259,8 @@ class ReplayEpisodes:
         world, before = self.simulation.world, self.events
         assert before is not None
         states_before = world.ego_states()
-        driven = np.ones(len(world), dtype=bool)
-        self.simulation.step(denormalize_actions(actions), driven)
+        controlled = np.ones(len(world), dtype=bool)
+        self.simulation.step(denormalize_actions(actions), controlled)
         self.events = after = world.events()
         terms = reward_terms(before, after, states_before, world.ego_states(), world.dt_s)
         endings = ending(after)
