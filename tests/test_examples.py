@@ -1,6 +1,7 @@
-"""The examples run and stay short."""
+"""The examples and the code in the documentation of the environments run."""
 
 import math
+import re
 from pathlib import Path
 
 import cv2
@@ -24,6 +25,16 @@ EXAMPLES = sorted(Path(own_predictor.__file__).parent.glob("*.py"))
 @pytest.mark.parametrize("path", EXAMPLES, ids=lambda path: path.name)
 def test_examples_have_at_most_80_lines(path: Path) -> None:
     assert len(path.read_text().splitlines()) <= 80
+
+
+@pytest.mark.parametrize("page", ["environment.md", "rl.md"])
+def test_python_code_in_the_documentation_runs(page: str) -> None:
+    """The blocks of a page run one after another, except the one that trains for long."""
+    text = (Path(own_predictor.__file__).parents[1] / "docs" / page).read_text()
+    names: dict[str, object] = {}
+    for code in re.findall(r"```python\n(.*?)```", text, re.DOTALL):
+        if "PPO" not in code:
+            exec(code, names)
 
 
 def test_every_episode_of_random_actions_has_a_named_ending() -> None:

@@ -420,7 +420,9 @@ all |
                 num_agents = max(num_agents, int((present & selected).sum()))
                 drivable[row] = True
         if not num_agents:
-            raise AspEnvError(f"{data}: the ego of no scenario has one of the given classes and ids")
+            raise AspEnvError(
+                f"{data}: the ego of no scenario has one of the given classes and ids"
+            )
         return scenarios.select(drivable), num_agents
 
     def _observe(self) -> Observations:
