@@ -4,8 +4,10 @@ from asp_env.dynamics.bicycle import (
     MAX_ACCELERATION_MPS2,
     MAX_STEERING_RAD,
     clip_actions,
+    denormalize_actions,
     forward,
     inverse,
+    normalize_actions,
     rollout,
 )
 from asp_env.dynamics.car_following import IDM, follow_paths, speed_limits
@@ -15,9 +17,11 @@ __all__ = [
     "MAX_ACCELERATION_MPS2",
     "MAX_STEERING_RAD",
     "clip_actions",
+    "denormalize_actions",
     "follow_paths",
     "forward",
     "inverse",
+    "normalize_actions",
     "rollout",
     "speed_limits",
 ]
