@@ -39,7 +39,7 @@ def report(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def rows_of(page: str, heading: str) -> list[list[str]]:
     """The cells' first words of the first table that carries a heading."""
     table = page[page.index(f"<thead><tr><th>{heading}</th>") :].partition("</table>")[0]
-    rows = re.findall(r"<tr[^>]*>(.*?)</tr>", table)
+    rows = re.findall(r"<tr[^>]*>(.*?)</tr>", table, re.DOTALL)
     return [
         [re.sub("<[^>]+>", "", re.sub("<(small|i).*", "", cell)) for cell in cells]
         for row in rows
@@ -79,20 +79,20 @@ def test_tables_name_who_knew_the_future_first_and_mark_the_best_of_the_others(
 def test_kinds_of_targets_have_tables_of_their_own(report: Path) -> None:
     """Columns left and right of manoeuvres, FDE 1.2 and 1.1 times the error; no tab, no bar."""
     page = report.read_text()
-    section = page.partition("<section id='kinds'>")[2].partition("</section>")[0]
+    section = page.partition('<section id="kinds">')[2].partition("</section>")[0]
     assert "FDE by manoeuvre" in section
     table = rows_of(section, "most probable")
     assert table[0][1:] == ["left", "right"]
     assert table[2] == ["constant-velocity", "4.56", "4.18"]
-    assert "manoeuvre:left" not in page.partition("<section id='kinds'>")[0]
+    assert "manoeuvre:left" not in page.partition('<section id="kinds">')[0]
     bars = data_of(page)["figures"]["final-errors"]["data"]
     assert {x for bar in bars for x in bar["x"]} == {"all", "moving", "left", "straight"}
 
 
 def test_cards_compare_with_constant_velocity_and_the_expert(report: Path) -> None:
     """FDE of moving targets 1.90 m beside 3.80 m; score 81.0 % beside 93.0 %."""
-    cards = report.read_text().partition("<div class='cards'>")[2].partition("<section")[0]
-    assert re.findall(r"class='figure'>([\d.]+)", cards) == ["1.90", "1.14", "81.0", "93.9"]
+    cards = report.read_text().partition('<div class="cards">')[2].partition("<section")[0]
+    assert re.findall(r'class="figure">([\d.]+)', cards) == ["1.90", "1.14", "81.0", "93.9"]
     assert "constant velocity: 3.80 m; ratio 0.50 (0.45 to 0.55)" in cards
     assert "93.0 % for the logged expert" in cards
 
@@ -149,7 +149,7 @@ def test_a_run_without_drives_or_pictures_has_no_such_sections(tmp_path: Path) -
     """Only what there is gets a heading."""
     write_tables(tmp_path, [row for row in metric_rows() if not row["planner"]])
     page = write_report(tmp_path, title="Open loop").read_text()
-    assert re.findall(r"<section id='(\w+)'", page) == ["forecasts", "kinds", "metrics", "run"]
+    assert re.findall(r'<section id="(\w+)"', page) == ["forecasts", "kinds", "metrics", "run"]
 
 
 def test_names_that_look_like_markup_stay_text(tmp_path: Path) -> None:

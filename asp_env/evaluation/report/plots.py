@@ -6,8 +6,15 @@ from collections.abc import Sequence
 import plotly.graph_objects as go
 from plotly.subplots import make_subplots
 
-from asp_env.evaluation.report.results import MethodResult, Result, distinct, entrants, note
-from asp_env.evaluation.report.tables import SELECTIONS, SUBSETS
+from asp_env.evaluation.report.results import (
+    SELECTIONS,
+    SUBSETS,
+    MethodResult,
+    Result,
+    distinct,
+    methods_of,
+    metric_note,
+)
 
 COLOURS = ("#e8590c", "#7048e8", "#0ca678", "#1c7ed6", "#d6336c", "#c99700", "#5c7cfa", "#74b816")
 PRIVILEGED_COLOUR = "#8a94a6"
@@ -27,17 +34,17 @@ def final_errors(results: Sequence[Result], colour: dict[str, str]) -> str | Non
     selections = distinct((r.selection for r in results), first=SELECTIONS)
     figure = _panels([selection.replace("-", " ") for selection in selections])
     for panel, selection in enumerate(selections, start=1):
-        for entrant in entrants(results):
-            mine = [r for r in results if (r.entrant, r.selection) == (entrant, selection)]
+        for method in methods_of(results):
+            mine = [r for r in results if (r.method, r.selection) == (method, selection)]
             mine.sort(key=lambda r: SUBSETS.index(r.subset) if r.subset in SUBSETS else 9)
             bar = go.Bar(
-                name=entrant.label,
-                legendgroup=entrant.label,
+                name=method.label,
+                legendgroup=method.label,
                 showlegend=panel == 1,
                 x=[r.subset for r in mine],
                 y=_values(mine),
                 error_y=_whiskers(mine),
-                marker={"color": _colour(entrant, colour), "cornerradius": 3},
+                marker={"color": _colour(method, colour), "cornerradius": 3},
                 hovertemplate="%{y:.2f} m",
             )
             figure.add_trace(bar, row=1, col=panel)
@@ -56,17 +63,17 @@ def errors_over_time(results: Sequence[Result], colour: dict[str, str]) -> str |
     selections = distinct((r.selection for r in results), first=SELECTIONS)
     figure = _panels([f"{s.replace('-', ' ')} · {subset} targets" for s in selections])
     for panel, selection in enumerate(selections, start=1):
-        for entrant in entrants(results):
-            mine = [r for r in results if (r.entrant, r.selection) == (entrant, selection)]
+        for method in methods_of(results):
+            mine = [r for r in results if (r.method, r.selection) == (method, selection)]
             line = go.Scatter(
-                name=entrant.label,
-                legendgroup=entrant.label,
+                name=method.label,
+                legendgroup=method.label,
                 showlegend=panel == 1,
                 x=[r.at_s for r in mine],
                 y=_values(mine),
                 error_y=_whiskers(mine),
                 mode="lines+markers",
-                line={"color": _colour(entrant, colour), "width": 2.5},
+                line={"color": _colour(method, colour), "width": 2.5},
                 marker={"size": 7},
                 hovertemplate="%{y:.2f} m",
             )
@@ -85,7 +92,7 @@ def driving_metrics(results: Sequence[Result], colour: dict[str, str]) -> str | 
     metrics = distinct(r.metric for r in results)
     if not metrics:
         return None
-    who = entrants(results)
+    who = methods_of(results)
     columns = min(PANELS_PER_ROW, len(metrics))
     rows = math.ceil(len(metrics) / columns)
     height = rows * (95 + 30 * len(who)) + 20
@@ -99,17 +106,17 @@ def driving_metrics(results: Sequence[Result], colour: dict[str, str]) -> str | 
     )
     for number, metric in enumerate(metrics):
         row, column = number // columns + 1, number % columns + 1
-        told = note(metric)
+        told = metric_note(metric)
         percent = told.unit == "%"
-        for entrant in who:
-            mine = [r for r in results if (r.entrant, r.metric) == (entrant, metric)]
+        for method in who:
+            mine = [r for r in results if (r.method, r.metric) == (method, metric)]
             scale = 100.0 if percent else 1.0
             point = go.Scatter(
                 x=_values(mine, scale),
-                y=[entrant.label] * len(mine),
+                y=[method.label] * len(mine),
                 error_x=_whiskers(mine, scale),
                 mode="markers",
-                marker={"color": _colour(entrant, colour), "size": 10},
+                marker={"color": _colour(method, colour), "size": 10},
                 hovertemplate="%{x:.2f}<extra>%{y}</extra>",
                 showlegend=False,
             )
@@ -124,8 +131,10 @@ def driving_metrics(results: Sequence[Result], colour: dict[str, str]) -> str | 
 
 
 def _panel_title(metric: str) -> str:
-    arrow = {"lower": "↓", "higher": "↑", "neither": ""}[note(metric).better]
-    return " ".join(part for part in (note(metric).label, note(metric).unit, arrow) if part)
+    arrow = {"lower": "↓", "higher": "↑", "neither": ""}[metric_note(metric).better]
+    return " ".join(
+        part for part in (metric_note(metric).label, metric_note(metric).unit, arrow) if part
+    )
 
 
 def _panels(titles: Sequence[str]) -> go.Figure:
@@ -134,8 +143,8 @@ def _panels(titles: Sequence[str]) -> go.Figure:
     )
 
 
-def _colour(entrant: MethodResult, colour: dict[str, str]) -> str:
-    return colour.get(entrant.predictor, PRIVILEGED_COLOUR)
+def _colour(method: MethodResult, colour: dict[str, str]) -> str:
+    return colour.get(method.predictor, PRIVILEGED_COLOUR)
 
 
 def _values(results: Sequence[Result], scale: float = 1.0) -> list[float | None]:

@@ -26,6 +26,12 @@ class MetricNote:
     better: Better
     text: str
 
+    @property
+    def unit_and_arrow(self) -> str:
+        """The unit, then an arrow that shows which way is better."""
+        arrow = {"lower": "↓", "higher": "↑", "neither": ""}[self.better]
+        return " ".join(part for part in (self.unit, arrow) if part)
+
     def format(self, value: float) -> str:
         """The value as text, without its unit."""
         if self.unit == "%":
@@ -168,11 +174,14 @@ NOTES = {
 """By name in `metrics.csv`."""
 
 
-def note(metric: str) -> MetricNote:
+def metric_note(metric: str) -> MetricNote:
     """The note of a metric; an unknown one keeps its name and is ranked neither way."""
     return NOTES.get(metric) or _note(metric, "", "neither", "")
 
 
+SELECTIONS = ("most-probable", "best-of-3", "")
+"""A metric without a selection speaks of all modes together."""
+SUBSETS = ("all", "moving")
 COLUMNS = tuple(field.name for field in fields(Row))
 DETAILS = ("trained_on", "view", "recipe", "chaining", "traffic", "latency_ticks")
 """Columns that tell rows of one predictor or planner apart, where they differ."""
@@ -205,7 +214,7 @@ class MethodResult:
 class Result:
     """One number of the table; None where it is missing."""
 
-    entrant: MethodResult
+    method: MethodResult
     data: str
     horizon_s: str
     fixed: tuple[str, ...]
@@ -232,7 +241,7 @@ class Results:
     @property
     def predictors(self) -> list[str]:
         """All predictors that do not know the future, by appearance."""
-        every = [result.entrant for result in (*self.open_loop, *self.driving)]
+        every = [result.method for result in (*self.open_loop, *self.driving)]
         return distinct(e.predictor for e in every if e.predictor and not e.privileged)
 
 
@@ -291,7 +300,7 @@ def _result(
     except ValueError as error:
         raise DataError(f"{path}: metric {row['metric']!r}: {error}") from error
     return Result(
-        entrant=MethodResult(
+        method=MethodResult(
             planner=row["planner"],
             predictor=row["predictor"],
             details=tuple(details),
@@ -314,10 +323,10 @@ def _detail(column: str, value: str) -> str:
     return f"{column.replace('_', ' ')} {value}"
 
 
-def entrants(results: Iterable[Result]) -> list[MethodResult]:
+def methods_of(results: Iterable[Result]) -> list[MethodResult]:
     """Those of some results: first the expert, then others who knew the future, then the rest."""
-    found = dict.fromkeys(result.entrant for result in results)
-    return sorted(found, key=lambda entrant: (not entrant.privileged, entrant.planner != "expert"))
+    found = dict.fromkeys(result.method for result in results)
+    return sorted(found, key=lambda method: (not method.privileged, method.planner != "expert"))
 
 
 def distinct(values: Iterable[str], *, first: Sequence[str] = ()) -> list[str]:
@@ -327,8 +336,8 @@ def distinct(values: Iterable[str], *, first: Sequence[str] = ()) -> list[str]:
     return sorted(found, key=lambda value: rank.get(value, len(rank)))
 
 
-def best(results: Iterable[Result], *, better: str) -> Result | None:
+def best_result(results: Iterable[Result], *, better: str) -> Result | None:
     """The best of those who did not know the future, None if there is none."""
-    fair = [r for r in results if r.value is not None and not r.entrant.privileged]
+    fair = [r for r in results if r.value is not None and not r.method.privileged]
     sign = 1 if better == "lower" else -1
     return min(fair, key=lambda r: sign * (r.value or 0.0), default=None)
