@@ -15,8 +15,8 @@ from asp_env.errors import DataError, MissingExtraError
 from asp_env.evaluation.report.payload import (
     ForecastExamples,
     MapTable,
-    drives_payload,
-    pictures_payload,
+    examples_payload,
+    rollouts_payload,
 )
 from asp_env.evaluation.report.results import (
     MetricNote,
@@ -96,8 +96,8 @@ def write_report(
     map_table = MapTable()
     data = {
         **_plots(results),
-        "pictures": pictures_payload(examples, map_table) if examples else [],
-        "drives": drives_payload(out / "rollouts", maps or {}, map_table),
+        "pictures": examples_payload(examples, map_table) if examples else [],
+        "drives": rollouts_payload(out / "rollouts", maps or {}, map_table),
     }
     data["maps"] = map_table.payloads
     context = {
@@ -153,13 +153,13 @@ def _sections(context: Mapping[str, Any]) -> dict[str, str]:
     """Headings of the sections that have something to show, by their anchors."""
     data = context["data"]
     sections = {
-        "forecasts": ("How good are the forecasts?", context["forecast_figures"]),
-        "kinds": ("Which targets are hard?", context["breakdown_figures"]),
-        "pictures": ("What do they look like?", data["pictures"]),
-        "driving": ("How does the car drive with them?", context["driving_figures"]),
-        "drives": ("Watch the drives", data["drives"]),
-        "metrics": ("What the metrics say", context["notes"]),
-        "run": ("What was run", True),
+        "forecasts": ("Forecast errors", context["forecast_figures"]),
+        "breakdown": ("Forecast errors by kind of target", context["breakdown_figures"]),
+        "examples": ("Example forecasts", data["pictures"]),
+        "driving": ("Closed-loop driving", context["driving_figures"]),
+        "rollouts": ("Rollouts", data["drives"]),
+        "metrics": ("Metrics", context["notes"]),
+        "manifest": ("Manifest", True),
     }
     return {anchor: heading for anchor, (heading, shown) in sections.items() if shown}
 
@@ -232,11 +232,11 @@ def _driving_cards(results: Sequence[Result]) -> Iterator[Card]:
         winner = best_result(column, better=note.better)
         if winner is not None:
             expert = [
-                f"{note.format(r.value)} {note.unit} for the logged expert"
+                f"expert: {note.format(r.value)} {note.unit}"
                 for r in column
                 if r.method.planner == "expert" and r.value is not None and r.data == winner.data
             ]
-            yield _card(note.label, winner, "".join(expert[:1]))
+            yield _card(metric.capitalize(), winner, "".join(expert[:1]))
 
 
 def _first_subset(results: Sequence[Result], *preferred: str) -> str:

@@ -1,4 +1,4 @@
-"""Metrics as plotly figures, in JSON; the page colours text and grids by its theme."""
+"""Metrics as plotly figures in JSON; the page sets the colours of text and grids."""
 
 import math
 from collections.abc import Sequence
@@ -22,12 +22,20 @@ PANELS_PER_ROW = 4
 
 
 def colours(predictors: Sequence[str]) -> dict[str, str]:
-    """A colour for each predictor, the same in plots and pictures."""
+    """A colour for each predictor, shared by plots and pictures."""
     return {name: COLOURS[number % len(COLOURS)] for number, name in enumerate(predictors)}
 
 
 def final_errors(results: Sequence[Result], colour: dict[str, str]) -> str | None:
-    """Bars of FDE by subset and predictor with their intervals, a panel per selection."""
+    """Bars of FDE with intervals by subset and method, a panel per selection.
+
+    Args:
+        results: Open-loop results; metrics other than FDE are ignored.
+        colour: The colour of each predictor.
+
+    Returns:
+        The figure as JSON, None if there is nothing to show.
+    """
     results = [r for r in results if r.metric == "FDE" and r.at_s is None and ":" not in r.subset]
     if not results:
         return None
@@ -35,15 +43,15 @@ def final_errors(results: Sequence[Result], colour: dict[str, str]) -> str | Non
     figure = _panels([selection.replace("-", " ") for selection in selections])
     for panel, selection in enumerate(selections, start=1):
         for method in methods_of(results):
-            mine = [r for r in results if (r.method, r.selection) == (method, selection)]
-            mine.sort(key=lambda r: SUBSETS.index(r.subset) if r.subset in SUBSETS else 9)
+            group = [r for r in results if (r.method, r.selection) == (method, selection)]
+            group.sort(key=lambda r: SUBSETS.index(r.subset) if r.subset in SUBSETS else 9)
             bar = go.Bar(
                 name=method.label,
                 legendgroup=method.label,
                 showlegend=panel == 1,
-                x=[r.subset for r in mine],
-                y=_values(mine),
-                error_y=_whiskers(mine),
+                x=[r.subset for r in group],
+                y=_values(group),
+                error_y=_whiskers(group),
                 marker={"color": _colour(method, colour), "cornerradius": 3},
                 hovertemplate="%{y:.2f} m",
             )
@@ -54,7 +62,10 @@ def final_errors(results: Sequence[Result], colour: dict[str, str]) -> str | Non
 
 
 def errors_over_time(results: Sequence[Result], colour: dict[str, str]) -> str | None:
-    """Lines of metrics such as `L2@1s` over the time they speak of, with their intervals."""
+    """Lines of metrics such as `L2@1s` over the time ahead, with intervals.
+
+    The arguments and the return value are as for `final_errors`.
+    """
     results = [r for r in results if r.at_s is not None]
     subset = next(iter(distinct((r.subset for r in results), first=("moving", "all"))), None)
     if subset is None:
@@ -64,14 +75,14 @@ def errors_over_time(results: Sequence[Result], colour: dict[str, str]) -> str |
     figure = _panels([f"{s.replace('-', ' ')} · {subset} targets" for s in selections])
     for panel, selection in enumerate(selections, start=1):
         for method in methods_of(results):
-            mine = [r for r in results if (r.method, r.selection) == (method, selection)]
+            group = [r for r in results if (r.method, r.selection) == (method, selection)]
             line = go.Scatter(
                 name=method.label,
                 legendgroup=method.label,
                 showlegend=panel == 1,
-                x=[r.at_s for r in mine],
-                y=_values(mine),
-                error_y=_whiskers(mine),
+                x=[r.at_s for r in group],
+                y=_values(group),
+                error_y=_whiskers(group),
                 mode="lines+markers",
                 line={"color": _colour(method, colour), "width": 2.5},
                 marker={"size": 7},
@@ -79,23 +90,26 @@ def errors_over_time(results: Sequence[Result], colour: dict[str, str]) -> str |
             )
             figure.add_trace(line, row=1, col=panel)
     figure.update_layout(height=400, hovermode="x unified")
-    figure.update_xaxes(title_text="seconds ahead", rangemode="tozero")
+    figure.update_xaxes(title_text="time ahead, s", rangemode="tozero")
     figure.update_yaxes(rangemode="tozero")
-    figure.update_yaxes(title_text="distance to the truth, m", col=1)
+    figure.update_yaxes(title_text="error, m", col=1)
     return _finish(figure)
 
 
 def driving_metrics(results: Sequence[Result], colour: dict[str, str]) -> str | None:
-    """A panel per metric: a point with its interval for each planner and predictor."""
+    """A panel per metric with a point and an interval for each method.
+
+    The arguments and the return value are as for `final_errors`, with closed-loop results.
+    """
     subset = next(iter(distinct((r.subset for r in results), first=SUBSETS)), None)
     results = [r for r in results if r.subset == subset and r.value is not None and r.at_s is None]
     metrics = distinct(r.metric for r in results)
     if not metrics:
         return None
-    who = methods_of(results)
+    methods = methods_of(results)
     columns = min(PANELS_PER_ROW, len(metrics))
     rows = math.ceil(len(metrics) / columns)
-    height = rows * (95 + 30 * len(who)) + 20
+    height = rows * (95 + 30 * len(methods)) + 20
     figure = make_subplots(
         rows=rows,
         cols=columns,
@@ -106,22 +120,22 @@ def driving_metrics(results: Sequence[Result], colour: dict[str, str]) -> str | 
     )
     for number, metric in enumerate(metrics):
         row, column = number // columns + 1, number % columns + 1
-        told = metric_note(metric)
-        percent = told.unit == "%"
-        for method in who:
-            mine = [r for r in results if (r.method, r.metric) == (method, metric)]
+        note = metric_note(metric)
+        percent = note.unit == "%"
+        for method in methods:
+            group = [r for r in results if (r.method, r.metric) == (method, metric)]
             scale = 100.0 if percent else 1.0
             point = go.Scatter(
-                x=_values(mine, scale),
-                y=[method.label] * len(mine),
-                error_x=_whiskers(mine, scale),
+                x=_values(group, scale),
+                y=[method.label] * len(group),
+                error_x=_whiskers(group, scale),
                 mode="markers",
                 marker={"color": _colour(method, colour), "size": 10},
                 hovertemplate="%{x:.2f}<extra>%{y}</extra>",
                 showlegend=False,
             )
             figure.add_trace(point, row=row, col=column)
-        if percent and told.better == "higher":
+        if percent and note.better == "higher":
             figure.update_xaxes(range=[-4, 104], tickvals=[0, 50, 100], row=row, col=column)
         else:
             figure.update_xaxes(rangemode="tozero", nticks=5, row=row, col=column)
@@ -148,7 +162,7 @@ def _colour(method: MethodResult, colour: dict[str, str]) -> str:
 
 
 def _values(results: Sequence[Result], scale: float = 1.0) -> list[float | None]:
-    """Plain numbers, so that the figure holds them as text and not as packed arrays."""
+    """Python numbers, which plotly writes as text rather than as packed arrays."""
     return [None if r.value is None else round(scale * r.value, 4) for r in results]
 
 
