@@ -16,7 +16,7 @@ from asp_env.data.scene import Scene
 from asp_env.data.snippets import Future
 from asp_env.data.source import Recordings
 from asp_env.envs.episodes import ReplayEpisodes, StepResult, as_actions
-from asp_env.render.live import MODES, Live
+from asp_env.render.live import MODES, LiveRenderer
 from asp_env.sim.world import World, recorded_future
 
 NOT_BEGUN = "no episode has begun: call reset first"
@@ -135,7 +135,7 @@ way, in its frame, m; beyond the end of the way straight on |
         self._actions: list[Float[np.ndarray, " 2"]] = []
         dt_s = self._episodes.simulation.world.dt_s
         self.metadata = {**METADATA, "render_fps": round(1 / dt_s, 6)}
-        self._live = Live(render_mode, title=f"asp-env: {data}", dt_s=dt_s)
+        self._live = LiveRenderer(render_mode, title=f"asp-env: {data}", dt_s=dt_s)
 
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
@@ -153,7 +153,7 @@ way, in its frame, m; beyond the end of the way straight on |
         super().reset(seed=seed)
         self._begin(*self._episodes.draw(self.np_random, options or {}))
         self._running = True
-        self._live.forget()
+        self._live.clear_overlay()
         self._keep_up()
         return self._observe(), self._info()
 
@@ -212,7 +212,7 @@ way, in its frame, m; beyond the end of the way straight on |
         self.np_random.bit_generator.state = snapshot.generator
         self._np_random_seed = snapshot.seed
         self._running = snapshot.running
-        self._live.forget()
+        self._live.clear_overlay()
 
     def scene(self) -> Scene:
         """All that may be known now, for a predictor in anybody's loop; the ego is slot 0.

@@ -31,8 +31,8 @@ from asp_env.evaluation.report.tables import breakdown_figures, result_figures
 
 BASELINE = "constant-velocity"
 RATIO = "FDE / constant velocity"
-DRIVING_METRICS = ("score", "no at-fault collision")
-SELECTIONS = ("most-probable", "best-of-3")
+CARD_METRICS = ("score", "no at-fault collision")
+CARD_SELECTIONS = ("most-probable", "best-of-3")
 ASSETS = files("asp_env.evaluation.report") / "assets"
 SCRIPTS = ("draw.js", "pictures.js", "replay.js", "page.js")
 
@@ -193,7 +193,7 @@ def _markup(text: str) -> Any:
 def _forecast_cards(results: Sequence[Result]) -> Iterator[Card]:
     """FDE of the best predictor beside constant velocity, for each selection of modes."""
     subset = _first_subset(results, "moving", "all")
-    for selection in SELECTIONS:
+    for selection in CARD_SELECTIONS:
         comparable = [
             r for r in results if (r.subset, r.selection) == (subset, selection) and r.at_s is None
         ]
@@ -226,7 +226,7 @@ def _beside_baseline(winner: Result, results: Sequence[Result]) -> str:
 def _driving_cards(results: Sequence[Result]) -> Iterator[Card]:
     """The best method beside the expert, for each of the main metrics."""
     subset = _first_subset(results, "all")
-    for metric in DRIVING_METRICS:
+    for metric in CARD_METRICS:
         note = metric_note(metric)
         column = [r for r in results if (r.subset, r.metric) == (subset, metric)]
         winner = best_result(column, better=note.better)
