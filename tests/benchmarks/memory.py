@@ -29,8 +29,8 @@ def resident_mib() -> float:
     return peak / (2**20 if sys.platform == "darwin" else 2**10)
 
 
-def single_memory(data: str, *, resets: int, steps: int) -> list[float]:
-    """Memory after each tenth of the resets; the steps are divided evenly among the resets."""
+def drive_one(data: str, *, resets: int, steps: int) -> list[float]:
+    """Memory after each tenth of the resets of one environment, MiB; the resets share the steps."""
     env = ReplayEnv(data, observations=OBSERVATIONS)
     rng = np.random.default_rng(0)
     env.reset(seed=0)
@@ -46,8 +46,8 @@ def single_memory(data: str, *, resets: int, steps: int) -> list[float]:
     return memory
 
 
-def batch_memory(data: str, *, count: int, steps: int) -> list[float]:
-    """Memory after each tenth of the steps, which are divided evenly among the environments."""
+def drive_many(data: str, *, count: int, steps: int) -> list[float]:
+    """Memory after each tenth of the steps of a batch, MiB; its environments share the steps."""
     envs = ReplayVectorEnv(count, data, observations=OBSERVATIONS)
     rng = np.random.default_rng(0)
     envs.reset(seed=0)
@@ -66,8 +66,8 @@ def main() -> None:
     parser.add_argument("--resets", type=int, default=2000)
     parser.add_argument("--steps", type=int, default=200_000)
     args = parser.parse_args()
-    single = single_memory(args.data, resets=args.resets, steps=args.steps)
-    batch = batch_memory(args.data, count=64, steps=args.steps)
+    single = drive_one(args.data, resets=args.resets, steps=args.steps)
+    batch = drive_many(args.data, count=64, steps=args.steps)
     for name, memory in (("one environment", single), ("batch of 64", batch)):
         row = ", ".join(f"{each:.1f}" for each in memory)
         sys.stdout.write(f"{name}: {row} MiB; growth {memory[-1] - memory[0]:.1f} MiB\n")
