@@ -306,7 +306,7 @@ METRIC_NOTES = {
         "No at-fault",
         "%",
         "higher",
-        "Share of episodes without a collision for which the rules find the ego at fault: with a "
+        "Share of episodes without a collision that is the ego's fault under the rules: with a "
         "standing agent, at the ego's front, or at its side where the rules say so. Collisions "
         "from behind or while the ego stands do not count.",
     ),
