@@ -17,7 +17,7 @@ from asp_env.data.snippets import Future
 from asp_env.data.source import Recordings
 from asp_env.envs.episodes import ReplayEpisodes, StepResult, valid_actions
 from asp_env.envs.options import ReplayOptions, suggest_options
-from asp_env.render.live import MODES, Live
+from asp_env.render.live import MODES, LiveRenderer
 from asp_env.sim.traffic.assignment import TrafficSpec
 from asp_env.sim.world import World, recorded_future
 
@@ -228,7 +228,7 @@ table of drivers; `log` by default, `own` in a world with reacting traffic |
         """The scenario, and the state of its generator at the start."""
         self._actions: list[Float[np.ndarray, " 2"]] = []
         self.metadata = {**METADATA, "render_fps": round(1 / dt_s, 6)}
-        self._live = Live(render_mode, title=f"asp-env: {data}", dt_s=dt_s)
+        self._live = LiveRenderer(render_mode, title=f"asp-env: {data}", dt_s=dt_s)
 
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
@@ -246,7 +246,7 @@ table of drivers; `log` by default, `own` in a world with reacting traffic |
         super().reset(seed=seed)
         self._begin(*self._episodes.draw(self.np_random, options or {}))
         self._running = True
-        self._live.forget()
+        self._live.clear_overlay()
         self._update_window()
         return self._observe(), self._info()
 
@@ -325,7 +325,7 @@ table of drivers; `log` by default, `own` in a world with reacting traffic |
         self.np_random.bit_generator.state = snapshot.generator
         self._np_random_seed = snapshot.seed
         self._running = snapshot.running
-        self._live.forget()
+        self._live.clear_overlay()
 
     def show(
         self, *, forecast: Forecast | None = None, plan: Shaped[np.ndarray, "..."] | None = None
