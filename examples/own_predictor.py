@@ -7,7 +7,7 @@ import numpy as np
 from asp_env.data.predictor import Forecast, fill_missing, make_forecast
 from asp_env.data.scene import Scene
 from asp_env.data.snippets import Future
-from asp_env.dynamics import MAX_ACCELERATION_MPS2, MAX_STEERING_RAD, rollout
+from asp_env.dynamics import normalize_actions, rollout
 from asp_env.envs.replay import ReplayEnv
 from asp_env.planning.sampling import SamplingPlanner
 
@@ -50,8 +50,7 @@ def main() -> float:
     while not done:
         scene = env.scene()
         plan = planner.plan(scene, fill_missing(predictor.predict(scene), scene))
-        action = plan.actions[0, 0] / [MAX_ACCELERATION_MPS2, MAX_STEERING_RAD]
-        _, _, terminated, truncated, info = env.step(action.astype(np.float32))
+        _, _, terminated, truncated, info = env.step(normalize_actions(plan.actions[0, 0]))
         done = terminated or truncated
     return info["progress"]
 

@@ -4,8 +4,10 @@ from asp_env.dynamics.bicycle import (
     MAX_ACCELERATION_MPS2,
     MAX_STEERING_RAD,
     clip_actions,
+    denormalize_actions,
     forward,
     inverse,
+    normalize_actions,
     rollout,
 )
 
@@ -13,7 +15,9 @@ __all__ = [
     "MAX_ACCELERATION_MPS2",
     "MAX_STEERING_RAD",
     "clip_actions",
+    "denormalize_actions",
     "forward",
     "inverse",
+    "normalize_actions",
     "rollout",
 ]

@@ -160,3 +160,29 @@ def clip_actions(actions: Float[Any, "*batch 2"]) -> Float[Any, "*batch 2"]:
     acceleration = xp.clip(actions[..., 0], -MAX_ACCELERATION_MPS2, MAX_ACCELERATION_MPS2)
     steering = xp.clip(actions[..., 1], -MAX_STEERING_RAD, MAX_STEERING_RAD)
     return xp.stack([acceleration, steering], axis=-1)
+
+
+_ACTION_LIMITS = (MAX_ACCELERATION_MPS2, MAX_STEERING_RAD)
+
+
+def normalize_actions(actions: Float[Any, "*batch 2"]) -> Float[Any, "*batch 2"]:
+    """Actions in the action space [-1, 1] of the environments, of the same type.
+
+    Args:
+        actions: [acceleration m/s², steering rad]. Actions beyond the limits are not clipped; the
+            environments do that.
+    """
+    if namespace(actions) is np:
+        return (actions / np.array(_ACTION_LIMITS)).astype(actions.dtype)
+    return actions / actions.new_tensor(_ACTION_LIMITS)
+
+
+def denormalize_actions(actions: Float[Any, "*batch 2"]) -> Float[Any, "*batch 2"]:
+    """Actions [acceleration m/s², steering rad]; the inverse of `normalize_actions`.
+
+    Args:
+        actions: in the action space [-1, 1] of the environments.
+    """
+    if namespace(actions) is np:
+        return actions * np.array(_ACTION_LIMITS, dtype=actions.dtype)
+    return actions * actions.new_tensor(_ACTION_LIMITS)

@@ -19,13 +19,13 @@ from asp_env.data.scenarios.scenario import Scenario, ScenarioFilter, ScenarioSe
 from asp_env.data.scenarios.selection import choose_scenarios, scenario_of
 from asp_env.data.snippets import HISTORY_S
 from asp_env.data.source import Recordings, open_data
-from asp_env.dynamics import MAX_ACCELERATION_MPS2, MAX_STEERING_RAD
+from asp_env.dynamics import denormalize_actions
 from asp_env.errors import AspEnvError, unknown_name
 from asp_env.sim.observation import Observation, Observer, ego_context
 from asp_env.sim.reward import reward_terms, weighted_sum, weights_from
 from asp_env.sim.simulation import Simulation, ending
 from asp_env.sim.traffic.assignment import TrafficSpec, make_traffic
-from asp_env.sim.world import Ending, Events, world_of
+from asp_env.sim.world import Ending, Events, world_class
 from asp_env.views import make_picture_view
 
 
@@ -58,7 +58,7 @@ class Buffers:
             if all(_references(self._held, number, name) == self._alone for name in arrays):
                 self._held.append(self._held.pop(number))
                 return dict(arrays)
-        fresh = self._observer.memory(self._count)
+        fresh = self._observer.allocate(self._count)
         self._held.append(fresh)
         del self._held[: -self._KEPT]
         return dict(fresh)
@@ -176,7 +176,6 @@ def _whole(name: str, value: Any) -> int:
     return int(value)
 
 
-_ACTION_LIMITS = np.array([MAX_ACCELERATION_MPS2, MAX_STEERING_RAD], dtype=np.float32)
 _TERMINAL = np.array([kind in (Ending.COLLISION, Ending.OFF_ROAD, Ending.GOAL) for kind in Ending])
 _ENDING_NAMES = np.array([kind.name for kind in Ending], dtype=object)
 
@@ -186,7 +185,7 @@ class ReplayOptions:
     """What can be chosen of a replay environment."""
 
     observations: Sequence[str] = ("raster", "actions", "state")
-    """Some of `asp_env.sim.observation.KNOWN`."""
+    """Some of `asp_env.sim.observation.OBSERVATION_NAMES`."""
     view: str = "chauffeurnet"
     """What the raster shows."""
     raster_px: tuple[int, int] | None = None
@@ -237,14 +236,14 @@ class ReplayEpisodes:
         self.scenarios = self._starts.scenarios
         raster = make_picture_view(chosen.view, pixels=chosen.raster_px)
         self.observer = Observer(chosen.observations, raster, history)
-        kind = world_of(data)
+        kind = world_class(data)
         self.simulation = Simulation(
             self.recordings,
             make_traffic(chosen.traffic, dt_s=chosen.dt_s, default=kind.traffic),
             num_episodes=num_episodes,
             dt_s=chosen.dt_s,
             history=history,
-            kind=kind,
+            world_class=kind,
         )
         self._weights = weights_from(chosen.reward_weights or {})
         self._names = np.full(num_episodes, None, dtype=object)
@@ -263,7 +262,7 @@ class ReplayEpisodes:
             num_episodes=num_episodes,
             dt_s=world.dt_s,
             history=world.history,
-            kind=type(world),
+            world_class=type(world),
         )
         self._names = np.full(num_episodes, None, dtype=object)
         self._tags = np.full(num_episodes, None, dtype=object)
@@ -311,8 +310,8 @@ class ReplayEpisodes:
         world, before = self.simulation.world, self.events
         assert before is not None
         states_before = world.ego_states()
-        driven = np.ones(len(world), dtype=bool)
-        self.simulation.step(actions * _ACTION_LIMITS, driven)
+        controlled = np.ones(len(world), dtype=bool)
+        self.simulation.step(denormalize_actions(actions), controlled)
         self.events = after = world.events()
         terms = reward_terms(before, after, states_before, world.ego_states(), world.dt_s)
         why = ending(after)

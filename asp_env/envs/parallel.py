@@ -18,13 +18,13 @@ from asp_env.data.classes import PREDICTED, AgentClass
 from asp_env.data.recording import Recording, frames_per_tick
 from asp_env.data.scenarios.scenario import Scenario, ScenarioSet
 from asp_env.data.scene import EGO, Scene
-from asp_env.dynamics import MAX_ACCELERATION_MPS2, MAX_STEERING_RAD
+from asp_env.dynamics import denormalize_actions
 from asp_env.envs.episodes import OPTIONS, ReplayEpisodes, StepResult, as_actions
 from asp_env.errors import AspEnvError, unknown_name
 from asp_env.render.frames import draw_frame
 from asp_env.sim.reward import MIN_GOAL_M
 from asp_env.sim.traffic import Control, Driver
-from asp_env.sim.traffic.driver import vehicles
+from asp_env.sim.traffic.driver import controllable_agents
 from asp_env.sim.world import World
 
 
@@ -132,7 +132,8 @@ class JointPolicyDriver:
         self._agents = _positions(here, here[:, EGO])
         self._slots = _positions(here, here[0])
         self.actions = np.zeros((len(tracks), 2), dtype=np.float32)
-        traffic = (vehicles(world) if agent_mask is None else agent_mask) & (self._agents < 0)
+        others = controllable_agents(world) if agent_mask is None else agent_mask
+        traffic = others & (self._agents < 0)
         traffic[1:] = False
         self._traffic.reset(world, reset_mask, traffic)
 
@@ -144,7 +145,7 @@ class JointPolicyDriver:
             actions=np.where(
                 agent[..., None], self.actions[self._agents], said.actions[0, self._slots]
             ),
-            driven=agent | (said.driven[0, self._slots] & known),
+            controlled=agent | (said.controlled[0, self._slots] & known),
             leaving=~agent & said.leaving[0, self._slots] & known,
         )
 
@@ -160,8 +161,6 @@ def _positions(
     same = (tracks[..., None] == known) & (tracks >= 0)[..., None]
     return np.where(same.any(axis=-1), same.argmax(axis=-1), -1)
 
-
-_LIMITS = np.array([MAX_ACCELERATION_MPS2, MAX_STEERING_RAD], dtype=np.float32)
 
 Observations = dict[str, dict[str, np.ndarray]]
 
@@ -288,7 +287,7 @@ class ParallelReplayEnv(ParallelEnv[str, dict[str, np.ndarray], Any]):
             given[self._numbers[name]] = as_actions(actions[name], (2,))
         driver = self._episodes.simulation.driver
         assert isinstance(driver, JointPolicyDriver)
-        driver.actions = given * _LIMITS
+        driver.actions = denormalize_actions(given)
         outcome = self._episodes.step(given)
         over = outcome.terminated | outcome.truncated
         returned = (
@@ -298,7 +297,7 @@ class ParallelReplayEnv(ParallelEnv[str, dict[str, np.ndarray], Any]):
             self._told(outcome.truncated),
             self._infos(outcome),
         )
-        self._episodes.simulation.world.episodes.gone |= driver.slots_of(over)
+        self._episodes.simulation.world.episodes.departed |= driver.slots_of(over)
         self.agents = [name for name in self.agents if not over[self._numbers[name]]]
         return returned
 

@@ -30,7 +30,7 @@ from rich.console import Console
 from rich.table import Table
 
 import asp_env
-from asp_env.dynamics import MAX_ACCELERATION_MPS2, MAX_STEERING_RAD, inverse
+from asp_env.dynamics import inverse, normalize_actions
 from scenarios.highway import world as highway_world
 from scenarios.highway.sites import SITES, STEP_S, Site
 
@@ -39,7 +39,6 @@ assert asp_env  # registers the environments
 TURN = 5
 """Steps from one laying of the vehicles to the next."""
 SUBSTEPS = 3
-LIMITS = np.array([MAX_ACCELERATION_MPS2, MAX_STEERING_RAD])
 CONTESTANTS = ("theirs", "bare", "ours")
 
 
@@ -172,7 +171,7 @@ class Ours:
         world = self._inner._episodes.simulation.world
         data, now = world.episodes, int(world.now[0])
         there, length = data.log_states[0, now + 1, 0], data.sizes[0, 0, 0]
-        needed = inverse(data.states[0, now, 0], there, length, world.dt_s) / LIMITS
+        needed = normalize_actions(inverse(data.states[0, now, 0], there, length, world.dt_s))
         return np.clip(needed, -1.0, 1.0).astype(np.float32)
 
     def close(self) -> None:

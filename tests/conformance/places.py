@@ -9,7 +9,7 @@ import pytest
 
 from asp_env.data.scenarios.scenario import Scenario, find_scenarios
 from asp_env.sim.simulation import Simulation
-from asp_env.sim.world import ReplayWorld, World, world_of
+from asp_env.sim.world import ReplayWorld, World, world_class
 from tests.builders import make_recording
 from tests.highway_folders import highway_data, highway_recordings, highway_scenarios
 from tests.sim.worlds import DT_S, HISTORY, TRAFFICS, scenario, simulate
@@ -76,7 +76,7 @@ def _replayed() -> Place:
 def _highway(site: str, scenarios: Sequence[Scenario], traffics: tuple[str, ...]) -> Place:
     return Place(
         data="highway",
-        kind=lambda: world_of(highway_data(site)),
+        kind=lambda: world_class(highway_data(site)),
         recordings=lambda: highway_recordings(site),
         scenarios=lambda: [*scenarios],
         found=lambda: list(highway_scenarios(site))[

@@ -16,8 +16,8 @@ from asp_env.errors import AspEnvError
 from asp_env.sim.simulation import Simulation
 from asp_env.sim.traffic import Driver, DriverPlug
 from asp_env.sim.traffic.assignment import make_traffic
-from asp_env.sim.traffic.driver import vehicles
-from asp_env.sim.world import ReplayWorld, World, world_of
+from asp_env.sim.traffic.driver import controllable_agents
+from asp_env.sim.world import ReplayWorld, World, world_class
 from tests.builders import make_recording
 from tests.highway_folders import highway_recordings
 from tests.sim.worlds import DT_S, HISTORY, scenario, simulate
@@ -73,7 +73,7 @@ def _highway() -> Stage:
             scenario(2, start=20, length=12),
             scenario(9, start=130, length=40, recording=1),
         ],
-        kind=world_of("highway:"),
+        kind=world_class("highway:"),
         steps=14,
     )
 
@@ -175,9 +175,9 @@ def test_a_driver_says_nothing_of_others(stage, traffic):
         assert control.actions.dtype == np.float32
         assert np.isfinite(control.actions).all()
         assert logged or (np.abs(control.actions) <= limits).all()
-        assert not control.actions[~control.driven & ~control.leaving].any()
-        assert not (control.driven & control.leaving).any()
-        assert not ((control.driven | control.leaving) & ~vehicles(world)).any()
+        assert not control.actions[~control.controlled & ~control.leaving].any()
+        assert not (control.controlled & control.leaving).any()
+        assert not ((control.controlled | control.leaving) & ~controllable_agents(world)).any()
         _step(simulation, tick, [0, 1, 2, 3])
     assert np.isfinite(world.episodes.states).all()
 

@@ -10,7 +10,7 @@ from stable_baselines3.common.env_checker import check_env as check_env_sb3
 
 import asp_env
 from asp_env.envs.replay import ReplayEnv
-from asp_env.sim.observation import KNOWN
+from asp_env.sim.observation import OBSERVATION_NAMES
 
 KINDS = ("raster", "vectors", "actions", "state", "route")
 SUBSETS = [names for n in range(1, 6) for names in itertools.combinations(KINDS, n)]
@@ -54,7 +54,7 @@ def test_the_spaces_are_those_of_the_contract(crossing):
     assert set(np.unique(obs["raster"])) == {0, 255}
 
 
-@pytest.mark.parametrize("name", KNOWN)
+@pytest.mark.parametrize("name", OBSERVATION_NAMES)
 def test_all_that_is_seen_is_finite_and_within_finite_bounds(crossing, name):
     """Through wild drives far off the road, alone or beside the raster."""
     env = ReplayEnv(crossing, observations=(name,))

@@ -5,7 +5,7 @@ import pytest
 
 from asp_env.data.classes import AgentClass
 from asp_env.planning.idm import DESIRED_MPS
-from asp_env.planning.sampling import SamplingPlanner, Weights
+from asp_env.planning.sampling import SamplingPlanner, SamplingWeights
 from tests.builders import DRIVES, Drive, make_recording
 from tests.planning.situations import (
     STEPS,
@@ -188,6 +188,6 @@ def test_weights_decide():
     """Without any weight on touching or closeness it drives on into the standing car."""
     scene = approach(car(-40.0, 0.0)).world.scene()
     forecast = straight_on(scene)
-    careless = SamplingPlanner(Weights(collision=0.0, closeness=0.0))
+    careless = SamplingPlanner(SamplingWeights(collision=0.0, closeness=0.0))
     assert _gain(careless.plan(scene, forecast).states[0]) > 25
     assert _gain(SamplingPlanner().plan(scene, forecast).states[0]) < 20

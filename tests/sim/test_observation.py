@@ -91,7 +91,7 @@ def test_wild_values_are_clipped_to_the_bounds():
     simulation = simulate(on_road(), scenario())
     world = simulation.world
     world.episodes.states[0, HISTORY, 0] = (900.0, -95.0, np.pi / 2, 90.0)
-    world.episodes.inferred[0] -= 1
+    world.episodes.num_actions[0] -= 1
     world.episodes.on_route[0] = (-900.0, -890.0, 0.0)
     observer = Observer(("actions", "state"), VIEW, HISTORY)
     observed = observer.observe(ego_context(world), world.events())

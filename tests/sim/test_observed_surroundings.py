@@ -114,7 +114,7 @@ def test_the_former_content_of_memory_does_not_matter():
     world = simulation.world
     observer = Observer(("vectors", "raster", "actions", "state", "route"), VIEW, HISTORY)
     fresh = observer.observe(ego_context(world), world.events())
-    memory = observer.memory(2)
+    memory = observer.allocate(2)
     for part in memory.values():
         part.view(np.uint8)[:] = 127
     told = observer.observe(ego_context(world), world.events(), memory)

@@ -68,7 +68,7 @@ def simulate(
         num_episodes=len(scenarios),
         dt_s=DT_S,
         history=HISTORY,
-        kind=kind,
+        world_class=kind,
     )
     simulation.reset(scenarios, [np.random.default_rng(each.seed) for each in scenarios])
     return simulation

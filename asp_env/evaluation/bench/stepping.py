@@ -168,12 +168,12 @@ def simulated(
     reset_s = median_s(lambda: simulation.reset(scenarios, generators))
     start = simulation.snapshot()
     actions = np.zeros((count, 2), dtype=np.float32)
-    driven = np.ones(count, dtype=bool)
+    controlled = np.ones(count, dtype=bool)
     steps = min(scenario.length for scenario in scenarios)
 
     def drive() -> None:
         for _ in range(steps):
-            simulation.step(actions, driven)
+            simulation.step(actions, controlled)
             simulation.world.events()
 
     step_s = median_s(drive, prepare=lambda: simulation.restore(start))

@@ -6,7 +6,7 @@ import pytest
 from asp_env.data.source import open_data
 from asp_env.dynamics.car_following import IDM, speed_limits
 from asp_env.geometry import route_along
-from asp_env.sim.episodes import BEYOND_M
+from asp_env.sim.episodes import ROUTE_EXTENSION_M
 from asp_env.sim.traffic.paths import Paths
 from tests.builders import make_recording
 from tests.real_data import real_data
@@ -32,9 +32,9 @@ def test_every_path_is_the_route_of_its_track(source):
     for number, recording in enumerate(recordings):
         base = paths.base(recordings, number)
         for track in range(len(recording)):
-            route = route_along(recording.track(track), beyond_m=BEYOND_M)
+            route = route_along(recording.track(track), beyond_m=ROUTE_EXTENSION_M)
             assert _path(paths, base + track)[:, :2] == pytest.approx(route, abs=1e-3)
-            assert paths.ends[base + track] == len(route) - 1 - BEYOND_M
+            assert paths.ends[base + track] == len(route) - 1 - ROUTE_EXTENSION_M
 
 
 def test_a_recording_is_laid_once():

@@ -8,7 +8,7 @@ from hypothesis import strategies as st
 from asp_env.data.classes import AgentClass
 from asp_env.geometry import overlaps
 from asp_env.sim.traffic.idm import IDMDriver, advance, arrival_s
-from asp_env.sim.traffic.paths import A_FIRST, IN_A, IN_B, IN_FILE, OUT_A, OUT_B
+from asp_env.sim.traffic.paths import A_FIRST, ENTRY_A, ENTRY_B, EXIT_A, EXIT_B, SAME_DIRECTION
 from tests.builders import Drive
 from tests.sim.worlds import car, now, on_road, replay, scenario, simulate
 
@@ -73,8 +73,8 @@ def test_the_zone_of_two_crossing_paths_by_hand():
         if other == 2
     ]
     zone = found[0]
-    assert zone[[IN_A, OUT_A, IN_B, OUT_B]].tolist() == [49, 54, 35, 41]
-    assert zone[IN_FILE] == 0
+    assert zone[[ENTRY_A, EXIT_A, ENTRY_B, EXIT_B]].tolist() == [49, 54, 35, 41]
+    assert zone[SAME_DIRECTION] == 0
     assert zone[A_FIRST] == 1
 
 

@@ -7,7 +7,7 @@ from asp_env.data.classes import AgentClass
 from asp_env.errors import AspEnvError
 from asp_env.sim.traffic import Control, Driver
 from asp_env.sim.traffic.assignment import Traffic, make_traffic
-from asp_env.sim.traffic.driver import no_control, vehicles
+from asp_env.sim.traffic.driver import controllable_agents, no_control
 from asp_env.sim.traffic.log import LogActionsDriver, LogDriver
 from tests.builders import Drive, make_recording
 from tests.sim.worlds import car, now, on_road, replay, scenario, simulate
@@ -172,4 +172,4 @@ def test_agents_of_the_caller_go_straight_on_where_it_is_silent():
 def test_vehicles_are_what_can_be_driven():
     """Cars, a van, a truck, a motorcycle and a bicycle; not the ego, walkers and the parked."""
     world = simulate(make_recording(), scenario(1, start=25)).world
-    assert sorted(world.episodes.ids[vehicles(world)].tolist()) == [2, 3, 4, 5, 6, 7, 9]
+    assert sorted(world.episodes.ids[controllable_agents(world)].tolist()) == [2, 3, 4, 5, 6, 7, 9]
