@@ -13,7 +13,7 @@ from asp_env.dynamics import MAX_ACCELERATION_MPS2, MAX_STEERING_RAD, rollout
 from asp_env.errors import AspEnvError
 from asp_env.planning.planner import Plan, Planner, load_planner
 from tests.builders import make_recording
-from tests.planning.situations import STEPS, straight_on
+from tests.planning.situations import STEPS, straight_ahead
 from tests.sim.worlds import drive, scenario, simulate
 
 PLANNERS = [name for name in registry.names("planners") if not load_planner(name).privileged]
@@ -66,13 +66,13 @@ def test_is_a_planner(name):
 def test_privileged_planners_are_never_asked(name, scene):
     """Whoever follows the log is not given one, and refuses to plan in one line."""
     with pytest.raises(AspEnvError, match="does not plan"):
-        load_planner(name).plan(scene, straight_on(scene))
+        load_planner(name).plan(scene, straight_ahead(scene))
 
 
 @pytest.mark.parametrize("name", PLANNERS)
 def test_plans_are_finite_and_within_limits(name, scene):
     """A plan for every situation over the forecast's ticks; ±5 m/s² and ±π/4."""
-    plan = load_planner(name).plan(scene, straight_on(scene))
+    plan = load_planner(name).plan(scene, straight_ahead(scene))
     assert plan.actions.shape == (4, STEPS, 2)
     assert plan.states.shape == (4, STEPS, 4)
     assert np.isfinite(plan.actions).all()
@@ -84,7 +84,7 @@ def test_plans_are_finite_and_within_limits(name, scene):
 @pytest.mark.parametrize("name", PLANNERS)
 def test_states_are_what_the_actions_lead_to(name, scene):
     """The bicycle model makes the planned states of the planned actions, to 1 mm."""
-    plan = load_planner(name).plan(scene, straight_on(scene))
+    plan = load_planner(name).plan(scene, straight_ahead(scene))
     made = rollout(scene.states[:, 0, -1], plan.actions, scene.sizes[:, 0, 0], scene.dt_s)
     assert plan.states[..., :2] == pytest.approx(made[..., :2], abs=1e-3)
     assert plan.states[..., 3] == pytest.approx(made[..., 3], abs=1e-3)
@@ -94,14 +94,14 @@ def test_states_are_what_the_actions_lead_to(name, scene):
 def test_situations_do_not_know_of_each_other(name, scene):
     """Four at once are bit for bit the four alone, whatever the planner was asked before."""
     planner = load_planner(name)
-    together = planner.plan(scene, straight_on(scene))
+    together = planner.plan(scene, straight_ahead(scene))
     for b in range(len(scene.tick)):
         alone = _situation(scene, b)
         for asked in (planner, load_planner(name)):
-            single = asked.plan(alone, straight_on(alone))
+            single = asked.plan(alone, straight_ahead(alone))
             assert single.actions.tobytes() == together.actions[b : b + 1].tobytes()
             assert single.states.tobytes() == together.states[b : b + 1].tobytes()
-    assert _equal(planner.plan(scene, straight_on(scene)), together)
+    assert _equal(planner.plan(scene, straight_ahead(scene)), together)
 
 
 @pytest.mark.parametrize("name", PLANNERS)
@@ -119,7 +119,7 @@ def test_the_order_of_slots_does_not_matter(name, scene):
         targets=np.stack([scene.targets[:, 0], place[scene.targets[:, 1]]], axis=-1)[::-1],
     )
     planner = load_planner(name)
-    first, second = (planner.plan(each, straight_on(each)) for each in (scene, turned))
+    first, second = (planner.plan(each, straight_ahead(each)) for each in (scene, turned))
     assert second.actions == pytest.approx(first.actions, abs=1e-6)
     assert second.states == pytest.approx(first.states, abs=1e-4)
 
@@ -135,14 +135,14 @@ def test_the_absent_do_not_matter(name, scene):
     haunted = dataclasses.replace(scene, states=states, sizes=sizes)
     planner = load_planner(name)
     assert _equal(
-        planner.plan(haunted, straight_on(haunted)), planner.plan(scene, straight_on(scene))
+        planner.plan(haunted, straight_ahead(haunted)), planner.plan(scene, straight_ahead(scene))
     )
 
 
 @pytest.mark.parametrize("name", PLANNERS)
 def test_arguments_are_not_written_to(name, scene):
     """Scene and forecast are as they were, down to the bit."""
-    forecast = straight_on(scene)
+    forecast = straight_ahead(scene)
     before = _bits(scene) | _bits(forecast)
     load_planner(name).plan(scene, forecast)
     assert _bits(scene) | _bits(forecast) == before
@@ -151,7 +151,7 @@ def test_arguments_are_not_written_to(name, scene):
 @pytest.mark.parametrize("name", PLANNERS)
 def test_says_whether_forecasts_matter(name, scene):
     """One that uses no forecasts plans the same with everybody forecast 12 m ahead of the ego."""
-    forecast = straight_on(scene)
+    forecast = straight_ahead(scene)
     wild = dataclasses.replace(forecast, states=forecast.states.copy())
     blocked = scene.states[scene.targets[:, 0], 0, -1]
     blocked[:, :2] += 12 * np.stack([np.cos(blocked[:, 2]), np.sin(blocked[:, 2])], axis=-1)
@@ -168,7 +168,7 @@ def test_a_scene_without_a_route_is_refused(name):
     index = index_snippets(recordings, dt_s=0.2, horizon_s=3.0)
     scene = gather_scene(recordings, index.select(np.arange(3)))
     with pytest.raises(AspEnvError, match="route"):
-        load_planner(name).plan(scene, straight_on(scene))
+        load_planner(name).plan(scene, straight_ahead(scene))
 
 
 @pytest.mark.parametrize("name", PLANNERS)
@@ -178,7 +178,7 @@ def test_nobody_around_is_fine(name, scene):
     valid = scene.valid.copy()
     valid[:, 1:] = False
     empty = dataclasses.replace(nobody, valid=valid)
-    plan = load_planner(name).plan(empty, straight_on(empty))
+    plan = load_planner(name).plan(empty, straight_ahead(empty))
     assert np.isfinite(plan.states).all()
 
 
