@@ -37,7 +37,8 @@ def test_round_trip(dtype, acceleration, steering):
     actions = np.array([acceleration, steering], dtype=dtype)
     back = denormalize_actions(normalize_actions(actions))
     assert back.dtype == dtype
-    assert back == pytest.approx(actions, rel=4 * np.finfo(dtype).eps, abs=1e-40)
+    precision = np.finfo(dtype)
+    np.testing.assert_allclose(back, actions, rtol=4 * precision.eps, atol=precision.tiny)
 
 
 @given(actions=st.lists(st.tuples(st.floats(-1, 1), st.floats(-1, 1)), min_size=1, max_size=5))
