@@ -258,7 +258,7 @@ def _first_contact(plan, size, other, other_size, margin):
 
 @njit(cache=True)
 @no_type_check
-def _rate(plans, sizes, others, probabilities, other_sizes, starts, collision, closeness):
+def _rate(plans, sizes, agents, probabilities, agent_sizes, starts, collision, closeness):
     """Writes the probability of each candidate to touch any agent, without and with margins.
 
     A contact at the last step counts half as much as one at the first.
@@ -266,9 +266,9 @@ def _rate(plans, sizes, others, probabilities, other_sizes, starts, collision, c
     Args:
         plans: (B, C, T, 4) states of the candidates [x m, y m, heading rad, speed m/s].
         sizes: (B, 2) lengths and widths of the egos, m.
-        others: (N, M, T, 4) forecast states of the other agents, sorted by situation.
+        agents: (N, M, T, 4) forecast states of the other agents, sorted by situation.
         probabilities: (N, M) of their modes.
-        other_sizes: (N, 2) their lengths and widths, m.
+        agent_sizes: (N, 2) their lengths and widths, m.
         starts: (B + 1,) the agents of situation b are `starts[b]:starts[b + 1]`.
         collision: (B, C), written.
         closeness: (B, C), written.
@@ -279,8 +279,8 @@ def _rate(plans, sizes, others, probabilities, other_sizes, starts, collision, c
             no_collision, no_closeness = 1.0, 1.0
             for n in range(starts[b], starts[b + 1]):
                 hit, near = 0.0, 0.0
-                for m in range(others.shape[1]):
-                    p, other, size_o = probabilities[n, m], others[n, m], other_sizes[n]
+                for m in range(agents.shape[1]):
+                    p, other, size_o = probabilities[n, m], agents[n, m], agent_sizes[n]
                     step = _first_contact(plans[b, c], sizes[b], other, size_o, MARGIN_M)
                     if step == NO_CONTACT:
                         continue

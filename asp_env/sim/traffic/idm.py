@@ -225,7 +225,7 @@ def spawn_blocked(world: World, agent_mask: Bool[np.ndarray, "b a"]) -> Bool[np.
     """Mask of agents that would appear at the next tick, but whose recorded place is blocked.
 
     It is blocked if an agent is there, or if the vehicle could not stop behind a slower agent ahead
-    with 5 m/s². Such a vehicle never appears: later its recorded positions are amid the traffic.
+    with 5 m/s². Such a vehicle never appears: later its recorded positions are among the traffic.
 
     Args:
         world: the world with all episodes.

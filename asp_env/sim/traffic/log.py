@@ -155,7 +155,7 @@ def _recorded_control(
 
 
 class PolicyDriver(BaseDriver):
-    """Reserves its agents for the caller, who controls them by `Simulation.step_agents`.
+    """Reserves its agents for the caller of `Simulation.step_agents`.
 
     An agent that the caller does not control at a tick continues without acceleration or steering.
     It leaves 10 m outside the area of all recorded positions.
