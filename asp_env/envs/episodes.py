@@ -26,7 +26,7 @@ from asp_env.sim.observation import Observation, Observer, ego_context
 from asp_env.sim.reward import reward_terms, weighted_sum, weights_from
 from asp_env.sim.simulation import Simulation, ending
 from asp_env.sim.traffic.assignment import make_traffic
-from asp_env.sim.world import Ending, Events, world_of
+from asp_env.sim.world import Ending, Events, world_class
 from asp_env.views import make_picture_view
 
 RESET_OPTIONS = ("scenario", "start_tick", "ego")
@@ -191,14 +191,14 @@ class ReplayEpisodes:
         self.scenarios = self._sampler.scenarios
         raster = make_picture_view(options.view, pixels=options.raster_px)
         self.observer = Observer(options.observations, raster, history)
-        kind = world_of(data)
+        kind = world_class(data)
         self.simulation = Simulation(
             self.recordings,
             make_traffic(options.traffic, dt_s=options.dt_s, default=kind.traffic),
             num_episodes=num_episodes,
             dt_s=options.dt_s,
             history=history,
-            kind=kind,
+            world_class=kind,
         )
         self._weights = weights_from(options.reward_weights or {})
         self._names = np.full(num_episodes, None, dtype=object)
@@ -217,7 +217,7 @@ class ReplayEpisodes:
             num_episodes=num_episodes,
             dt_s=world.dt_s,
             history=world.history,
-            kind=type(world),
+            world_class=type(world),
         )
         self._names = np.full(num_episodes, None, dtype=object)
         self._tags = np.full(num_episodes, None, dtype=object)
@@ -380,7 +380,7 @@ class ObservationBuffers:
             ):
                 self._buffers.append(self._buffers.pop(number))
                 return dict(arrays)
-        fresh = self._observer.memory(self._count)
+        fresh = self._observer.allocate(self._count)
         self._buffers.append(fresh)
         del self._buffers[: -self._MAX_BUFFERS]
         return dict(fresh)

@@ -28,7 +28,7 @@ from asp_env.render.frames import draw_frame
 from asp_env.sim.reward import MIN_GOAL_M
 from asp_env.sim.traffic import Control, Driver
 from asp_env.sim.traffic.assignment import TrafficSpec
-from asp_env.sim.traffic.driver import vehicles
+from asp_env.sim.traffic.driver import controllable_agents
 from asp_env.sim.world import World
 
 
@@ -152,7 +152,8 @@ class JointPolicyDriver:
         self._agent_index = _match(tracks, tracks[:, EGO])
         self._slots = _match(tracks, tracks[0])
         self.actions = np.zeros((len(tracks), 2), dtype=np.float32)
-        traffic = (vehicles(world) if agent_mask is None else agent_mask) & (self._agent_index < 0)
+        others = controllable_agents(world) if agent_mask is None else agent_mask
+        traffic = others & (self._agent_index < 0)
         traffic[1:] = False
         self._traffic.reset(world, reset_mask, traffic)
 
@@ -166,7 +167,7 @@ class JointPolicyDriver:
                 self.actions[self._agent_index],
                 control.actions[0, self._slots],
             ),
-            driven=is_agent | (control.driven[0, self._slots] & in_row_0),
+            controlled=is_agent | (control.controlled[0, self._slots] & in_row_0),
             leaving=~is_agent & control.leaving[0, self._slots] & in_row_0,
         )
 
@@ -353,7 +354,7 @@ all |
             self._by_agent(result.truncated),
             self._infos(result),
         )
-        self._episodes.simulation.world.episodes.gone |= driver.slots_of(over)
+        self._episodes.simulation.world.episodes.departed |= driver.slots_of(over)
         self.agents = [name for name in self.agents if not over[self._rows[name]]]
         return returned
 

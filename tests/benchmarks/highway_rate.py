@@ -31,7 +31,7 @@ from rich.console import Console
 from rich.table import Table
 
 import asp_env
-from asp_env.dynamics import MAX_ACCELERATION_MPS2, MAX_STEERING_RAD, inverse
+from asp_env.dynamics import inverse, normalize_actions
 from scenarios.highway import world as highway_world
 from scenarios.highway.sites import SITES, STEP_S, Site
 
@@ -40,7 +40,6 @@ assert asp_env  # registers the environments
 TURN = 5
 """Steps between two copies of the vehicles."""
 SUBSTEPS = 3
-LIMITS = np.array([MAX_ACCELERATION_MPS2, MAX_STEERING_RAD])
 IMPLEMENTATIONS = ("highway-env", "road", "asp-env")
 
 
@@ -171,7 +170,7 @@ class AspEnv:
         world = self._inner._episodes.simulation.world
         data, now = world.episodes, int(world.now[0])
         target, length = data.log_states[0, now + 1, 0], data.sizes[0, 0, 0]
-        action = inverse(data.states[0, now, 0], target, length, world.dt_s) / LIMITS
+        action = normalize_actions(inverse(data.states[0, now, 0], target, length, world.dt_s))
         return np.clip(action, -1.0, 1.0).astype(np.float32)
 
     def close(self) -> None:

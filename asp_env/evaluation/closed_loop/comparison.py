@@ -22,7 +22,7 @@ from asp_env.metrics.driving.scores import driving_metrics
 from asp_env.metrics.masked import Masked
 from asp_env.planning.planner import Planner, load_planner
 from asp_env.sim.traffic.assignment import make_traffic
-from asp_env.sim.world import Ending, world_of
+from asp_env.sim.world import Ending, world_class
 
 EPISODES_AT_ONCE = 16
 """A second or a few of work, so that processes end together; more at once saves no time."""
@@ -85,7 +85,7 @@ class Methods:
             AspEnvError: something is unknown, cannot be loaded, or does not fit.
         """
         self._names = (data, planner, predictors, traffic, metrics, horizon_s, dt_s)
-        self._kind = world_of(data)
+        self._kind = world_class(data)
         self._traffic = make_traffic(traffic, dt_s=dt_s, default=self._kind.traffic)
         self.preset: Rules = find_rules(metrics)
         self.dt_s = dt_s

@@ -37,7 +37,7 @@ from asp_env.evaluation.tables import driving_table
 from asp_env.files import atomic_folder
 from asp_env.metrics.driving.rules import DEFAULT_PRESET, RULES, Rules
 from asp_env.metrics.masked import Masked
-from asp_env.sim.world import world_of
+from asp_env.sim.world import world_class
 from asp_env.workers import WorkerPool, worker_pool
 
 REFERENCE = "constant-velocity"
@@ -117,7 +117,7 @@ def drive(config: Drive) -> ClosedLoop:
     """
     if config.jobs < 1:
         raise AspEnvError(f"--jobs {config.jobs}: expected at least 1 process")
-    config = replace(config, traffic=config.traffic or world_of(config.data).traffic)
+    config = replace(config, traffic=config.traffic or world_class(config.data).traffic)
     entrants = Methods(  # refused before anything is computed
         config.data, config.planner, config.predictors, config.traffic, config.rules,
         config.horizon, config.dt,

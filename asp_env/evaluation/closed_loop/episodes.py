@@ -119,7 +119,7 @@ def drive_episodes(
         num_episodes=len(scenarios),
         dt_s=dt_s,
         history=history,
-        kind=kind,
+        world_class=kind,
     )
     world = simulation.world
     generators = [np.random.default_rng(scenario.seed) for scenario in scenarios]

@@ -61,7 +61,7 @@ def test_a_damaged_folder_is_told_in_one_line(tmp_path, capsys):
     """Unknown DATA, and drivers that need a replay: status 2."""
     for options, what in (
         (["highway:nowhere"], "unknown highway site or folder 'nowhere'"),
-        ([highway_data("roundabout"), "--traffic", "log"], "in this world nobody replays a log"),
+        ([highway_data("roundabout"), "--traffic", "log"], "this world replays no tracks"),
         ([highway_data("roundabout"), "--dt", "0.3333333333"], "multiple of that"),
     ):
         out = tmp_path / "out"

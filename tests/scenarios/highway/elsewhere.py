@@ -11,7 +11,7 @@ import numpy as np
 from asp_env.data.source import Recordings, open_data
 from asp_env.sim.simulation import Simulation
 from asp_env.sim.traffic.assignment import make_traffic
-from asp_env.sim.world import world_of
+from asp_env.sim.world import world_class
 from tests.sim.worlds import DT_S, HISTORY
 
 
@@ -23,7 +23,7 @@ def open_world(recordings: Recordings, episodes: int) -> Simulation:
         num_episodes=episodes,
         dt_s=DT_S,
         history=HISTORY,
-        kind=world_of("highway:"),
+        world_class=world_class("highway:"),
     )
 
 

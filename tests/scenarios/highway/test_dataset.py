@@ -18,7 +18,7 @@ from asp_env.cli import main
 from asp_env.data.scenarios.scenario import find_scenarios
 from asp_env.data.source import open_data
 from asp_env.errors import AspEnvError, DataError
-from asp_env.sim.world import world_of
+from asp_env.sim.world import world_class
 from scenarios.highway import dataset
 from scenarios.highway.rounds import hidden_path, load_history
 from tests.highway_folders import SITE_NAMES, highway_data, highway_folder, highway_recordings
@@ -214,7 +214,7 @@ def test_foreign_data_are_refused(short, tmp_path):
     with pytest.raises(AspEnvError, match=r"^highway:[^\n]*hidden is missing[^\n]*replayed[^\n]*$"):
         open_data(f"highway:{tmp_path / 'copy'}")
     with pytest.raises(AspEnvError, match=r"^recordings in memory: expected those of `highway:…`$"):
-        world_of("highway:")(list(open_data(short)), num_episodes=1, dt_s=DT_S, history=HISTORY)
+        world_class("highway:")(list(open_data(short)), num_episodes=1, dt_s=DT_S, history=HISTORY)
 
 
 def test_the_source_is_made_once(tmp_path, monkeypatch):
@@ -247,7 +247,7 @@ def test_with_noise_episodes_hold_the_true_states(short, tmp_path):
     for folder in (short, out):
         recordings = open_data(f"highway:{folder}")
         found = list(find_scenarios(recordings, source="", dt_s=DT_S, history=HISTORY))
-        simulation = simulate(recordings, found, "own", world_of("highway:"))
+        simulation = simulate(recordings, found, "own", world_class("highway:"))
         replay(simulation, max(each.length for each in found))
         runs.append(simulation.world)
     one, other = runs[0].episodes, runs[1].episodes
@@ -261,7 +261,7 @@ def test_with_noise_episodes_hold_the_true_states(short, tmp_path):
 def test_a_recording_can_be_replayed_as_any_other():
     """The folder without the scheme is a recording in which no agent reacts."""
     folder = str(highway_folder("intersection"))
-    assert world_of(folder).traffic == "log"
+    assert world_class(folder).traffic == "log"
     simulation = simulate(open_data(folder), scenario(18, start=150, length=10))
     replay(simulation, 10)
     episodes = simulation.world.episodes

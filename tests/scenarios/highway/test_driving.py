@@ -9,7 +9,7 @@ from asp_env.dynamics.bicycle import AXLE_SHARE_OF_LENGTH
 from asp_env.errors import AspEnvError
 from asp_env.geometry import wrap_angle
 from asp_env.sim.simulation import Simulation
-from asp_env.sim.world import ReplayWorld, World, world_of
+from asp_env.sim.world import ReplayWorld, World, world_class
 from scenarios.highway.sites import SITES, empty_road, network
 from scenarios.highway.world import APART_M, HighwayWorld
 from tests.envs.same import same
@@ -31,7 +31,7 @@ FOLLOWED = scenario(11, start=55, length=40)
 
 def begin(site: str, scenarios: list[Scenario] | Scenario, traffic: str = "own") -> Simulation:
     """Episodes that have just begun."""
-    return simulate(highway_recordings(site), scenarios, traffic, world_of("highway:"))
+    return simulate(highway_recordings(site), scenarios, traffic, world_class("highway:"))
 
 
 def step(world: HighwayWorld | ReplayWorld, driven: np.ndarray, tick: int) -> None:
@@ -261,5 +261,5 @@ def test_agents_without_a_driver_are_left_to_the_world():
     twin.reset(options={"scenario": 11})
     for _ in range(5):
         same(env.step(np.zeros(2)), twin.step(np.zeros(2)))
-    with pytest.raises(AspEnvError, match="in this world nobody replays a log"):
+    with pytest.raises(AspEnvError, match="this world replays no tracks"):
         make(highway_data("intersection"), traffic="log").reset(seed=0)

@@ -7,10 +7,10 @@ import pytest
 from highway_env.vehicle.kinematics import Vehicle
 
 from asp_env.data.scenarios.scenario import Scenario
-from asp_env.dynamics import MAX_ACCELERATION_MPS2, MAX_STEERING_RAD, forward, inverse
+from asp_env.dynamics import forward, inverse, normalize_actions
 from asp_env.dynamics.bicycle import AXLE_SHARE_OF_LENGTH
 from asp_env.geometry import to_frame, wrap_angle
-from asp_env.sim.world import world_of
+from asp_env.sim.world import world_class
 from asp_env.views import make_picture_view
 from scenarios.highway.road_map import mirror_actions, mirror_states
 from scenarios.highway.rounds import hidden_path, load_history
@@ -21,7 +21,6 @@ from tests.scenarios.highway.environments import ego, make
 from tests.sim.worlds import drive, replay, simulate
 
 STEP_S, FRAMES = 1 / 15, 3
-LIMITS = np.array([MAX_ACCELERATION_MPS2, MAX_STEERING_RAD])
 TRAIL = 2
 """Channel of the picture."""
 
@@ -88,7 +87,7 @@ def test_a_turn_is_seen_to_go_its_way(tag, side):
     recording = highway_recordings("intersection")[scenario.recording]
     log = recording.track(scenario.ego_id)[::FRAMES].astype(np.float64)
     start = scenario.start_tick - recording.first_frames[scenario.ego_id] // FRAMES
-    acts = inverse(log[:-1], log[1:], np.array(Vehicle.LENGTH), 0.2) / LIMITS
+    acts = normalize_actions(inverse(log[:-1], log[1:], np.array(Vehicle.LENGTH), 0.2))
     env = make(
         highway_data("intersection"), observations=("raster", "actions", "route"), traffic="own"
     )
@@ -128,7 +127,9 @@ def test_an_observed_vehicle_turns_the_same_way(tag, side):
         and abs(each.start_tick - turner.start_tick) < 10
         and each.length > 50
     )
-    simulation = simulate(highway_recordings("intersection"), scenario, "own", world_of("highway:"))
+    simulation = simulate(
+        highway_recordings("intersection"), scenario, "own", world_class("highway:")
+    )
     view, steering, heading, trail = make_picture_view("chauffeurnet"), [], [], []
     for _ in range(scenario.length):
         scene = simulation.world.scene()
@@ -150,7 +151,9 @@ def test_an_observed_vehicle_turns_the_same_way(tag, side):
 def test_steering_turns_the_body_that_other_vehicles_see(side):
     """Left is positive: the heading grows here, falls in highway-env, and the box turns left."""
     scenario = highway_scenarios("intersection")[4]
-    simulation = simulate(highway_recordings("intersection"), scenario, "own", world_of("highway:"))
+    simulation = simulate(
+        highway_recordings("intersection"), scenario, "own", world_class("highway:")
+    )
     first = simulation.world.ego_states()[0].copy()
     drive(simulation, [(0.0, side * 0.25)] * 4)
     scene = simulation.world.scene()

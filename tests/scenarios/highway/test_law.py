@@ -8,7 +8,7 @@ from highway_env.vehicle.behavior import IDMVehicle
 
 from asp_env.data.scenarios.scenario import Scenario, find_scenarios
 from asp_env.geometry import wrap_angle
-from asp_env.sim.world import world_of
+from asp_env.sim.world import world_class
 from scenarios.highway.rounds import step_road
 from scenarios.highway.sites import (
     SITES,
@@ -26,7 +26,7 @@ every_site = pytest.mark.parametrize("site", SITE_NAMES)
 
 def warm_starts_from_3s(site: str, scenarios: list[Scenario], dt_s: float, history: int) -> int:
     """Leaves episodes to themselves and compares them with the log; how many states of it."""
-    recordings, kind = highway_recordings(site), world_of("highway:")
+    recordings, kind = highway_recordings(site), world_class("highway:")
     count = len(scenarios)
     world = kind(recordings, num_episodes=count, dt_s=dt_s, history=history)
     world.reset(scenarios, [np.random.default_rng(0)] * count)

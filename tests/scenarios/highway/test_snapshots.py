@@ -17,7 +17,7 @@ from scenarios.highway.rounds import (
     restore,
 )
 from scenarios.highway.sites import empty_road, network
-from tests.conformance.places import PLACES
+from tests.conformance.world_cases import WORLD_CASES
 from tests.highway_folders import SITE_NAMES, highway_data, highway_recordings
 from tests.scenarios.highway.elsewhere import drive, go_on, open_world
 
@@ -77,7 +77,7 @@ def test_the_future_comes_back_bit_for_bit_in_another_process(tmp_path: Path):
     """From pickled snapshots of both sites, amid lane changes, yielding, crashes and drives."""
     requests, expected, kept = [], [], {}
     for site in SITE_NAMES:
-        scenarios = PLACES[f"highway {site}"].scenarios()
+        scenarios = WORLD_CASES[f"highway {site}"].scenarios()
         simulation = open_world(highway_recordings(site), len(scenarios))
         simulation.reset(scenarios, [np.random.default_rng(0) for _ in scenarios])
         snapshots = []
