@@ -5,11 +5,10 @@ import numpy as np
 import pytest
 from gymnasium.utils.env_checker import check_env
 
-import asp_env
 from asp_env.data.classes import AgentClass
 from asp_env.data.recording import Recording
 from asp_env.data.snippets import find_snippets
-from asp_env.data.source import Recordings
+from asp_env.data.source import Recordings, open_data
 from asp_env.evaluation.inspect import drift_m
 from asp_env.geometry import wrap_angle
 from tests.real_data import real_data
@@ -27,13 +26,13 @@ VULNERABLE = (AgentClass.BICYCLE, AgentClass.PEDESTRIAN)
 @pytest.fixture(scope="module")
 def published() -> Recordings:
     """The recordings as published."""
-    return asp_env.load(real_data("taf_bw"))
+    return open_data(real_data("taf_bw"))
 
 
 @pytest.fixture(scope="module")
 def smoothed() -> Recordings:
     """All recordings of the same location, in the inD layout."""
-    return asp_env.load(real_data("karlsruhe"))
+    return open_data(real_data("karlsruhe"))
 
 
 def matching_states(recording: Recording, other: Recording) -> tuple[np.ndarray, np.ndarray]:
