@@ -269,16 +269,16 @@ def _predict(m, p, work, process):
     """
     rear, dt = process.rear_m, process.dt_s
     keep_a, keep_c = process.keep_acceleration, process.keep_curvature
-    way = m[3] * dt + 0.5 * m[4] * dt * dt
+    distance = m[3] * dt + 0.5 * m[4] * dt * dt
     sin_slip = min(max(rear * m[5], -_MAX_SIN_SLIP), _MAX_SIN_SLIP)
     cos_slip = math.sqrt(1.0 - sin_slip * sin_slip)
-    course = m[2] + math.asin(sin_slip) + 0.5 * m[5] * way
+    course = m[2] + math.asin(sin_slip) + 0.5 * m[5] * distance
     cosine, sine = math.cos(course), math.sin(course)
-    bend = rear / cos_slip + 0.5 * way
-    turn = 0.5 * m[5] * dt * way
+    bend = rear / cos_slip + 0.5 * distance
+    turn = 0.5 * m[5] * dt * distance
     # Rows of the Jacobian that differ from the identity.
-    x_t, x_v, x_c = -way * sine, dt * cosine - turn * sine, -way * sine * bend
-    y_t, y_v, y_c = way * cosine, dt * sine + turn * cosine, way * cosine * bend
+    x_t, x_v, x_c = -distance * sine, dt * cosine - turn * sine, -distance * sine * bend
+    y_t, y_v, y_c = distance * cosine, dt * sine + turn * cosine, distance * cosine * bend
     t_v = m[5] * dt
     half = 0.5 * dt
     for j in range(6):
@@ -286,7 +286,7 @@ def _predict(m, p, work, process):
         mean_v = v + half * a
         work[0, j] = p[0, j] + x_t * t + x_v * mean_v + x_c * c
         work[1, j] = p[1, j] + y_t * t + y_v * mean_v + y_c * c
-        work[2, j] = t + t_v * mean_v + way * c
+        work[2, j] = t + t_v * mean_v + distance * c
         work[3, j] = v + dt * a
         work[4, j] = keep_a * a
         work[5, j] = keep_c * c
@@ -295,7 +295,7 @@ def _predict(m, p, work, process):
         mean_v = v + half * a
         p[i, 0] = work[i, 0] + x_t * t + x_v * mean_v + x_c * c
         p[i, 1] = work[i, 1] + y_t * t + y_v * mean_v + y_c * c
-        p[i, 2] = t + t_v * mean_v + way * c
+        p[i, 2] = t + t_v * mean_v + distance * c
         p[i, 3] = v + dt * a
         p[i, 4] = keep_a * a
         p[i, 5] = keep_c * c
@@ -306,9 +306,9 @@ def _predict(m, p, work, process):
     p[4, 4] += process.acceleration_noise
     p[5, 5] += process.curvature_noise / (calm * calm)
 
-    m[0] += way * cosine
-    m[1] += way * sine
-    m[2] += m[5] * way
+    m[0] += distance * cosine
+    m[1] += distance * sine
+    m[2] += m[5] * distance
     before = m[3]
     m[3] += m[4] * dt
     m[4] *= keep_a

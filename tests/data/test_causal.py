@@ -142,21 +142,23 @@ def test_delay_after_a_step_of_acceleration(rate_hz: float) -> None:
     theory = 2 * ((poles + 2 * w) / slopes * np.exp(poles * after_s[:, None])).sum(axis=-1).real
     time_s = np.arange(0, 8, 1 / rate_hz)
     true = 8 + 2 * np.clip(time_s - 4, 0, None)
-    way = 8 * time_s + np.clip(time_s - 4, 0, None) ** 2
-    lag = true - filter_exact(along_x(way), speed_mps=8.0, rate_hz=rate_hz)[:, 3]
+    distance = 8 * time_s + np.clip(time_s - 4, 0, None) ** 2
+    lag = true - filter_exact(along_x(distance), speed_mps=8.0, rate_hz=rate_hz)[:, 3]
     assert lag[time_s > 4].max() == pytest.approx(theory.max(), rel=0.05)
     assert time_s[lag.argmax()] - 4 == pytest.approx(after_s[theory.argmax()], abs=0.11)
     if rate_hz == 25.0:
         assert theory.max() == pytest.approx(0.446, abs=1e-3)
-    assert lag[time_s >= 6].max() < 0.15  # acceleration is taken to fade, here it does not
+    assert lag[time_s >= 6].max() < 0.15  # the filter assumes that acceleration decays
 
 
 def test_the_steering_inferred_on_a_circle() -> None:
     """6 m/s on a circle of 12 m need atan(2 tan(asin(1.35 / 12))) = 0.2227 rad of steering."""
     time_s = np.arange(0, 20, 0.04)
     slip, heading = math.asin(REAR_M / 12), 0.5 * time_s
-    way = np.stack([12 * np.sin(heading + slip), -12 * np.cos(heading + slip), heading], axis=-1)
-    states = filter_exact(way, speed_mps=6.0)[125::5]
+    measured = np.stack(
+        [12 * np.sin(heading + slip), -12 * np.cos(heading + slip), heading], axis=-1
+    )
+    states = filter_exact(measured, speed_mps=6.0)[125::5]
     known = np.ones((1, len(states)), dtype=bool)
     actions = infer_actions(states[None], known, np.array([4.5]), 0.2)[0]
     np.testing.assert_allclose(actions[:, 1], 0.2227, atol=1e-3)
@@ -213,9 +215,9 @@ def test_driving_backwards_has_negative_speed() -> None:
 def test_a_reversed_heading_reverses_the_speed() -> None:
     """The recorded heading turns by 180° from one frame to the next."""
     time_s = np.arange(0, 10, 0.04)
-    way = along_x(5 * time_s)
-    way[125:, 2] = math.pi
-    states = filter_exact(way, speed_mps=5.0)
+    measured = along_x(5 * time_s)
+    measured[125:, 2] = math.pi
+    states = filter_exact(measured, speed_mps=5.0)
     np.testing.assert_allclose(states[:125, 3], 5, atol=1e-3)
     np.testing.assert_allclose(states[125:, 3], -5, atol=1e-3)
     np.testing.assert_allclose(abs(wrap_angle(states[125:, 2] - math.pi)), 0, atol=1e-3)

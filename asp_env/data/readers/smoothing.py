@@ -43,7 +43,7 @@ SETS_OFF_MPS2 = 15.0
 """Acceleration from a stand above which the preceding positions were repeated by the tracker, not
 measured. Chosen by hand: no vehicle reaches it."""
 
-STANDS_MPS = 0.2
+HEADING_HELD_MPS = 0.2
 """Speed below which a vehicle's heading is constant. Chosen by hand: above the drift of smoothed
 positions of standing vehicles."""
 
@@ -158,8 +158,8 @@ def follow_heading(
     course = np.arctan2(steps[:, 1], steps[:, 0])
     start = positions[int(away.argmax())] - positions[0]
     headings = np.empty(len(positions))
-    _pull(math.atan2(start[1], start[0]), course, step_m, rear_m, STANDS_MPS * dt_s, headings)
-    moves = step_m > STANDS_MPS * dt_s
+    _pull(math.atan2(start[1], start[0]), course, step_m, rear_m, HEADING_HELD_MPS * dt_s, headings)
+    moves = step_m > HEADING_HELD_MPS * dt_s
     expected = course if measured_rad is None or folded else measured_rad[1:]
     forward = (step_m * np.cos(expected - headings[1:]))[moves].sum()
     return headings if forward >= 0 else headings + math.pi

@@ -200,9 +200,9 @@ def test_gaps_and_jumps_split_tracks(tmp_path: Path) -> None:
     cars = pd.concat([rows(3, STRAIGHT), rows(5, STRAIGHT)]).reset_index(drop=True)
     second = cars["track_id"] == 5
     cars.loc[second & (cars["timestamp_ms"] >= 4_000), "y"] += 3.0
-    gone = ~second & cars["timestamp_ms"].between(2_000, 2_400)
+    removed = ~second & cars["timestamp_ms"].between(2_000, 2_400)
     early = second & cars["timestamp_ms"].between(300, 400)
-    table, _ = read(tmp_path, pd.DataFrame(cars[~gone & ~early]))
+    table, _ = read(tmp_path, pd.DataFrame(cars[~removed & ~early]))
     assert table.track_ids.tolist() == [3, 5, 6, 7]
     assert table.first_frames.tolist() == [0, 5, 25, 40]
     assert np.diff(table.starts).tolist() == [20, 35, 36, 21]

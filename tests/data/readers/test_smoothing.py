@@ -107,7 +107,7 @@ def test_a_vehicle_that_never_moves() -> None:
 
 
 def test_driving_backwards() -> None:
-    """Forward, back, forward: a constant heading. A measured heading shows that all is backwards."""
+    """Forward, back, forward: a constant heading. With a measured heading, all may be backwards."""
     forward = np.linspace(0, 10, 51)
     there_and_back = np.concatenate([forward, forward[:-1][::-1][:30], forward[20:]])
     positions = np.stack([there_and_back, np.zeros_like(there_and_back)], axis=-1)
