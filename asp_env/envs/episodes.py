@@ -26,7 +26,7 @@ from asp_env.sim.reward import reward_terms, weighted_sum, weights_from
 from asp_env.sim.simulation import Simulation, ending
 from asp_env.sim.traffic.assignment import TrafficSpec, make_traffic
 from asp_env.sim.world import Ending, Events, world_of
-from asp_env.views import make_picture_view
+from asp_env.views import make_raster_view
 
 
 def _references(held: list[Observation], number: int, name: str) -> int:
@@ -235,7 +235,7 @@ class ReplayEpisodes:
             self.recordings, chosen.scenarios, dt_s=chosen.dt_s, history=history
         )
         self.scenarios = self._starts.scenarios
-        raster = make_picture_view(chosen.view, pixels=chosen.raster_px)
+        raster = make_raster_view(chosen.view, pixels=chosen.raster_px)
         self.observer = Observer(chosen.observations, raster, history)
         kind = world_of(data)
         self.simulation = Simulation(

@@ -38,7 +38,7 @@ AT_FAULT = (Contact.OTHER_STANDS, Contact.FRONT, Contact.SIDE)
 """Contacts the ego may answer for. By nuPlan's rule a side contact is its fault only while it is in
 several lanes or off the road; that is for a preset to say."""
 
-TOWING = (
+TOWING_CLASSES = (
     *(AgentClass.CAR, AgentClass.VAN, AgentClass.TRUCK),
     *(AgentClass.BUS, AgentClass.TRUCK_BUS),
 )
@@ -127,7 +127,7 @@ def touching_trailers(
     valid: Bool[np.ndarray, "b a"],
 ) -> Bool[np.ndarray, "b a"]:
     """Trailers whose box overlaps that of the ego (slot 0), if the ego's class may tow one."""
-    trailers = (classes == AgentClass.TRAILER) & np.isin(classes[:, :1], TOWING)
+    trailers = (classes == AgentClass.TRAILER) & np.isin(classes[:, :1], TOWING_CLASSES)
     return trailers & (ego_contacts(states, sizes, valid) > 0)
 
 
@@ -157,7 +157,7 @@ def _modes_meet(paths, sizes, situation, slot, others, valid, other_sizes, out):
                     out[n, m] = _meets(paths[n, m + 1], size, track, there, size_o)
 
 
-def modes_meet(
+def overlapping_paths(
     paths: Float[np.ndarray, "n paths t 4"],
     sizes: Float[np.ndarray, "n 2"],
     situation: Int[np.ndarray, " n"],

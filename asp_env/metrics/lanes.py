@@ -84,7 +84,7 @@ def _along(points, covers, lines, starts, heading, arc):
                 gone += length
 
 
-def covering(
+def covering_lanes(
     road_map: RoadMap, points: Float[np.ndarray, "*batch 2"]
 ) -> Bool[np.ndarray, "*batch lanes"]:
     """Which lanes' areas each point lies in; no lane at all on a map without areas."""
@@ -100,7 +100,7 @@ def _covering(
     return out.reshape(*points.shape[:-1], len(boxes))
 
 
-def along_lanes(
+def lane_coordinates(
     road_map: RoadMap,
     points: Float[np.ndarray, "*batch 2"],
     covers: Bool[np.ndarray, "*batch lanes"],
@@ -151,7 +151,7 @@ def _where_crossed(
         covers = _covering(road_map, points, boxes)
         shared = covers.sum(axis=1) > 1
         points, covers = points[shared], covers[shared]
-        heading, arc = along_lanes(road_map, points, covers)
+        heading, arc = lane_coordinates(road_map, points, covers)
         across = np.abs(np.sin(heading[:, :, None] - heading[:, None])) > math.sin(CROSSING_RAD)
         meets = (across & covers[:, :, None] & covers[:, None]).any(axis=2)
         crossed[np.nonzero(meets)[1], arc[meets].astype(np.int64)] = True
@@ -170,7 +170,7 @@ def in_several_lanes(
     As nuPlan's test of common or connected lanes, with one lanelet more, since lanelets are short.
     Corners that no lane covers do not count.
     """
-    covers = covering(road_map, box_corners(states, sizes))
+    covers = covering_lanes(road_map, box_corners(states, sizes))
     held = covers.astype(np.float32) @ lane_table(road_map).chains.T > 0
     unknown = np.asarray(~covers.any(axis=-1))
     one = np.asarray((held | unknown[..., None]).all(axis=-2)).any(axis=-1)
@@ -185,8 +185,8 @@ def at_crossing(
     This stands for nuPlan's polygons of intersections, which these maps do not have.
     """
     points = np.concatenate([box_corners(states, sizes), states[..., None, :2]], axis=-2)
-    covers = covering(road_map, points)
-    _, arc = along_lanes(road_map, points, covers)
+    covers = covering_lanes(road_map, points)
+    _, arc = lane_coordinates(road_map, points, covers)
     crossed = lane_table(road_map).crossed
     there = crossed[np.arange(len(crossed)), arc.astype(np.int64)]
     return np.asarray((covers & there).any(axis=(-2, -1)))
@@ -201,8 +201,8 @@ def against_traffic_m(
     without a lane is neither right nor wrong, two-way lanes are never wrong, and before the first
     tick nothing has moved.
     """
-    covers = covering(road_map, xy)
-    heading, _ = along_lanes(road_map, xy, covers)
+    covers = covering_lanes(road_map, xy)
+    heading, _ = lane_coordinates(road_map, xy, covers)
     step = np.diff(xy.astype(np.float64), axis=-2, prepend=xy[..., :1, :])
     along = step[..., 0, None] * np.cos(heading) + step[..., 1, None] * np.sin(heading)
     along = np.where(road_map.two_way, np.abs(along), along)
@@ -215,8 +215,8 @@ def speed_limits(road_map: RoadMap, states: Float[np.ndarray, "*batch 4"]) -> Ma
 
     Of several lanes those within 90° of the heading count, of these the highest limit.
     """
-    covers = covering(road_map, states[..., :2])
-    heading, _ = along_lanes(road_map, states[..., :2], covers)
+    covers = covering_lanes(road_map, states[..., :2])
+    heading, _ = lane_coordinates(road_map, states[..., :2], covers)
     fits = covers & road_map.limited & (np.cos(heading - states[..., 2, None]) > 0)
     limits = np.where(fits, road_map.limits_mps, 0.0).max(axis=-1, initial=0.0)
     return Masked(value=limits, valid=np.asarray(fits.any(axis=-1)))

@@ -23,7 +23,7 @@ from asp_env.errors import AspEnvError, unknown_name
 from asp_env.geometry import wrap_angle
 from asp_env.sim.episodes import last_ticks
 from asp_env.sim.world import Events, World
-from asp_env.views import VIEWS, PictureView, make_picture_view
+from asp_env.views import VIEWS, RasterView, make_raster_view
 from asp_env.views.vectors import AGENT_FIELDS, LINE_FIELDS, VectorBounds, Vectors, VectorView
 
 
@@ -117,7 +117,7 @@ Spaces = dict[str, spaces.Box[Any]]
 class RasterComponent:
     """The picture that a view draws: uint8 (channels, height, width)."""
 
-    def __init__(self, name: str, view: PictureView) -> None:
+    def __init__(self, name: str, view: RasterView) -> None:
         """A part of that name."""
         self._name, self._view = name, view
         self.history = view.history
@@ -126,7 +126,7 @@ class RasterComponent:
     def write(self, sight: ObservationContext, events: Events, out: Arrays) -> None:
         """Draws into the memory itself."""
         del events
-        self._view.draw(sight, out[self._name])
+        self._view.render(sight, out[self._name])
 
 
 @final
@@ -158,7 +158,7 @@ class VectorsComponent:
         del events
         masks = out["agents_valid"].view(np.bool_), out["lines_valid"].view(np.bool_)
         memory = Vectors(out["agents"], masks[0], out["lines"], masks[1])
-        self._view.draw(sight, memory, self._within)
+        self._view.render(sight, memory, self._within)
 
 
 @final
@@ -321,7 +321,7 @@ class ObservationComponent(Protocol):
 class Observer:
     """Turns what is seen into observations; draws nothing that is not asked for."""
 
-    def __init__(self, names: Sequence[str], raster: PictureView, history: int) -> None:
+    def __init__(self, names: Sequence[str], raster: RasterView, history: int) -> None:
         """An observer of the named kinds of observation.
 
         Args:
@@ -377,7 +377,7 @@ class Observer:
         return out
 
 
-def _make(name: str, raster: PictureView, history: int) -> ObservationComponent:
+def _make(name: str, raster: RasterView, history: int) -> ObservationComponent:
     if name == "raster":
         return RasterComponent(name, raster)
     if name == "vectors":
@@ -388,4 +388,4 @@ def _make(name: str, raster: PictureView, history: int) -> ObservationComponent:
         return StateComponent()
     if name == "route":
         return RouteComponent()
-    return RasterComponent(name, make_picture_view(name))
+    return RasterComponent(name, make_raster_view(name))

@@ -16,7 +16,7 @@ from asp_env.data.snippets import Future
 from asp_env.data.split import TrainedOn
 from asp_env.errors import AspEnvError
 from asp_env.geometry import from_frame, wrap_angle
-from asp_env.views import PictureView, SceneView
+from asp_env.views import RasterView, SceneView
 from predictors.models.batch import Batch, Labels, make_batch, make_labels
 from predictors.models.chaining import Chaining
 from predictors.models.network import AbstractNetwork, Modes
@@ -76,7 +76,7 @@ class TrainedPredictor:
         self._about = MappingProxyType(dict(about))
         self._temperature = temperature
         self._at_once = TARGETS_AT_ONCE
-        if isinstance(view, PictureView):
+        if isinstance(view, RasterView):
             pixels = math.prod(view.shape[1:])
             self._at_once = min(TARGETS_AT_ONCE, max(1, PIXELS_AT_ONCE // pixels))
 

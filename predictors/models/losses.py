@@ -10,7 +10,7 @@ from torch import Tensor
 from torch.nn import functional
 
 from asp_env.metrics.forecast import errors
-from asp_env.metrics.forecast.errors import ModeRule, ends_alike
+from asp_env.metrics.forecast.errors import ModeRule, ends_in_true_direction
 
 Assignment = Literal["angle", "distance", "angle-random"]
 Classification = Literal["cross-entropy", "softmax"]
@@ -54,7 +54,7 @@ def chance_mode(
     distance = torch.linalg.vector_norm(positions - label[:, None], dim=-1).mean(dim=-1)
     bits = distance.float().contiguous().view(torch.int32).long()
     drawn = (bits * 2_654_435_761 >> 8 & 0xFFFF).argmax(dim=1)
-    decided = ends_alike(positions, label).any(dim=1)
+    decided = ends_in_true_direction(positions, label).any(dim=1)
     return torch.where(decided, best_mode(positions, label, "angle"), drawn)
 
 

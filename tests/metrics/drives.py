@@ -8,17 +8,17 @@ import numpy as np
 from asp_env.metrics.boxes import Contact
 from asp_env.metrics.driving.map_context import MapContext
 from asp_env.metrics.driving.rules import STRICT, Rules
-from asp_env.metrics.driving.scores import Drives, driving_metrics
+from asp_env.metrics.driving.scores import EpisodeRecord, driving_metrics
 from asp_env.metrics.masked import Masked
 
 TICKS = 8
 DT_S = 0.2
 
 
-def drive(*, active: int = TICKS, dt_s: float = DT_S, **changes: object) -> Drives:
+def drive(*, active: int = TICKS, dt_s: float = DT_S, **changes: object) -> EpisodeRecord:
     """One episode at 5 m/s that is perfect but for its progress of 40 m out of 50 m.
 
-    Fields of `Drives` and `MapContext` are given as values for all ticks, or as arrays; `limit_mps` is
+    Fields of `EpisodeRecord` and `MapContext` are given as values for all ticks, or as arrays; `limit_mps` is
     `None` where none is known, and `against_m` where the map has no lanes.
     """
     states = np.zeros((1, TICKS, 4))
@@ -55,7 +55,7 @@ def drive(*, active: int = TICKS, dt_s: float = DT_S, **changes: object) -> Driv
         distance_to_route_lanes_m=fields.pop("distance_to_route_lanes_m"),
     )
     lasts = np.arange(TICKS)[None] < active
-    return Drives(**fields, on_map=on_map, active=lasts, dt_s=dt_s)
+    return EpisodeRecord(**fields, on_map=on_map, active=lasts, dt_s=dt_s)
 
 
 def at_tick(tick: int, value: float, otherwise: float = 0.0) -> np.ndarray:
@@ -70,7 +70,7 @@ def contact(tick: int, kind: Contact) -> np.ndarray:
     return found
 
 
-def values(drives: Drives, preset: Rules = STRICT) -> dict[str, float]:
+def values(drives: EpisodeRecord, preset: Rules = STRICT) -> dict[str, float]:
     """The metrics of one episode; NaN where missing."""
     return {
         name: float(metric.value[0]) if metric.valid[0] else math.nan
@@ -78,7 +78,7 @@ def values(drives: Drives, preset: Rules = STRICT) -> dict[str, float]:
     }
 
 
-def joined(episodes: list[Drives]) -> Drives:
+def joined(episodes: list[EpisodeRecord]) -> EpisodeRecord:
     """Several drives side by side."""
 
     def side_by_side(kind: type, parts: list) -> dict:
@@ -92,4 +92,4 @@ def joined(episodes: list[Drives]) -> Drives:
                 found[field.name] = values[0] if whole else np.concatenate(values)
         return found
 
-    return Drives(**side_by_side(Drives, episodes))
+    return EpisodeRecord(**side_by_side(EpisodeRecord, episodes))

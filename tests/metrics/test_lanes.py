@@ -10,11 +10,11 @@ from hypothesis import given
 
 from asp_env.data.road_map import Ragged, RoadMap
 from asp_env.geometry import box_corners, from_frame
-from asp_env.metrics.driving.map_context import distance_to_route_lanes_m, reachable
+from asp_env.metrics.driving.map_context import distance_to_route_lanes_m, reachable_lanes
 from asp_env.metrics.lanes import (
     against_traffic_m,
     at_crossing,
-    covering,
+    covering_lanes,
     in_several_lanes,
     lane_table,
     speed_limits,
@@ -65,7 +65,7 @@ def at(x: float, y: float, heading: float = 0.0, speed: float = 5.0) -> np.ndarr
 )
 def test_covering(x: float, y: float, lanes: set[int]) -> None:
     """Rings by hand."""
-    assert set(np.flatnonzero(covering(STREET, np.array([x, y])))) == lanes
+    assert set(np.flatnonzero(covering_lanes(STREET, np.array([x, y])))) == lanes
 
 
 @pytest.mark.parametrize(
@@ -176,10 +176,10 @@ def test_speed_limit(state: np.ndarray, limit: float | None) -> None:
 
 def test_lanes_that_lead_on() -> None:
     """From the eastbound lane onwards and to the left; nothing from a place without a lane."""
-    assert set(np.flatnonzero(reachable(STREET, at(10, 0)[0]))) == {EAST, ONWARDS, LEFT}
-    assert set(np.flatnonzero(reachable(STREET, at(10, 0, math.pi)[0]))) == set()
-    assert set(np.flatnonzero(reachable(STREET, at(10, 4, math.pi)[0]))) == {WEST}
-    assert set(np.flatnonzero(reachable(STREET, at(10, 40)[0]))) == set()
+    assert set(np.flatnonzero(reachable_lanes(STREET, at(10, 0)[0]))) == {EAST, ONWARDS, LEFT}
+    assert set(np.flatnonzero(reachable_lanes(STREET, at(10, 0, math.pi)[0]))) == set()
+    assert set(np.flatnonzero(reachable_lanes(STREET, at(10, 4, math.pi)[0]))) == {WEST}
+    assert set(np.flatnonzero(reachable_lanes(STREET, at(10, 40)[0]))) == set()
 
 
 def test_distance_to_the_ways() -> None:
@@ -197,7 +197,7 @@ def test_distance_to_the_ways() -> None:
 def test_a_map_of_centre_lines_tells_nothing() -> None:
     """No areas, so no lane: nothing is several, crossed, against or limited."""
     state = at(20, 2)
-    assert covering(BARE, state[:, :2]).shape == (1, 0)
+    assert covering_lanes(BARE, state[:, :2]).shape == (1, 0)
     assert not in_several_lanes(BARE, state, CAR[None]).any()
     assert not at_crossing(BARE, state, CAR[None]).any()
     assert not against_traffic_m(BARE, np.array([(20.0, 4.0), (30.0, 4.0)])).any()
@@ -231,7 +231,7 @@ def test_where_the_street_lies_changes_nothing(
         return
     for one, other in (
         (in_several_lanes(STREET, state, CAR[None]), in_several_lanes(elsewhere, moved, CAR[None])),
-        (covering(STREET, two[0]), covering(elsewhere, two[1])),
+        (covering_lanes(STREET, two[0]), covering_lanes(elsewhere, two[1])),
     ):
         np.testing.assert_array_equal(one, other)
     np.testing.assert_allclose(

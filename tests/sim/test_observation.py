@@ -8,11 +8,11 @@ import pytest
 
 from asp_env.errors import AspEnvError
 from asp_env.sim.observation import STATE_FIELDS, Observer, ego_context
-from asp_env.views import make_picture_view
+from asp_env.views import make_raster_view
 from tests.builders import make_recording
 from tests.sim.worlds import HISTORY, drive, on_road, scenario, simulate
 
-VIEW = make_picture_view("chauffeurnet", pixels=(90, 60))
+VIEW = make_raster_view("chauffeurnet", pixels=(90, 60))
 
 
 def _state(simulation) -> dict[str, float]:

@@ -28,7 +28,7 @@ from asp_env.evaluation.bench.timing import (
     write_bandwidth,
 )
 from asp_env.evaluation.selection import no_data_error
-from asp_env.views import make_picture_view
+from asp_env.views import make_raster_view
 
 SIZES_PX = ((360, 240), (90, 60))
 SECTIONS = ("drawing", "stepping", "environments", "scaling")
@@ -132,9 +132,9 @@ def _drawing(recordings: Recordings, write_bytes_per_s: float) -> list[Rate]:
     scene = gather_scene(recordings, index.select(chosen))
     found = []
     for height_px, width_px in SIZES_PX:
-        view = make_picture_view("chauffeurnet", pixels=(height_px, width_px))
+        view = make_raster_view("chauffeurnet", pixels=(height_px, width_px))
         out = np.zeros((len(chosen), *view.shape), dtype=np.uint8)
-        per_s = len(chosen) / median_s(lambda view=view, out=out: view.draw(scene, out))
+        per_s = len(chosen) / median_s(lambda view=view, out=out: view.render(scene, out))
         found.append(
             Rate(
                 what=f"raster 12x{height_px}x{width_px}",

@@ -16,9 +16,9 @@ from asp_env.data.road_map import Ragged, RoadMap
 from asp_env.metrics.drivable import off_road_m
 from asp_env.metrics.lanes import (
     against_traffic_m,
-    along_lanes,
+    lane_coordinates,
     at_crossing,
-    covering,
+    covering_lanes,
     in_several_lanes,
     speed_limits,
 )
@@ -43,10 +43,10 @@ def _nearest(points, lines, starts, chosen, out):
                 out[n] = min(out[n], math.hypot(dx - at * sx, dy - at * sy))
 
 
-def reachable(road_map: RoadMap, start: Float[np.ndarray, " 4"]) -> Bool[np.ndarray, " lanes"]:
+def reachable_lanes(road_map: RoadMap, start: Float[np.ndarray, " 4"]) -> Bool[np.ndarray, " lanes"]:
     """Lanes that lead on from a state: those it is in and heads along, and whatever follows."""
-    covers = covering(road_map, start[:2])
-    heading, _ = along_lanes(road_map, start[:2], covers)
+    covers = covering_lanes(road_map, start[:2])
+    heading, _ = lane_coordinates(road_map, start[:2], covers)
     found = covers & (np.cos(heading - start[2]) > 0)
     for _ in range(len(found)):
         after = road_map.successors[found[road_map.successors[:, 0]], 1] if found.any() else []
@@ -61,13 +61,13 @@ def distance_to_route_lanes_m(
 ) -> Float[np.ndarray, " t"]:
     """Distance from each tick's centre to the nearest way that led on from the first tick, metres.
 
-    Ways are the centre lines of `reachable` lanes, and the logged route, since maps have gaps.
+    Ways are the centre lines of `reachable_lanes` lanes, and the logged route, since maps have gaps.
     """
     points = np.ascontiguousarray(states[:, :2], dtype=np.float64)
     out = np.full(len(points), np.inf)
     logged = Ragged.pack([route])
     _nearest(points, logged.points, logged.starts, np.ones(1, dtype=bool), out)
-    chosen = reachable(road_map, states[0])
+    chosen = reachable_lanes(road_map, states[0])
     _nearest(points, road_map.lanes.points, road_map.lanes.starts, chosen, out)
     return out
 

@@ -150,7 +150,7 @@ SMOOTHING = 0.1
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Feature:
+class RealismFeature:
     """Its weight in the whole, and the histogram of its values."""
 
     weight: float
@@ -161,21 +161,21 @@ class Feature:
     """Whether it is asked once per agent, if ever, rather than at every tick."""
 
 
-FEATURES = {
-    "speed": Feature(weight=0.05, low=0.0, high=25.0, bins=10),
-    "acceleration": Feature(weight=0.05, low=-12.0, high=12.0, bins=11),
-    "yaw rate": Feature(weight=0.05, low=-0.628, high=0.628, bins=11),
-    "yaw acceleration": Feature(weight=0.05, low=-3.14, high=3.14, bins=11),
-    "nearest": Feature(weight=0.10, low=-5.0, high=40.0, bins=10),
-    "collision": Feature(weight=0.25, low=-0.5, high=1.5, bins=2, once=True),
-    "TTC": Feature(weight=0.10, low=0.0, high=5.0, bins=10),
-    "road edge": Feature(weight=0.05, low=-20.0, high=40.0, bins=10),
-    "off-road": Feature(weight=0.25, low=-0.5, high=1.5, bins=2, once=True),
+REALISM_FEATURES = {
+    "speed": RealismFeature(weight=0.05, low=0.0, high=25.0, bins=10),
+    "acceleration": RealismFeature(weight=0.05, low=-12.0, high=12.0, bins=11),
+    "yaw rate": RealismFeature(weight=0.05, low=-0.628, high=0.628, bins=11),
+    "yaw acceleration": RealismFeature(weight=0.05, low=-3.14, high=3.14, bins=11),
+    "nearest": RealismFeature(weight=0.10, low=-5.0, high=40.0, bins=10),
+    "collision": RealismFeature(weight=0.25, low=-0.5, high=1.5, bins=2, once=True),
+    "TTC": RealismFeature(weight=0.10, low=0.0, high=5.0, bins=10),
+    "road edge": RealismFeature(weight=0.05, low=-20.0, high=40.0, bins=10),
+    "off-road": RealismFeature(weight=0.25, low=-0.5, high=1.5, bins=2, once=True),
 }
 """WOSAC's of 2025. Its 0.05 for traffic lights are left out, since recordings have none."""
 
 
-def features(
+def realism_features(
     states: Float[np.ndarray, "t a 4"],
     valid: Bool[np.ndarray, "t a"],
     sizes: Float[np.ndarray, "a 2"],
@@ -229,7 +229,7 @@ def _central(
     return half, known
 
 
-def likelihood(logged: Masked, simulated: list[Masked], feature: Feature) -> Masked:
+def feature_likelihood(logged: Masked, simulated: list[Masked], feature: RealismFeature) -> Masked:
     """(1,) the geometric mean of the logged values' shares in each agent's simulated histogram.
 
     Values beyond the histogram count in its outermost bins. Agents without a simulated value are
@@ -261,14 +261,14 @@ def realism(logged: Mapping[str, Masked], simulated: list[dict[str, Masked]]) ->
     From 0 to 1, of one scene; it is no probability of the scene. What is missing is left out.
 
     Args:
-        logged: `features` of the recording, over the same ticks and agents.
+        logged: `realism_features` of the recording, over the same ticks and agents.
         simulated: those of each simulation.
     """
     found = {
-        name: likelihood(logged[name], [each[name] for each in simulated], feature)
-        for name, feature in FEATURES.items()
+        name: feature_likelihood(logged[name], [each[name] for each in simulated], feature)
+        for name, feature in REALISM_FEATURES.items()
     }
-    weights = {name: FEATURES[name].weight * float(each.valid[0]) for name, each in found.items()}
+    weights = {name: REALISM_FEATURES[name].weight * float(each.valid[0]) for name, each in found.items()}
     total = sum(weights.values())
     mean = sum(weights[name] * each.value[0] for name, each in found.items()) / max(total, 1e-9)
     whole = Masked(value=np.array([mean]), valid=np.array([total > 0]))

@@ -125,7 +125,7 @@ STRICT = Rules(
 )
 
 RULES = {preset.name: preset for preset in (NUPLAN, PDMS, WAYMAX, STRICT)}
-DEFAULT_PRESET = PDMS.name
+DEFAULT_RULES = PDMS.name
 
 
 def find_rules(name: str) -> Rules:

@@ -26,7 +26,7 @@ LEAST_PROGRESS = 0.2
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Drives:
+class EpisodeRecord:
     """What B episodes of up to T ticks looked like from the ego; `active` marks the first few."""
 
     states: Float[np.ndarray, "b t 4"]
@@ -46,7 +46,7 @@ class Drives:
     dt_s: float
 
 
-def at_fault(drives: Drives, preset: Rules) -> Bool[np.ndarray, "b t"]:
+def at_fault(drives: EpisodeRecord, preset: Rules) -> Bool[np.ndarray, "b t"]:
     """Ticks at which a contact begins that is the ego's fault by the preset's rule (nuPlan).
 
     With somebody who stands, at the ego's front, or at its side; the latter, unless any side is,
@@ -60,7 +60,7 @@ def at_fault(drives: Drives, preset: Rules) -> Bool[np.ndarray, "b t"]:
     return (begins & (sure | side)).any(axis=2) & drives.active
 
 
-def driving_metrics(drives: Drives, preset: Rules) -> dict[str, Masked]:
+def driving_metrics(drives: EpisodeRecord, preset: Rules) -> dict[str, Masked]:
     """Per episode; missing where it has no tick.
 
     - `no collision`, `no at-fault collision`, `no hit from behind`: 1 or 0. Who comes from behind
@@ -129,7 +129,7 @@ def _score(metrics: Mapping[str, Masked], preset: Rules, some: Bool[np.ndarray, 
     return Masked(value=product * total / np.maximum(weights, 1.0), valid=some)
 
 
-def _progress(drives: Drives, preset: Rules) -> Float[np.ndarray, " b"]:
+def _progress(drives: EpisodeRecord, preset: Rules) -> Float[np.ndarray, " b"]:
     last = np.maximum(drives.active.sum(axis=1) - 1, 0)
     reached = drives.route_m[np.arange(len(last)), last]
     lifted = np.maximum(reached, preset.min_progress_m) if preset.lifts else reached
@@ -137,7 +137,7 @@ def _progress(drives: Drives, preset: Rules) -> Float[np.ndarray, " b"]:
     return np.where(reached < 0, 0.0, share)
 
 
-def against_traffic_m(drives: Drives) -> Float[np.ndarray, "b t"]:
+def against_traffic_in_window_m(drives: EpisodeRecord) -> Float[np.ndarray, "b t"]:
     """How far against the traffic the ego drove within the last second."""
     against = drives.on_map.against_traffic
     driven = np.cumsum(np.where(drives.active, against.value, 0.0), axis=1)
@@ -146,15 +146,15 @@ def against_traffic_m(drives: Drives) -> Float[np.ndarray, "b t"]:
     return driven - before
 
 
-def overspeed_mps(drives: Drives) -> Masked:
+def overspeed_mps(drives: EpisodeRecord) -> Masked:
     """How much the ego is over the limit at each tick; missing without one."""
     limits = drives.on_map.limits
     over = np.maximum(np.abs(drives.states[..., 3]) - limits.value, 0.0)
     return Masked(value=over, valid=limits.valid & drives.active)
 
 
-def _direction(drives: Drives) -> Masked:
-    most = against_traffic_m(drives).max(axis=1, initial=0.0)
+def _direction(drives: EpisodeRecord) -> Masked:
+    most = against_traffic_in_window_m(drives).max(axis=1, initial=0.0)
     known = drives.on_map.against_traffic.valid & drives.active
     return Masked(
         value=np.select([most <= COMPLIANT_M, most <= VIOLATION_M], [1.0, 0.5], 0.0),
@@ -162,7 +162,7 @@ def _direction(drives: Drives) -> Masked:
     )
 
 
-def _speed(drives: Drives) -> Masked:
+def _speed(drives: EpisodeRecord) -> Masked:
     over = overspeed_mps(drives)
     count = over.valid.sum(axis=1)
     mean = np.where(over.valid, over.value, 0.0).sum(axis=1) / np.maximum(count, 1)
@@ -170,7 +170,7 @@ def _speed(drives: Drives) -> Masked:
     return Masked(value=value, valid=np.asarray(count > 0))
 
 
-def _comfort(drives: Drives) -> Masked:
+def _comfort(drives: EpisodeRecord) -> Masked:
     ticks, needed = drives.active.sum(axis=1), window_ticks(drives.dt_s)
     value = np.zeros(len(ticks))
     for b, count in enumerate(ticks):
@@ -180,7 +180,7 @@ def _comfort(drives: Drives) -> Masked:
     return Masked(value=value, valid=np.asarray(ticks >= needed))
 
 
-def _feasible(drives: Drives) -> Masked:
+def _feasible(drives: EpisodeRecord) -> Masked:
     both = drives.active[:, 1:] & drives.active[:, :-1]
     beyond = infeasible_ticks(drives.states, dt_s=drives.dt_s) & both
     return Masked(value=np.asarray(1.0 - beyond.any(axis=1)), valid=np.asarray(both.any(axis=1)))

@@ -55,12 +55,12 @@ def best_mode(
     distance_m = away_m[..., -1] if rule == "fde" else away_m.mean(axis=-1)
     allowed = xp.ones_like(distance_m, dtype=bool) if among is None else among
     if rule == "paper":
-        near = allowed & ends_alike(positions, truth)
+        near = allowed & ends_in_true_direction(positions, truth)
         allowed = xp.where(near.any(axis=1)[:, None], near, allowed)
     return xp.where(allowed, distance_m, math.inf).argmin(axis=1)
 
 
-def ends_alike(positions: Float[Any, "n m t 2"], truth: Float[Any, "n t 2"]) -> Bool[Any, "n m"]:
+def ends_in_true_direction(positions: Float[Any, "n m t 2"], truth: Float[Any, "n t 2"]) -> Bool[Any, "n m"]:
     """(n, m) whether a mode ends within 5° of where the truth ends, seen from (0, 0).
 
     All modes do where the truth ends within 2 m, and so has no direction.

@@ -9,7 +9,7 @@ from jaxtyping import Bool, Float, Int
 
 from asp_env.data.road_map import RoadMap
 from asp_env.geometry import wrap_angle
-from asp_env.metrics.boxes import modes_meet
+from asp_env.metrics.boxes import overlapping_paths
 from asp_env.metrics.drivable import OFF_ROAD_M, drivable_field
 
 MAX_ACCELERATION_MPS2 = 10.4
@@ -20,7 +20,7 @@ MIN_SPEED_MPS = 0.6
 """Below this speed Waymax's inverse bicycle reads no curvature."""
 
 
-def off_road_points(
+def off_road_modes(
     maps: tuple[RoadMap, ...],
     map_index: Int[np.ndarray, " n"],
     points: Float[np.ndarray, "n m t 2"],
@@ -102,4 +102,4 @@ def overlapping_modes(
         others_sizes: their lengths and widths.
     """
     paths = np.concatenate([truth[:, None], modes], axis=1)
-    return modes_meet(paths, sizes, situation, slot, others, others_valid, others_sizes)
+    return overlapping_paths(paths, sizes, situation, slot, others, others_valid, others_sizes)

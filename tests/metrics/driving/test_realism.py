@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from asp_env.geometry import from_frame
-from asp_env.metrics.driving.realism import FEATURES, Feature, features, likelihood, realism
+from asp_env.metrics.driving.realism import REALISM_FEATURES, RealismFeature, realism_features, feature_likelihood, realism
 from asp_env.metrics.masked import Masked
 from tests.metrics.streets import STREET, moved_map
 
@@ -32,7 +32,7 @@ def traffic(*, speed_mps: float = 8.0, ticks: int = 20) -> np.ndarray:
 
 def found_in(states: np.ndarray, asked: np.ndarray = ALL) -> dict[str, Masked]:
     """Features of traffic on the street."""
-    return features(states, np.ones(states.shape[:2], dtype=bool), SIZES, STREET, asked, DT_S)
+    return realism_features(states, np.ones(states.shape[:2], dtype=bool), SIZES, STREET, asked, DT_S)
 
 
 def test_likelihood_by_hand() -> None:
@@ -41,29 +41,29 @@ def test_likelihood_by_hand() -> None:
     With 0.1 in each of the four bins: 2.1, 1.1, 0.1 and 1.1 of 4.4. Logged 0.1 and 2.5 have the
     shares 2.1/4.4 and 0.1/4.4; their geometric mean counts, and a missing one does not.
     """
-    feature = Feature(weight=1.0, low=0.0, high=4.0, bins=4)
+    feature = RealismFeature(weight=1.0, low=0.0, high=4.0, bins=4)
     simulated = [column(0.5, 0.6), column(1.5, 9.0, None)]
-    found = likelihood(column(0.1, None, 2.5), simulated, feature)
+    found = feature_likelihood(column(0.1, None, 2.5), simulated, feature)
     assert found.value[0] == pytest.approx(math.sqrt(2.1 * 0.1) / 4.4)
-    assert not likelihood(column(None, None), simulated, feature).valid[0]
-    assert not likelihood(column(0.1), [column(None)], feature).valid[0]
+    assert not feature_likelihood(column(None, None), simulated, feature).valid[0]
+    assert not feature_likelihood(column(0.1), [column(None)], feature).valid[0]
 
 
 def test_what_is_asked_once() -> None:
     """Of 32 simulations 8 collide: a logged collision has (8 + 0.1)/32.2, none 24.1/32.2."""
     simulated = [column(float(number < 8)) for number in range(32)]
-    collision = FEATURES["collision"]
-    assert likelihood(column(1.0), simulated, collision).value[0] == pytest.approx(8.1 / 32.2)
-    assert likelihood(column(0.0), simulated, collision).value[0] == pytest.approx(24.1 / 32.2)
+    collision = REALISM_FEATURES["collision"]
+    assert feature_likelihood(column(1.0), simulated, collision).value[0] == pytest.approx(8.1 / 32.2)
+    assert feature_likelihood(column(0.0), simulated, collision).value[0] == pytest.approx(24.1 / 32.2)
 
 
 def test_weights_are_those_of_2025() -> None:
     """They add up to 1 with the 0.05 of traffic lights."""
-    assert {name: each.weight for name, each in FEATURES.items()} == {
+    assert {name: each.weight for name, each in REALISM_FEATURES.items()} == {
         **dict.fromkeys(("speed", "acceleration", "yaw rate", "yaw acceleration"), 0.05),
         **{"nearest": 0.1, "collision": 0.25, "TTC": 0.1, "road edge": 0.05, "off-road": 0.25},
     }
-    assert sum(each.weight for each in FEATURES.values()) == pytest.approx(0.95)
+    assert sum(each.weight for each in REALISM_FEATURES.values()) == pytest.approx(0.95)
 
 
 def test_features_by_hand() -> None:
@@ -143,7 +143,7 @@ def test_laws() -> None:
         valid = np.ones((20, 5), dtype=bool)
         valid[:, 3:] = False
         sizes = np.concatenate([SIZES, np.zeros((2, 2))])
-        return features(more, valid, sizes, STREET, np.ones(5, dtype=bool), DT_S)
+        return realism_features(more, valid, sizes, STREET, np.ones(5, dtype=bool), DT_S)
 
     for name, each in realism(padded(logged), [padded(simulated)]).items():
         assert each.value[0] == pytest.approx(here[name].value[0], abs=1e-9), name
@@ -154,7 +154,7 @@ def test_laws() -> None:
     def moved(states: np.ndarray) -> dict[str, Masked]:
         xy = from_frame(states[..., :2], np.array(pose))
         elsewhere = np.concatenate([xy, states[..., 2:3] + pose[2], states[..., 3:]], axis=-1)
-        return features(elsewhere, np.ones((20, 3), dtype=bool), SIZES, street, ALL, DT_S)
+        return realism_features(elsewhere, np.ones((20, 3), dtype=bool), SIZES, street, ALL, DT_S)
 
     for name, each in realism(moved(logged), [moved(simulated)]).items():
         assert each.value[0] == pytest.approx(here[name].value[0], abs=0.02), name

@@ -8,7 +8,7 @@ import pytest
 from asp_env.data.road_map import Ragged
 from asp_env.metrics.forecast.feasibility import (
     infeasible_modes,
-    off_road_points,
+    off_road_modes,
     overlapping_modes,
 )
 from tests.builders import make_map
@@ -26,7 +26,7 @@ def test_off_road(y_m: float, off: bool) -> None:
     points = np.zeros((1, 2, TICKS, 2))
     points[..., 0] = 50.0
     points[0, 1, 3, 1] = y_m
-    found, known = off_road_points((make_map(),), np.zeros(1, dtype=np.int64), points)
+    found, known = off_road_modes((make_map(),), np.zeros(1, dtype=np.int64), points)
     assert found.tolist() == [[False, off]]
     assert known.all()
 
@@ -35,7 +35,7 @@ def test_no_drivable_area() -> None:
     """On a map without one nobody is off it, and the question does not apply."""
     empty = dataclasses.replace(make_map(), drivable=Ragged.pack([]))
     points = np.full((2, 1, TICKS, 2), 500.0)
-    off, known = off_road_points((make_map(), empty), np.array([0, 1]), points)
+    off, known = off_road_modes((make_map(), empty), np.array([0, 1]), points)
     assert off.tolist() == [[True], [False]]
     assert known.tolist() == [True, False]
 

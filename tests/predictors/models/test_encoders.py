@@ -9,7 +9,6 @@ import torch
 from safetensors.torch import load_file, save_file
 
 from asp_env.errors import AspEnvError, CheckpointError
-from asp_env.views.draw import pack_bits
 from predictors.models.encoders import (
     PictureEncoder,
     ResNet18,
@@ -141,7 +140,7 @@ def test_small_encoder_tells_places_apart() -> None:
 def test_bits_are_unpacked_as_they_were_packed(width: int) -> None:
     """Pictures of 0 and 255 come back as 0 and 1, also where the last byte is not full."""
     pictures = np.random.default_rng(width).choice(np.array([0, 255], np.uint8), (2, 3, 4, width))
-    packed = torch.from_numpy(pack_bits(pictures))
+    packed = torch.from_numpy(np.packbits(pictures, axis=-1))
     assert torch.equal(unpack_bits(packed, width), torch.from_numpy(pictures // 255))
 
 
@@ -154,7 +153,7 @@ def test_packed_pictures_have_the_features_of_whole_ones() -> None:
     whole.load_state_dict(bits.state_dict())
     pictures = np.random.default_rng(0).choice(np.array([0, 255], np.uint8), (3, 2, 12, 20))
     with torch.no_grad():
-        one = bits(torch.from_numpy(pack_bits(pictures)))
+        one = bits(torch.from_numpy(np.packbits(pictures, axis=-1)))
         other = whole(torch.from_numpy(pictures))
     torch.testing.assert_close(one, other, atol=1e-5, rtol=1e-4)
 
