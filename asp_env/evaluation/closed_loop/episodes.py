@@ -16,7 +16,7 @@ from asp_env.data.rollout import Rollout
 from asp_env.data.scenarios.scenario import Scenario
 from asp_env.data.scene import EGO, Scene
 from asp_env.metrics.driving.map_context import map_context
-from asp_env.metrics.driving.realism import realism_features, realism
+from asp_env.metrics.driving.realism import realism, realism_features
 from asp_env.metrics.driving.rules import Rules
 from asp_env.metrics.driving.scores import (
     COMPLIANT_M,
