@@ -145,7 +145,11 @@ def drive(config: Drive) -> ClosedLoop:
                 *(name for name, p in predictors.items() if p.privileged),
             ],
             "traffic": config.traffic,
-            "metrics": {"preset": preset.name, "version": preset.version, "about": preset.about},
+            "metrics": {
+                "preset": preset.name,
+                "version": preset.version,
+                "about": preset.description,
+            },
             "horizon_s": config.horizon,
             "dt_s": config.dt,
             "part": part,
