@@ -130,7 +130,7 @@ def test_nothing_is_computed_that_nobody_asked_for(monkeypatch):
         raise AssertionError("nobody asked for this")
 
     simulation = simulate(on_road(), scenario())
-    monkeypatch.setattr(type(VIEW), "draw", refuse)
+    monkeypatch.setattr(type(VIEW), "render", refuse)
     monkeypatch.setattr("asp_env.sim.world.World.scene", refuse)
     _observe(simulation, "actions", "state")
     monkeypatch.setattr("asp_env.sim.observation.infer_actions", refuse)
