@@ -19,7 +19,7 @@ from asp_env.evaluation.report import check_report_possible, write_report
 from asp_env.evaluation.results import write_manifest, write_metrics
 from asp_env.evaluation.tables import driving_table, open_loop_tables
 from asp_env.files import atomic_folder
-from asp_env.metrics.driving.rules import DEFAULT_PRESET, RULES
+from asp_env.metrics.driving.rules import DEFAULT_RULES, RULES
 
 SITE = "intersection"
 PREDICTOR = "ffw-asp"
@@ -107,7 +107,7 @@ class Demo:
             )
         for table in (
             *open_loop_tables(opened.rows, opened.manifest["privileged"]),
-            driving_table(closed.rows, closed.manifest["privileged"], RULES[DEFAULT_PRESET].shown),
+            driving_table(closed.rows, closed.manifest["privileged"], RULES[DEFAULT_RULES].shown),
         ):
             console.print(table)
         console.print(f"wrote {self.out / 'report.html'}")

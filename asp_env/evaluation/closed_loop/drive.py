@@ -35,7 +35,7 @@ from asp_env.evaluation.results import Row, write_manifest, write_metrics
 from asp_env.evaluation.selection import PartChoice, no_data_error, short_names, ticks_to_judge
 from asp_env.evaluation.tables import driving_table
 from asp_env.files import atomic_folder
-from asp_env.metrics.driving.rules import DEFAULT_PRESET, RULES, Rules
+from asp_env.metrics.driving.rules import DEFAULT_RULES, RULES, Rules
 from asp_env.metrics.masked import Masked
 from asp_env.sim.world import world_class
 from asp_env.workers import WorkerPool, worker_pool
@@ -73,7 +73,7 @@ class Drive:
     """Seconds per tick."""
     part: PartChoice = "auto"
     """Which part of DATA; auto takes what no named predictor has seen."""
-    rules: str = DEFAULT_PRESET
+    rules: str = DEFAULT_RULES
     """Whose definitions judge the drives: nuplan, pdms, waymax or strict."""
     jobs: int = 1
     """Processes that drive, of one thread each; the results are the same whatever their number."""
@@ -146,7 +146,11 @@ def drive(config: Drive) -> ClosedLoop:
                 *(name for name, p in predictors.items() if p.privileged),
             ],
             "traffic": config.traffic,
-            "metrics": {"preset": preset.name, "version": preset.version, "about": preset.about},
+            "metrics": {
+                "preset": preset.name,
+                "version": preset.version,
+                "about": preset.description,
+            },
             "horizon_s": config.horizon,
             "dt_s": config.dt,
             "part": part,

@@ -16,13 +16,13 @@ from asp_env.data.rollout import Rollout
 from asp_env.data.scenarios.scenario import Scenario
 from asp_env.data.scene import EGO, Scene
 from asp_env.metrics.driving.map_context import map_context
-from asp_env.metrics.driving.realism import features, realism
+from asp_env.metrics.driving.realism import realism, realism_features
 from asp_env.metrics.driving.rules import Rules
 from asp_env.metrics.driving.scores import (
     COMPLIANT_M,
     OVERSPEED_MPS,
-    Drives,
-    against_traffic_m,
+    EpisodeRecord,
+    against_traffic_in_window_m,
     at_fault,
     overspeed_mps,
 )
@@ -55,8 +55,8 @@ def traffic_realism(world: World, active: Bool[np.ndarray, "b t"]) -> dict[str, 
             asked,
             world.dt_s,
         )
-        simulated = features(states, valid, *about)
-        for name, each in realism(features(logged, there, *about), [simulated]).items():
+        simulated = realism_features(states, valid, *about)
+        for name, each in realism(realism_features(logged, there, *about), [simulated]).items():
             found.setdefault(name, []).append(each)
     return {
         name: Masked(
@@ -88,7 +88,7 @@ class Decision:
 class DrivenEpisodes:
     """Episodes that have been driven, side by side, with everything that was said on the way."""
 
-    drives: Drives
+    drives: EpisodeRecord
     realism: Mapping[str, Masked]
     """Of the traffic; missing where it was replayed."""
     endings: Int[np.ndarray, " b"]
@@ -174,7 +174,7 @@ def _measure(
     events: Sequence[Events],
     active: Bool[np.ndarray, "b t"],
     preset: Rules,
-) -> Drives:
+) -> EpisodeRecord:
     episodes = world.episodes
     ticks = slice(world.history, world.history + len(events))
     states, valid = episodes.states[:, ticks], episodes.valid[:, ticks]
@@ -191,7 +191,7 @@ def _measure(
             valid=np.array([limit is not None for limit in limits]),
         ),
     )
-    return Drives(
+    return EpisodeRecord(
         states=states[:, :, EGO],
         log_states=episodes.log_states[:, ticks, EGO],
         contacts=contacts,
@@ -202,15 +202,15 @@ def _measure(
             episodes.sizes,
             contacts=contacts,
             ignored=episodes.own_trailer,
-            beside=found.several_lanes | found.at_crossing | (off_road_m > preset.off_road_m),
-            count=active.sum(axis=1),
+            wide_sector=found.several_lanes | found.at_crossing | (off_road_m > preset.off_road_m),
+            num_ticks=active.sum(axis=1),
             rule=preset.ttc,
             dt_s=world.dt_s,
         ),
         route_m=np.stack([each.route_m for each in events], axis=1),
         route_offset_m=np.stack([each.route_offset_m for each in events], axis=1),
         goal_m=events[0].goal_m,
-        on_map=found,
+        map_context=found,
         active=active,
         dt_s=world.dt_s,
     )
@@ -219,7 +219,7 @@ def _measure(
 def _collect(
     world: World,
     scenarios: Sequence[Scenario],
-    drives: Drives,
+    drives: EpisodeRecord,
     preset: Rules,
     said: Sequence[Decision],
     endings: Int[np.ndarray, " b"],
@@ -231,7 +231,7 @@ def _collect(
             at_fault(drives, preset),
             drives.off_road_m > preset.off_road_m,
             drives.ttc_s <= preset.ttc.min_ttc_s,
-            against_traffic_m(drives) > COMPLIANT_M,
+            against_traffic_in_window_m(drives) > COMPLIANT_M,
             over.valid & (over.value > OVERSPEED_MPS),
         ],
         axis=-1,

@@ -40,7 +40,7 @@ from asp_env.metrics.forecast.errors import (
 )
 from asp_env.metrics.forecast.feasibility import (
     infeasible_modes,
-    off_road_points,
+    off_road_modes,
     overlapping_modes,
 )
 from asp_env.metrics.masked import Masked
@@ -251,7 +251,7 @@ def _broken_rules(
     """(which modes break it, which targets it applies to), by metric."""
     future = truth.future
     known = np.asarray(future.valid.all(axis=1))
-    off_road, _ = off_road_points(truth.maps, truth.map_index, said.states[..., :2])
+    off_road, _ = off_road_modes(truth.maps, truth.map_index, said.states[..., :2])
     overlap = overlapping_modes(
         said.states,
         future.states,
@@ -276,7 +276,7 @@ def keeps_to_road(truth: GroundTruth) -> Bool[np.ndarray, " n"]:
     Who leaves it, as on the way to a parking place, cannot be forecast well and stay on it.
     """
     way = truth.states[:, None, truth.now :, :2]
-    off, known = off_road_points(truth.maps, truth.map_index, way)
+    off, known = off_road_modes(truth.maps, truth.map_index, way)
     return known & ~off[:, 0] & truth.valid[:, truth.now :].all(axis=1)
 
 

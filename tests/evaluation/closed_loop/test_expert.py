@@ -13,7 +13,7 @@ from asp_env.data.source import Recordings, open_data
 from asp_env.evaluation.closed_loop.episodes import DrivenEpisodes, drive_episodes
 from asp_env.metrics.driving.rules import NUPLAN, RULES, Rules
 from asp_env.metrics.driving.scores import driving_metrics
-from asp_env.metrics.lanes import covering
+from asp_env.metrics.lanes import covering_lanes
 from asp_env.planning.planner import load_planner
 from asp_env.sim.world import Ending
 from predictors.physical import ConstantVelocity
@@ -95,7 +95,7 @@ def test_a_missing_lanelet_raises_no_alarm() -> None:
     recording = recordings[0]
     road_map = recording.road_map
     followed = np.concatenate([recording.track(i)[::25, :2] for i in range(len(recording))])
-    busiest = int(covering(road_map, followed).sum(axis=0).argmax())
+    busiest = int(covering_lanes(road_map, followed).sum(axis=0).argmax())
     gappy = replace(recording, road_map=without_lane(road_map, busiest))
     driven, found = judged([gappy], NUPLAN, scenarios)
     for name in ("on road", "direction", "right way", "no at-fault collision", "progress"):
