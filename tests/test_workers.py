@@ -36,7 +36,13 @@ def exists(process: int) -> bool:
 def test_results_are_in_the_order_of_the_tasks(processes: int) -> None:
     """The first of five tasks takes the longest."""
     slow = partial(time.sleep, 0.5)
-    assert results(processes, [slow, *(partial(pow, 3, n) for n in range(4))]) == [None, 1, 3, 9, 27]
+    assert results(processes, [slow, *(partial(pow, 3, n) for n in range(4))]) == [
+        None,
+        1,
+        3,
+        9,
+        27,
+    ]
 
 
 def test_tasks_run_in_other_processes_that_are_gone_afterwards() -> None:
