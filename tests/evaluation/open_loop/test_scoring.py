@@ -280,7 +280,7 @@ def test_earlier_forecasts_are_stored_as_long_as_needed() -> None:
 
 
 def test_an_unknown_metric_is_an_error(scores: ForecastScores) -> None:
-    with pytest.raises(AspEnvError, match="cv: there is no metric 'PDM' of all modes"):
+    with pytest.raises(AspEnvError, match="cv: no metric 'PDM' of all modes was computed"):
         scores.of("cv", "PDM", "")
 
 
