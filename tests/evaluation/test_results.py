@@ -1,4 +1,4 @@
-"""Output folders: whole or not at all, in the contract's columns."""
+"""Output folders: complete or not there at all; columns and manifest."""
 
 import csv
 import json
@@ -86,8 +86,8 @@ def test_a_relative_folder_is_written_where_one_is(tmp_path, monkeypatch):
     assert os.listdir(tmp_path) == ["out"]
 
 
-def test_metrics_are_in_the_contracts_columns(tmp_path):
-    """The header letter by letter; unused columns empty; six digits."""
+def test_columns_of_the_metrics(tmp_path):
+    """The exact header; empty cells where a column does not apply; six digits."""
     rows = [
         Row(data="x,y", predictor="oracle", metric="FDE", value=1 / 3, n=7, horizon_s=3.0),
         Row(
@@ -116,13 +116,13 @@ def test_metrics_are_in_the_contracts_columns(tmp_path):
 
 
 def test_a_manifest_repeats_byte_for_byte(tmp_path):
-    """Command, configuration and versions; no time and no machine, so twice the same."""
+    """It contains command, configuration and versions, but no time and no machine."""
     texts = []
     for name in ("a", "b"):
         (tmp_path / name).mkdir()
         write_manifest(tmp_path / name, "drive", data="d", seeds=[0, 1])
         texts.append((tmp_path / name / "manifest.json").read_text())
     assert texts[0] == texts[1]
-    told = json.loads(texts[0])
-    assert (told["command"], told["data"], told["seeds"]) == ("drive", "d", [0, 1])
-    assert {"python", "numpy", "gymnasium", "asp-env"} <= set(told["versions"])
+    manifest = json.loads(texts[0])
+    assert (manifest["command"], manifest["data"], manifest["seeds"]) == ("drive", "d", [0, 1])
+    assert {"python", "numpy", "gymnasium", "asp-env"} <= set(manifest["versions"])

@@ -60,12 +60,12 @@ def test_a_video_of_one_rollout(drives, tmp_path, capsys):
     path = tmp_path / "film.mp4"
     assert main(["watch", str(one(drives)), "--video", str(path), *SMALL]) == 0
     assert capsys.readouterr().out.splitlines()[-1] == f"wrote {path}: 5.2 s"
-    pictures = frames(path)
-    assert len(pictures) == 20 + 1 + 5
-    assert {picture.shape for picture in pictures} == {(64, 96, 3)}
+    images = frames(path)
+    assert len(images) == 20 + 1 + 5
+    assert {image.shape for image in images} == {(64, 96, 3)}
     (film,) = make_films(load_rollouts(one(drives)), None)
     drawn = film.frame(2.0, size_px=(96, 64), extent_m=110.0)
-    assert np.abs(pictures[10].astype(int) - drawn).mean() < 8
+    assert np.abs(images[10].astype(int) - drawn).mean() < 8
     assert main(["watch", str(one(drives)), "--video", str(tmp_path / "b.mp4"), *SMALL]) == 0
     assert (tmp_path / "b.mp4").read_bytes() == path.read_bytes()
 

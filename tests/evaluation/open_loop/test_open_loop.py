@@ -8,7 +8,6 @@ import pytest
 
 from asp_env.data.classes import AgentClass
 from asp_env.errors import AspEnvError
-from asp_env.evaluation import selection
 from asp_env.evaluation.open_loop.evaluate import Evaluate, evaluate
 from asp_env.evaluation.results import Row
 from asp_env.evaluation.selection import load_predictors
@@ -129,7 +128,8 @@ def test_wrong_predictor_names_are_errors_of_one_line(names, what):
 
 def test_a_predictor_with_a_shorter_horizon_is_an_error(monkeypatch):
     short = ConstantVelocity(horizon=10, dt_s=0.2)
-    monkeypatch.setattr(selection, "load_predictor", lambda *_, **__: short)
+    loader = "asp_env.evaluation.selection.load_predictor"
+    monkeypatch.setattr(loader, lambda *_, **__: short)
     with pytest.raises(AspEnvError, match="forecasts 2 s, less than --horizon 3"):
         load_predictors(["short"], horizon=15, dt_s=0.2)
 
