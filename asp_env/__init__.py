@@ -1,34 +1,100 @@
 """Does this trajectory predictor make the car drive better?
 
 Importing this package registers the Gymnasium environments `asp_env/Replay-v0`,
-`asp_env/HighwayIntersection-v0` and `asp_env/HighwayRoundabout-v0`.
+`asp_env/HighwayIntersection-v0` and `asp_env/HighwayRoundabout-v0`. The public names are imported
+on first use, so that `import asp_env` stays cheap.
 """
+
+from importlib import import_module
+from typing import TYPE_CHECKING, Any
 
 import gymnasium
 
-from asp_env.data.source import load
-from asp_env.envs.registration import parallel_env, sb3_vec_env
-from asp_env.envs.wrappers import FlatParts, PredictionFeatures, VectorPredictionFeatures
-from asp_env.errors import AspEnvError
+if TYPE_CHECKING:
+    from asp_env.data.predictor import Forecast, Predictor
+    from asp_env.data.rollout import Rollout
+    from asp_env.data.scenarios.scenario import Scenario
+    from asp_env.data.scene import Scene
+    from asp_env.data.source import load, open_data
+    from asp_env.dynamics import denormalize_actions, normalize_actions
+    from asp_env.envs import (
+        FlatParts,
+        PredictionFeatures,
+        ReplayEnv,
+        ReplayVectorEnv,
+        VectorPredictionFeatures,
+        parallel_env,
+        sb3_vec_env,
+    )
+    from asp_env.errors import AspEnvError
+    from asp_env.planning.planner import Plan, Planner
 
 __all__ = [
     "AspEnvError",
     "FlatParts",
+    "Forecast",
+    "Plan",
+    "Planner",
     "PredictionFeatures",
+    "Predictor",
+    "ReplayEnv",
+    "ReplayVectorEnv",
+    "Rollout",
+    "Scenario",
+    "Scene",
     "VectorPredictionFeatures",
+    "denormalize_actions",
     "load",
+    "normalize_actions",
+    "open_data",
     "parallel_env",
     "sb3_vec_env",
 ]
 
-for _id, _given in (
+_MODULES = {
+    "asp_env.data.predictor": ("Forecast", "Predictor"),
+    "asp_env.data.rollout": ("Rollout",),
+    "asp_env.data.scenarios.scenario": ("Scenario",),
+    "asp_env.data.scene": ("Scene",),
+    "asp_env.data.source": ("load", "open_data"),
+    "asp_env.dynamics": ("denormalize_actions", "normalize_actions"),
+    "asp_env.envs": (
+        "FlatParts",
+        "PredictionFeatures",
+        "ReplayEnv",
+        "ReplayVectorEnv",
+        "VectorPredictionFeatures",
+        "parallel_env",
+        "sb3_vec_env",
+    ),
+    "asp_env.errors": ("AspEnvError",),
+    "asp_env.planning.planner": ("Plan", "Planner"),
+}
+_MODULE_OF = {name: module for module, names in _MODULES.items() for name in names}
+
+
+def __getattr__(name: str) -> Any:
+    """Imports a public name on first use."""
+    if name not in _MODULE_OF:
+        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+    value = getattr(import_module(_MODULE_OF[name]), name)
+    globals()[name] = value
+    return value
+
+
+def __dir__() -> list[str]:
+    """Lists the public names, imported or not."""
+    return sorted({*globals(), *__all__})
+
+
+for _name, _kwargs in (
     ("Replay", {}),
     ("HighwayIntersection", {"data": "highway:intersection"}),
     ("HighwayRoundabout", {"data": "highway:roundabout"}),
 ):
     gymnasium.register(
-        id=f"asp_env/{_id}-v0",
+        id=f"asp_env/{_name}-v0",
         entry_point="asp_env.envs.replay:ReplayEnv",
         vector_entry_point="asp_env.envs.vector:ReplayVectorEnv",
-        kwargs=_given,
+        kwargs=_kwargs,
     )

@@ -1,4 +1,4 @@
-"""`asp-env COMMAND …`: the commands that this package and others register."""
+"""The command `asp-env COMMAND …`, with the commands that this and other packages register."""
 
 import contextlib
 import io
@@ -15,6 +15,7 @@ from asp_env import registry
 from asp_env.errors import AspEnvError
 
 BAD_INPUT = 2
+"""Exit status for input that a command rejects."""
 
 RENAMED_OPTIONS = {
     ("drive", "--most"): "--max-scenarios",
@@ -23,24 +24,32 @@ RENAMED_OPTIONS = {
     ("train", "--drawing"): "--num-workers",
     ("table", "--preset"): "--recipe",
 }
-"""Old names of options, by command. They work for one more release, with a warning."""
+"""Deprecated options by command. They work for one more release, with a warning."""
 
 
 def main(argv: Sequence[str] | None = None) -> int:
-    """Runs one command; 0 on success, 2 with one line on stderr for bad input."""
-    given = list(sys.argv[1:] if argv is None else argv)
-    if not given or given[0] in ("-h", "--help"):
-        _list_commands()
+    """Runs one command.
+
+    Args:
+        argv: the command and its options, by default those of the process.
+
+    Returns:
+        The exit status: 0 on success, 2 with one line on stderr for bad input, 130 when
+        interrupted.
+    """
+    args = list(sys.argv[1:] if argv is None else argv)
+    if not args or args[0] in ("-h", "--help"):
+        _print_commands()
         return 0
-    name, rest = given[0], given[1:]
+    name, options = args[0], args[1:]
     try:
         command = registry.find("commands", name)
-        _parse(name, command, _with_current_names(name, rest)).run()
+        _parse(name, command, _with_current_names(name, options)).run()
     except AspEnvError as error:
-        return _refuse(str(error))
+        return _report(str(error))
     except OSError as error:
-        where = f"{error.filename}: " if error.filename else ""
-        return _refuse(f"{where}{error.strerror or error}")
+        path = f"{error.filename}: " if error.filename else ""
+        return _report(f"{path}{error.strerror or error}")
     except KeyboardInterrupt:
         sys.stderr.write("asp-env: interrupted\n")
         return 130
@@ -60,39 +69,40 @@ def _with_current_names(command: str, args: Sequence[str]) -> list[str]:
     return current
 
 
-def _parse(name: str, command: Any, rest: Sequence[str]) -> Any:
-    """The command with its options.
+def _parse(name: str, command: Any, args: Sequence[str]) -> Any:
+    """Returns the command with its options.
 
     Raises:
-        AspEnvError: they are not understood; the parser's box of text becomes one line.
+        AspEnvError: an option is unknown, missing or invalid, in one line instead of tyro's box.
     """
-    told = io.StringIO()
+    stderr = io.StringIO()
     try:
-        with contextlib.redirect_stderr(told):
-            return tyro.cli(command, prog=f"asp-env {name}", args=rest)
+        with contextlib.redirect_stderr(stderr):
+            return tyro.cli(command, prog=f"asp-env {name}", args=args)
     except SystemExit as stop:
         if not stop.code:
             raise
-        lines = [line.strip("│─ ") or ";" for line in told.getvalue().splitlines()[1:-1]]
-        what = re.split("; (?:For full|Argument) helptext", " ".join(lines).replace(" ;", ";"))[0]
-        raise AspEnvError(f"{what.rstrip('.')}; see asp-env {name} --help") from None
+        lines = [line.strip("│─ ") or ";" for line in stderr.getvalue().splitlines()[1:-1]]
+        text = " ".join(lines).replace(" ;", ";")
+        problem = re.split("; (?:For full|Argument) helptext", text)[0].rstrip(".")
+        raise AspEnvError(f"{problem}; see asp-env {name} --help") from None
 
 
-def _refuse(message: str) -> int:
+def _report(message: str) -> int:
     sys.stderr.write(f"asp-env: {' '.join(message.split())}\n")
     return BAD_INPUT
 
 
-def _list_commands() -> None:
+def _print_commands() -> None:
     table = Table(box=None, show_header=False, padding=(0, 2))
     for name in registry.names("commands"):
         try:
-            what = registry.find("commands", name).__doc__ or ""
+            description = registry.find("commands", name).__doc__ or ""
         except AspEnvError as error:
-            what = str(error)
-        table.add_row(name, what.strip().partition("\n")[0])
+            description = str(error)
+        table.add_row(name, description.strip().partition("\n")[0])
     console = Console()
-    console.print("usage: asp-env COMMAND …    (asp-env COMMAND --help tells its options)\n")
+    console.print("usage: asp-env COMMAND …    (asp-env COMMAND --help lists its options)\n")
     console.print(table)
 
 

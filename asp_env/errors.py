@@ -1,11 +1,11 @@
-"""What goes wrong because of what the user gave: one line, never a traceback."""
+"""Errors caused by user input. Commands print their message, one line, instead of a traceback."""
 
 import difflib
 from collections.abc import Iterable
 
 
 class AspEnvError(ValueError):
-    """Bad input. The message is one line: what was given, what was expected, what to do."""
+    """Invalid input. The one-line message states what was given, what was expected, what to do."""
 
 
 class DataError(AspEnvError):
@@ -17,10 +17,16 @@ class CheckpointError(AspEnvError):
 
 
 class MissingExtraError(AspEnvError, ImportError):
-    """A package is needed that the core does not install."""
+    """A package is missing that only an optional extra installs."""
 
     def __init__(self, package: str, extra: str, purpose: str) -> None:
-        """Names the package, the extra that installs it and what it is for."""
+        """Composes the message.
+
+        Args:
+            package: the missing package.
+            extra: the extra of asp-env that installs it.
+            purpose: what needs the package.
+        """
         super().__init__(
             f"{purpose} needs the package {package!r}, which is not installed: "
             f"pip install 'asp-env[{extra}]'"
@@ -28,7 +34,13 @@ class MissingExtraError(AspEnvError, ImportError):
 
 
 def unknown_name(kind: str, given: str, known: Iterable[str]) -> AspEnvError:
-    """An error that lists the known names of a kind and suggests the nearest one."""
+    """An error that suggests the most similar known name and lists all of them.
+
+    Args:
+        kind: what the name stands for, such as `predictor`.
+        given: the unknown name.
+        known: all known names.
+    """
     names = sorted(known)
     near = difflib.get_close_matches(given, names, n=1)
     hint = f" (did you mean {near[0]!r}?)" if near else ""

@@ -1,13 +1,18 @@
-"""Plugs by name: the entry points of this package and of anybody else's.
+"""Plugs: objects that this package and any other package register by name, as entry points.
 
-A plug is a line in the `pyproject.toml` of the package that ships it:
+A package registers a plug in its `pyproject.toml`:
 
     [project.entry-points."asp_env.predictors"]
     my-predictor = "my_package.module:MyPredictor"
 
-Groups: `asp_env.predictors`, `asp_env.planners`, `asp_env.drivers` (who moves the traffic),
-`asp_env.sources` (schemes of DATA such as `synthetic:`), `asp_env.worlds` (where the data of such a
-scheme are driven, unless they are replayed), `asp_env.commands` (sub-commands of `asp-env`).
+The groups are:
+
+- `asp_env.predictors`: forecast the targets of a scene;
+- `asp_env.planners`: plan the ego's actions;
+- `asp_env.drivers`: move the agents other than the ego;
+- `asp_env.sources`: data by `scheme:argument`, such as `synthetic:intersection`;
+- `asp_env.worlds`: simulate the data of a source that are not replayed, such as `highway:`;
+- `asp_env.commands`: sub-commands of `asp-env`.
 """
 
 from functools import cache
@@ -25,15 +30,19 @@ def _plugs(group: Group) -> dict[str, EntryPoint]:
 
 
 def names(group: Group) -> tuple[str, ...]:
-    """The names that a group knows, in alphabetical order."""
+    """The names registered in a group, in alphabetical order."""
     return tuple(sorted(_plugs(group)))
 
 
 def find(group: Group, name: str) -> Any:
-    """The object registered under `name`; its module is imported only now.
+    """Imports and returns the object registered under a name.
+
+    Args:
+        group: the group.
+        name: the registered name.
 
     Raises:
-        AspEnvError: the name is unknown (known ones are listed), or its module is missing.
+        AspEnvError: the name is unknown (the message lists all names), or a package is missing.
     """
     plugs = _plugs(group)
     if name not in plugs:

@@ -1,1 +1,1 @@
-"""Short programs to start from; each runs on what is shipped."""
+"""Short programs to start from; each runs on the data that the package ships."""

@@ -1,4 +1,4 @@
-"""How the examples of PPO train, and how they are judged on scenarios that they never saw."""
+"""Training of PPO and its comparison on held-out scenarios, for the examples of PPO."""
 
 from collections.abc import Callable, Sequence
 from pathlib import Path
@@ -12,9 +12,9 @@ from stable_baselines3.common.vec_env import VecMonitor, VecNormalize
 import asp_env
 
 Policy = Callable[[Any], np.ndarray]
-"""From observations to actions."""
+"""A function from observations to actions."""
 Scores = dict[tuple[str, str], dict[str, float]]
-"""Means by policy and DATA."""
+"""Means by policy and data."""
 
 GAMMA = 0.99
 
@@ -30,7 +30,7 @@ def train_and_compare(
     settings: dict[str, Any],
     **options: Any,
 ) -> Scores:
-    """Trains PPO, and drives up to `count` scenarios of each held-out DATA with it and without."""
+    """Trains PPO and scores it, zero actions and random actions on up to `count` scenarios."""
     if train_on.startswith("runs/") and not Path(train_on).exists():
         from scenarios.sumo import synthesize
 
@@ -41,7 +41,7 @@ def train_and_compare(
         norm_obs_keys=["state", "route"],
         gamma=GAMMA,
     )
-    # with the usual deviation at first, steering of up to 45 degrees leaves every road
+    # With the default initial deviation, steering of up to 45 degrees leaves every road.
     policy = {"features_extractor_class": features, "log_std_init": -2.0, "net_arch": [128, 128]}
     model = PPO(
         "MultiInputPolicy", envs, gamma=GAMMA, policy_kwargs=policy, seed=0, device="cpu",
@@ -50,9 +50,9 @@ def train_and_compare(
     model.learn(steps)
     rng = np.random.default_rng(0)
     policies: dict[str, Policy] = {
-        "PPO": lambda seen: model.predict(envs.normalize_obs(seen), deterministic=True)[0],
-        "zero actions": lambda seen: np.zeros((len(seen["state"]), 2)),
-        "random actions": lambda seen: rng.uniform(-1, 1, (len(seen["state"]), 2)),
+        "PPO": lambda obs: model.predict(envs.normalize_obs(obs), deterministic=True)[0],
+        "zero actions": lambda obs: np.zeros((len(obs["state"]), 2)),
+        "random actions": lambda obs: rng.uniform(-1, 1, (len(obs["state"]), 2)),
     }
     return {
         (name, data): score(policy, data, count, **options)
@@ -62,18 +62,18 @@ def train_and_compare(
 
 
 def score(policy: Policy, data: str, count: int, **options: Any) -> dict[str, float]:
-    """Drives up to that many scenarios of DATA, evenly chosen, and averages over them."""
+    """Drives up to `count` evenly spaced scenarios and returns the means over them."""
     envs = asp_env.sb3_vec_env(count, data, **options)
     last = len(envs.get_attr("scenarios", 0)[0]) - 1
-    chosen = np.unique(np.linspace(0, last, count).astype(int)).tolist()
-    envs.set_options([{"scenario": chosen[b % len(chosen)]} for b in range(count)])
-    seen, running = envs.reset(), np.arange(count) < len(chosen)
+    scenarios = np.unique(np.linspace(0, last, count).astype(int)).tolist()
+    envs.set_options([{"scenario": scenarios[b % len(scenarios)]} for b in range(count)])
+    obs, running = envs.reset(), np.arange(count) < len(scenarios)
     reward, progress, at_fault = np.zeros((3, count))
     while running.any():
-        seen, gained, over, infos = envs.step(policy(seen))
-        reward += gained * running
-        for b in np.flatnonzero(over & running):
+        obs, step_reward, done, infos = envs.step(policy(obs))
+        reward += step_reward * running
+        for b in np.flatnonzero(done & running):
             progress[b], at_fault[b] = infos[b]["progress"], infos[b]["at_fault"]
-        running &= ~over
-    means = {"reward": reward, "progress": progress, "at fault": at_fault}
-    return {name: round(float(each[: len(chosen)].mean()), 3) for name, each in means.items()}
+        running &= ~done
+    columns = {"reward": reward, "progress": progress, "at fault": at_fault}
+    return {name: round(float(each[: len(scenarios)].mean()), 3) for name, each in columns.items()}

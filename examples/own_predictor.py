@@ -1,19 +1,19 @@
-"""A predictor of your own in the loop: everybody brakes gently, in two modes."""
+"""A predictor of your own in the loop: every agent keeps its speed or brakes gently."""
 
+import sys
 from typing import ClassVar
 
 import numpy as np
 
-from asp_env.data.predictor import Forecast, fill_missing, make_forecast
-from asp_env.data.scene import Scene
+from asp_env import Forecast, ReplayEnv, Scene, normalize_actions
+from asp_env.data.predictor import fill_missing, make_forecast
 from asp_env.data.snippets import Future
-from asp_env.dynamics import MAX_ACCELERATION_MPS2, MAX_STEERING_RAD, rollout
-from asp_env.envs.replay import ReplayEnv
+from asp_env.dynamics import rollout
 from asp_env.planning.sampling import SamplingPlanner
 
 
 class Braking:
-    """Half of all drivers keep their speed, half brake by 2 m/s²; nobody steers."""
+    """Forecasts two equally probable modes: constant speed, and braking by 2 m/s²."""
 
     name = "braking"
     privileged = False
@@ -24,17 +24,17 @@ class Braking:
     metadata: ClassVar[dict[str, str]] = {}
 
     def predict(self, scene: Scene, future: Future | None = None) -> Forecast:
-        """Two modes for every target, through the bicycle model."""
+        """Forecasts every target of the scene by actions through the bicycle model."""
         del future
         scene.check_dt(self.dt_s, self.name)
-        at = (scene.targets[:, 0], scene.targets[:, 1])
         actions = np.zeros((len(scene.targets), 2, self.horizon, 2), dtype=np.float32)
         actions[:, 1, :, 0] = -2.0
-        now = np.repeat(scene.target_states[:, None], 2, axis=1)
-        lengths = np.repeat(scene.sizes[at][:, :1], 2, axis=1)
+        situation, slot = scene.targets.T
+        states = np.repeat(scene.target_states[:, None], 2, axis=1)
+        lengths_m = np.repeat(scene.sizes[situation, slot, :1], 2, axis=1)
         return make_forecast(
             scene,
-            states=rollout(now, actions, lengths, self.dt_s),
+            states=rollout(states, actions, lengths_m, self.dt_s),
             actions=actions,
             log_probs=np.full(actions.shape[:2], np.log(0.5)),
             valid=scene.predictable,
@@ -50,13 +50,11 @@ def main() -> float:
     while not done:
         scene = env.scene()
         plan = planner.plan(scene, fill_missing(predictor.predict(scene), scene))
-        action = plan.actions[0, 0] / [MAX_ACCELERATION_MPS2, MAX_STEERING_RAD]
-        _, _, terminated, truncated, info = env.step(action.astype(np.float32))
+        action = normalize_actions(plan.actions[0, 0])
+        _, _, terminated, truncated, info = env.step(action)
         done = terminated or truncated
     return info["progress"]
 
 
 if __name__ == "__main__":
-    import sys
-
-    sys.stdout.write(f"{main():.2f} of the way\n")
+    sys.stdout.write(f"progress {main():.2f}\n")

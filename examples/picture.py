@@ -1,4 +1,4 @@
-"""Draw a situation of the sample: what people see, and the raster that a network sees."""
+"""Draw a scene of the sample for people, beside the raster that a network sees."""
 
 from pathlib import Path
 
@@ -6,15 +6,15 @@ import cv2
 import numpy as np
 from jaxtyping import UInt8
 
+from asp_env import ReplayEnv
 from asp_env.data.predictor import load_predictor
-from asp_env.envs.replay import ReplayEnv
 from asp_env.render.frames import draw_frame
 
 ROAD, AGENTS, TRAIL, EGO = (150, 150, 150), (235, 120, 60), (250, 220, 90), (80, 200, 120)
 
 
 def main(out: Path = Path("docs/scene.png"), *, scenario: int = 16, steps: int = 6) -> Path:
-    """Coasts for some steps, then draws the scene with a forecast beside the ego's raster."""
+    """Drives some steps with zero actions, then draws the scene, a forecast and the raster."""
     env = ReplayEnv(observations=("raster",))
     observation, _ = env.reset(seed=0, options={"scenario": scenario})
     for _ in range(steps):
@@ -24,7 +24,7 @@ def main(out: Path = Path("docs/scene.png"), *, scenario: int = 16, steps: int =
     background = env.recordings[env.scenarios[scenario].recording].background
     frame = draw_frame(scene, forecast=forecast, background=background)
     raster = cv2.resize(
-        coloured(observation["raster"]),
+        colour(observation["raster"]),
         (frame.shape[0] * 2 // 3, frame.shape[0]),
         interpolation=cv2.INTER_NEAREST,
     )
@@ -34,12 +34,12 @@ def main(out: Path = Path("docs/scene.png"), *, scenario: int = 16, steps: int =
     return out
 
 
-def coloured(raster: UInt8[np.ndarray, "12 h w"]) -> UInt8[np.ndarray, "h w 3"]:
-    """The twelve channels as one picture, older boxes darker."""
+def colour(raster: UInt8[np.ndarray, "12 h w"]) -> UInt8[np.ndarray, "h w 3"]:
+    """Draws the twelve channels as one picture, with darker boxes for earlier ticks."""
     picture = np.full((*raster.shape[1:], 3), 20, dtype=np.uint8)
     picture[raster[0] > 0] = ROAD
-    for age, channel in enumerate(raster[3:], start=1):
-        picture[channel > 0] = np.array(AGENTS) * age // 9
+    for number, channel in enumerate(raster[3:], start=1):
+        picture[channel > 0] = np.array(AGENTS) * number // 9
     picture[raster[2] > 0] = TRAIL
     picture[raster[1] > 0] = EGO
     return picture

@@ -1,4 +1,6 @@
-"""Drive with random actions on the shipped sample and tell how it went."""
+"""Drive with random actions on the shipped sample and print how each episode ends."""
+
+import sys
 
 import gymnasium as gym
 
@@ -6,11 +8,11 @@ import asp_env
 
 
 def main(episodes: int = 3) -> list[str]:
-    """Returns how each episode ended."""
+    """Returns a line for each episode: its scenario, its ending and the sum of its rewards."""
     env = gym.make("asp_env/Replay-v0", observations=("actions", "state"))
     env = asp_env.FlatParts(env)
     env.action_space.seed(0)
-    endings = []
+    lines = []
     for episode in range(episodes):
         _, info = env.reset(seed=episode)
         reward_sum, done = 0.0, False
@@ -18,11 +20,9 @@ def main(episodes: int = 3) -> list[str]:
             _, reward, terminated, truncated, info = env.step(env.action_space.sample())
             reward_sum += float(reward)
             done = terminated or truncated
-        endings.append(f"{info['scenario']}: {info['ending']}, reward {reward_sum:.2f}")
-    return endings
+        lines.append(f"{info['scenario']}: {info['ending']}, reward {reward_sum:.2f}")
+    return lines
 
 
 if __name__ == "__main__":
-    import sys
-
     sys.stdout.write("\n".join(main()) + "\n")

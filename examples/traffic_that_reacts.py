@@ -1,7 +1,7 @@
-"""A car that brakes to a stand: replayed traffic drives into it, highway-env's vehicles do not.
+"""Collisions with a braking car: replayed traffic does not react, highway-env's vehicles do.
 
-The same recordings of highway-env's intersection are driven twice: replayed, and with the vehicles
-driving themselves. The ego brakes as hard as it can from the first tick on.
+The same recordings of highway-env's intersection are driven twice: replayed, and with vehicles that
+drive themselves. The ego brakes as hard as possible from the first tick.
 """
 
 import sys
@@ -10,29 +10,29 @@ from pathlib import Path
 
 import numpy as np
 
-from asp_env.envs.replay import ReplayEnv
+from asp_env import ReplayEnv
 from scenarios.synthesize import Synthesize
 
 BRAKE = np.array([-1.0, 0.0], dtype=np.float32)
 
 
 def count_hits(data: str) -> tuple[int, int]:
-    """In how many scenarios the stopped car is hit by others, and how many scenarios there are."""
+    """Returns the number of scenarios in which the ego is hit without fault, and of all."""
     env = ReplayEnv(data, observations=("state",), scenarios="length>=6")
     hits = 0
     for number in range(len(env.scenarios)):
         env.reset(seed=0, options={"scenario": number})
-        over = hit = False
-        while not over:
+        done = hit = False
+        while not done:
             _, _, terminated, truncated, info = env.step(BRAKE)
             hit |= info["collision"] and not info["at_fault"]
-            over = terminated or truncated
+            done = terminated or truncated
         hits += hit
     return hits, len(env.scenarios)
 
 
 def main(folder: Path, *, minutes: float = 1.0) -> dict[str, tuple[int, int]]:
-    """Hits and scenarios by world, on recordings that are made if the folder does not exist."""
+    """Returns hits and scenarios by world; makes the recordings if the folder does not exist."""
     if not folder.exists():
         Synthesize(out=folder, site="highway:intersection", recordings=1, minutes=minutes).run()
     return {
@@ -42,7 +42,7 @@ def main(folder: Path, *, minutes: float = 1.0) -> dict[str, tuple[int, int]]:
 
 
 if __name__ == "__main__":
-    with tempfile.TemporaryDirectory() as aside:
-        given = Path(sys.argv[1]) if len(sys.argv) > 1 else Path(aside) / "highway"
-        for world, (hits, scenarios) in main(given).items():
+    with tempfile.TemporaryDirectory() as temporary:
+        folder = Path(sys.argv[1]) if len(sys.argv) > 1 else Path(temporary) / "highway"
+        for world, (hits, scenarios) in main(folder).items():
             sys.stdout.write(f"{world}: hit in {hits} of {scenarios} scenarios\n")

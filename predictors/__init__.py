@@ -1,1 +1,1 @@
-"""Forecasters, learned and physical, and how they are trained."""
+"""Trajectory predictors: physical ones, networks, their training and their use."""

@@ -1,4 +1,4 @@
-"""Forecasters without weights: the first rows of every table, and the oracle."""
+"""Predictors without weights: constant velocity, constant turn rate, and the oracle."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -16,12 +16,13 @@ from asp_env.errors import AspEnvError
 from asp_env.geometry import wrap_angle
 
 TURN_OVER_S = 0.6
-"""The present yaw rate is the mean over this time: one step of 0.2 s is mostly noise."""
+"""Time over which the present yaw rate is averaged. Chosen by hand: a single step of 0.2 s is
+mostly measurement noise."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class ConstantVelocity:
-    """Each target goes straight on at its present speed: zero actions."""
+    """Continues straight at the present speed: zero actions."""
 
     horizon: int
     dt_s: float
@@ -32,38 +33,38 @@ class ConstantVelocity:
 
     @property
     def metadata(self) -> Mapping[str, str]:
-        """Nothing: it is not trained."""
+        """Empty: nothing is trained."""
         return {}
 
     @classmethod
     def from_name(cls, argument: str, *, horizon: int, dt_s: float) -> "ConstantVelocity":
-        """The predictor for any horizon and time step; it takes no argument.
+        """Makes the predictor for any horizon (ticks) and time step.
 
         Raises:
-            AspEnvError: there is an argument.
+            AspEnvError: The argument is not empty.
         """
         _refuse_argument("constant-velocity", argument)
         return cls(horizon=horizon, dt_s=dt_s)
 
     def predict(self, scene: Scene, future: Future | None = None) -> Forecast:
-        """Forecasts the targets in one mode; reads no future.
+        """Forecasts the targets in one mode; the future is ignored.
 
         Raises:
-            AspEnvError: the scene has another time step.
+            AspEnvError: The scene has another time step.
         """
         del future
         scene.check_dt(self.dt_s, self.name)
         states = constant_velocity(scene, steps=self.horizon)
         actions = np.zeros((*states.shape[:-1], 2), dtype=states.dtype)
-        return _one_mode(scene, states, actions, seen_for(scene, self.history))
+        return _one_mode(scene, states, actions, predictable_targets(scene, self.history))
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class ConstantTurnRate:
-    """Each target keeps its present speed and the yaw rate it had over the last 0.6 s.
+    """Continues at the present speed and the mean yaw rate of the last 0.6 s.
 
-    The yaw rate is turned into the steering that causes it at the present speed, which is then
-    held; steering stays within ±π/4, and is 0 below 0.5 m/s.
+    The yaw rate is converted to the steering that causes it at the present speed, which then stays
+    constant, within ±π/4; it is 0 below 0.5 m/s.
     """
 
     horizon: int
@@ -74,41 +75,41 @@ class ConstantTurnRate:
 
     @property
     def history(self) -> int:
-        """The ticks that 0.6 s span, at least one."""
+        """Ticks within 0.6 s, at least one."""
         return max(1, round(TURN_OVER_S / self.dt_s))
 
     @property
     def metadata(self) -> Mapping[str, str]:
-        """Nothing: it is not trained."""
+        """Empty: nothing is trained."""
         return {}
 
     @classmethod
     def from_name(cls, argument: str, *, horizon: int, dt_s: float) -> "ConstantTurnRate":
-        """The predictor for any horizon and time step; it takes no argument.
+        """Makes the predictor for any horizon (ticks) and time step.
 
         Raises:
-            AspEnvError: there is an argument.
+            AspEnvError: The argument is not empty.
         """
         _refuse_argument("constant-turn-rate", argument)
         return cls(horizon=horizon, dt_s=dt_s)
 
     def predict(self, scene: Scene, future: Future | None = None) -> Forecast:
-        """Forecasts the targets in one mode; reads no future.
+        """Forecasts the targets in one mode; the future is ignored.
 
         Raises:
-            AspEnvError: the scene has another time step, or a history shorter than 0.6 s.
+            AspEnvError: The scene has another time step, or a history shorter than 0.6 s.
         """
         del future
         scene.check_dt(self.dt_s, self.name)
-        valid = seen_for(scene, self.history)
-        at = (scene.targets[:, 0], scene.targets[:, 1])
-        headings = scene.states[at][:, -self.history - 1 :, 2]
+        valid = predictable_targets(scene, self.history)
+        index = (scene.targets[:, 0], scene.targets[:, 1])
+        headings = scene.states[index][:, -self.history - 1 :, 2]
         headings = np.where(valid[:, None], headings, 0)
-        turned = wrap_angle(np.diff(headings, axis=-1)).mean(axis=-1)
+        turn_per_tick = wrap_angle(np.diff(headings, axis=-1)).mean(axis=-1)
         now = np.where(valid[:, None], scene.target_states, 0).astype(np.float32)
-        lengths = np.where(valid, scene.sizes[at][:, 0], 1).astype(np.float32)
+        lengths = np.where(valid, scene.sizes[index][:, 0], 1).astype(np.float32)
         after = now.copy()
-        after[:, 2] += turned
+        after[:, 2] += turn_per_tick
         action = clip_actions(inverse(now, after, lengths, self.dt_s))
         actions = np.repeat(action[:, None], self.horizon, axis=1)
         states = rollout(now, actions, lengths, self.dt_s, reverse=True)
@@ -117,11 +118,11 @@ class ConstantTurnRate:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Oracle:
-    """The recorded future as a single mode: what a perfect forecast would be worth.
+    """The recorded future as a single mode: a perfect forecast, for comparison.
 
-    It forecasts agents of any class. Where the recording has a gap the states in between are
-    interpolated, and behind its end the last speed and heading are kept. The actions are those
-    inferred from the states, which may exceed the limits of actions.
+    It forecasts agents of any class. States in gaps of the recording are interpolated; after its
+    end the target continues at its last speed and heading. The actions are inferred from the states
+    and may exceed the limits of actions.
     """
 
     horizon: int
@@ -133,24 +134,24 @@ class Oracle:
 
     @property
     def metadata(self) -> Mapping[str, str]:
-        """Nothing: it is not trained."""
+        """Empty: nothing is trained."""
         return {}
 
     @classmethod
     def from_name(cls, argument: str, *, horizon: int, dt_s: float) -> "Oracle":
-        """The predictor for any horizon and time step; it takes no argument.
+        """Makes the predictor for any horizon (ticks) and time step.
 
         Raises:
-            AspEnvError: there is an argument.
+            AspEnvError: The argument is not empty.
         """
         _refuse_argument("oracle", argument)
         return cls(horizon=horizon, dt_s=dt_s)
 
     def predict(self, scene: Scene, future: Future | None = None) -> Forecast:
-        """Repeats the future of targets that are there now and at one tick to come at least.
+        """Returns the future of targets that are present now and recorded at a future tick.
 
         Raises:
-            AspEnvError: the scene has another time step, or there is no future of this horizon.
+            AspEnvError: The scene has another time step, or the future is missing or too short.
         """
         scene.check_dt(self.dt_s, self.name)
         if future is None or future.states.shape[1] < self.horizon:
@@ -159,31 +160,31 @@ class Oracle:
                 f"oracle needs the recorded future of {self.horizon} ticks and was given {given}: "
                 "it works on recordings only"
             )
-        at = (scene.targets[:, 0], scene.targets[:, 1])
+        index = (scene.targets[:, 0], scene.targets[:, 1])
         known = future.valid[:, : self.horizon]
-        valid = scene.valid[at][:, -1] & known.any(axis=-1)
+        valid = scene.valid[index][:, -1] & known.any(axis=-1)
         now = np.where(valid[:, None], scene.target_states, 0)
-        states = _filled(now, future.states[:, : self.horizon], known, self.dt_s)
-        lengths = np.where(valid, scene.sizes[at][:, 0], 1).astype(np.float32)[:, None]
+        states = _fill_gaps(now, future.states[:, : self.horizon], known, self.dt_s)
+        lengths = np.where(valid, scene.sizes[index][:, 0], 1).astype(np.float32)[:, None]
         before = np.concatenate([now[:, None], states[:, :-1]], axis=1)
         actions = inverse(before, states, lengths, self.dt_s)
         return _one_mode(scene, states, actions, valid)
 
 
-def seen_for(scene: Scene, history: int) -> Bool[np.ndarray, " t"]:
-    """Which targets are of a predicted class and were seen now and at the last `history` ticks.
+def predictable_targets(scene: Scene, history: int) -> Bool[np.ndarray, " t"]:
+    """Mask of targets of a predicted class that are valid now and at the last `history` ticks.
 
     Raises:
-        AspEnvError: the scene itself has a shorter history.
+        AspEnvError: The scene has a shorter history.
     """
     if scene.history < history:
         raise AspEnvError(
             f"the predictor needs {history} past ticks, the scene has {scene.history}: "
             "make the scene with a longer history"
         )
-    at = (scene.targets[:, 0], scene.targets[:, 1])
-    known = np.isin(scene.classes[at], [int(kind) for kind in PREDICTED])
-    return known & scene.valid[at][:, scene.history - history :].all(axis=-1)
+    index = (scene.targets[:, 0], scene.targets[:, 1])
+    predicted = np.isin(scene.classes[index], [int(kind) for kind in PREDICTED])
+    return predicted & scene.valid[index][:, scene.history - history :].all(axis=-1)
 
 
 def _refuse_argument(name: str, argument: str) -> None:
@@ -191,34 +192,44 @@ def _refuse_argument(name: str, argument: str) -> None:
         raise AspEnvError(f"predictor {name} takes no argument, {argument!r} was given: use {name}")
 
 
-def _filled(
+def _fill_gaps(
     now: Float[np.ndarray, "t 4"],
     future: Float[np.ndarray, "t steps 4"],
     known: Bool[np.ndarray, "t steps"],
     dt_s: float,
 ) -> Float[np.ndarray, "t steps 4"]:
-    """The future where it is known, bit for bit; between along a line, behind straight on."""
+    """Future states without gaps: interpolated between known ticks, constant velocity after them.
+
+    Args:
+        now: States now.
+        future: Recorded states; any values where they are not known.
+        known: Mask of the recorded ticks.
+        dt_s: Time step.
+
+    Returns:
+        The recorded states unchanged where they are known.
+    """
     steps = future.shape[1]
     ticks = np.arange(steps + 1)
-    there = np.concatenate([np.ones((len(known), 1), dtype=bool), known], axis=1)
+    present = np.concatenate([np.ones((len(known), 1), dtype=bool), known], axis=1)
     states = np.concatenate([now[:, None], future], axis=1).astype(np.float64)
-    states = np.where(there[..., None], states, 0)
-    last = np.maximum.accumulate(np.where(there, ticks, 0), axis=1)
-    following = np.where(there, ticks, steps + 1)[:, ::-1]
+    states = np.where(present[..., None], states, 0)
+    last = np.maximum.accumulate(np.where(present, ticks, 0), axis=1)
+    following = np.where(present, ticks, steps + 1)[:, ::-1]
     following = np.minimum.accumulate(following, axis=1)[:, ::-1]
-    inside = (following <= steps)[..., None]
+    in_gap = (following <= steps)[..., None]
     rows = np.arange(len(states))[:, None]
     before, after = states[rows, last], states[rows, np.minimum(following, steps)]
 
     span = after - before
     span[..., 2] = wrap_angle(span[..., 2])
     share = (ticks - last) / np.maximum(following - last, 1)
-    between = before + share[..., None] * span
-    way_m = before[..., 3] * (ticks - last) * dt_s
-    behind = before.copy()
-    behind[..., 0] += way_m * np.cos(before[..., 2])
-    behind[..., 1] += way_m * np.sin(before[..., 2])
-    filled = np.where(inside, between, behind)
+    interpolated = before + share[..., None] * span
+    distance_m = before[..., 3] * (ticks - last) * dt_s
+    continued = before.copy()
+    continued[..., 0] += distance_m * np.cos(before[..., 2])
+    continued[..., 1] += distance_m * np.sin(before[..., 2])
+    filled = np.where(in_gap, interpolated, continued)
     filled[..., 2] = wrap_angle(filled[..., 2])
     return np.where(known[..., None], future, filled[:, 1:]).astype(np.float32)
 

@@ -1,1 +1,1 @@
-"""Where traffic comes from besides recordings."""
+"""Sources of traffic other than recordings: SUMO and highway-env."""

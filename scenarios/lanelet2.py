@@ -1,6 +1,6 @@
-"""Lanelets, and how they are written as a lanelet2 map.
+"""Lanelets and areas, and a writer of lanelet2 maps.
 
-A map is OSM XML, with coordinates that UTM brings back exactly.
+Maps are OSM XML with enough digits to reproduce UTM coordinates exactly.
 """
 
 from dataclasses import dataclass
@@ -27,7 +27,7 @@ _TAGS: dict[Marking, dict[str, str]] = {
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Border:
-    """One side of a lanelet, or a part of it that is marked in one way."""
+    """One side of a lanelet, or a section of it with one marking."""
 
     line: Polyline
     marking: Marking
@@ -35,40 +35,38 @@ class Border:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Lanelet:
-    """A strip of surface in the direction of travel."""
+    """A section of a lane, crossing or walkway in the direction of travel."""
 
     subtype: Subtype
     left: tuple[Border, ...]
-    """Parts that follow each other, each from where the one before ends."""
+    """Consecutive sections; each starts at the end of the one before."""
     right: tuple[Border, ...]
     centre: Polyline | None = None
-    """None where it is to be midway between the sides."""
+    """None: midway between the sides."""
     speed_limit_mps: float | None = None
-    """Written in whole km/h; None where there is no limit to tell."""
+    """Written in whole km/h; None: no limit is written."""
 
     @property
     def left_line(self) -> Polyline:
-        """The whole left side."""
         return _joined(self.left)
 
     @property
     def right_line(self) -> Polyline:
-        """The whole right side."""
         return _joined(self.right)
 
     @property
     def outline(self) -> Polyline:
-        """The closed strip's corners."""
+        """Corners of the closed outline."""
         return np.concatenate([self.left_line, self.right_line[::-1]])
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Area:
-    """Ground that vehicles may drive on, along no lane."""
+    """A drivable area without a lane."""
 
     subtype: Literal["parking", "freespace"]
     outer: tuple[Border, ...]
-    """Parts of the closed ring around it, in any direction each."""
+    """Sections of the closed ring around it, each in either direction."""
 
 
 def _joined(borders: tuple[Border, ...]) -> Polyline:
@@ -77,7 +75,7 @@ def _joined(borders: tuple[Border, ...]) -> Polyline:
 
 
 def to_degrees(points_utm: Polyline) -> Polyline:
-    """(latitude, longitude) of points in UTM zone 32."""
+    """Converts points (n, 2) in UTM zone 32, m, to (latitude, longitude), degrees."""
     transform = pyproj.Transformer.from_crs(UTM_ZONE_32, "EPSG:4326", always_xy=True)
     lon, lat = transform.transform(points_utm[:, 0], points_utm[:, 1])
     return np.stack([lat, lon], axis=1)
@@ -88,7 +86,7 @@ def _tag_lines(tags: dict[str, str]) -> str:
 
 
 class _Elements:
-    """Nodes and ways with shared ends, numbered as they come."""
+    """Nodes and ways with shared end points, numbered in the order of creation."""
 
     def __init__(self, join_m: float) -> None:
         self.join_m = join_m
@@ -115,7 +113,7 @@ class _Elements:
     def way(self, border: Border) -> int:
         """The number of the way along a border; both directions of a line share one way.
 
-        What only one of them marks is marked.
+        A marking of either direction replaces a virtual line.
         """
         numbers = [self.node(point) for point in border.line]
         key = tuple(n for i, n in enumerate(numbers) if i == 0 or n != numbers[i - 1])
@@ -137,13 +135,13 @@ def write_map(
     origin_utm_m: tuple[float, float],
     join_m: float,
 ) -> None:
-    """Writes the map of a place.
+    """Writes a lanelet2 map.
 
     Args:
         path: the `.osm` file to write.
-        lanelets: strips in the recording's frame, in the order in which they are to be read.
+        lanelets: in the recording's frame, in the order in which they are written.
         areas: in the same frame.
-        origin_utm_m: what to add to the recording's frame to get UTM.
+        origin_utm_m: UTM coordinates of the frame's origin.
         join_m: points closer than this, at most 0.1 m, become one node.
     """
     elements = _Elements(join_m)

@@ -1,32 +1,23 @@
-"""Lines of points: arc length, offsets, smoothing. Left is positive."""
+"""Polylines for drawing sites: arc length, resampling, offsets, curves. Left is positive."""
 
 import numpy as np
 from jaxtyping import Float
 
+from asp_env.geometry import arc_lengths, points_at
+
 Polyline = Float[np.ndarray, "_ 2"]
-"""Points one after the other, metres."""
-
-
-def arc_lengths(line: Float[np.ndarray, "n 2"]) -> Float[np.ndarray, " n"]:
-    """Distance of every point from the first along the line, metres."""
-    steps = np.hypot(*np.diff(line, axis=0).T)
-    return np.concatenate([[0.0], np.cumsum(steps)])
-
-
-def evenly(line: Polyline, count: int) -> Polyline:
-    """The same line as `count` points at equal distances, ends included."""
-    arc = arc_lengths(line)
-    at = np.linspace(0.0, arc[-1], count)
-    return np.stack([np.interp(at, arc, line[:, axis]) for axis in (0, 1)], axis=1)
+"""Points (n, 2), m."""
 
 
 def dense(line: Polyline, spacing_m: float) -> Polyline:
-    """The same line as points about `spacing_m` apart, ends included."""
-    return evenly(line, max(2, round(float(arc_lengths(line)[-1]) / spacing_m) + 1))
+    """Resamples a line to points about `spacing_m` apart, ends included."""
+    arc = arc_lengths(line)
+    count = max(2, round(float(arc[-1]) / spacing_m) + 1)
+    return points_at(line, arc, np.linspace(0.0, arc[-1], count))
 
 
 def normals(line: Float[np.ndarray, "n 2"]) -> Float[np.ndarray, "n 2"]:
-    """Unit vectors to the left at every point; at a corner the mean of both sides."""
+    """Unit vectors to the left at each point; at a corner the mean of both sides."""
     steps = np.diff(line, axis=0)
     steps = steps / np.hypot(*steps.T)[:, None]
     ahead = np.concatenate([steps[:1], steps[:-1] + steps[1:], steps[-1:]])
@@ -37,14 +28,14 @@ def normals(line: Float[np.ndarray, "n 2"]) -> Float[np.ndarray, "n 2"]:
 def offset(
     line: Float[np.ndarray, "n 2"], left_m: float | Float[np.ndarray, " n"]
 ) -> Float[np.ndarray, "n 2"]:
-    """The line moved to the left, by one distance or by one for each point."""
+    """Shifts a line to the left, by one distance or by one distance per point."""
     return line + normals(line) * np.asarray(left_m).reshape(-1, 1)
 
 
 def clothoid_like(
     *, heading_rad: float, curvature_per_m: float, straight_m: float, length_m: float
 ) -> Polyline:
-    """A line from the origin that is straight first and then bends gently, points 2 m apart."""
+    """A line from the origin with points 2 m apart: straight, then of growing curvature."""
     at = np.arange(0.0, length_m + 1e-9, 2.0)
     bend = np.clip((at - straight_m) / 20.0, 0.0, 1.0) * curvature_per_m
     heading = heading_rad + np.concatenate([[0.0], np.cumsum(0.5 * (bend[1:] + bend[:-1]) * 2.0)])
@@ -54,7 +45,7 @@ def clothoid_like(
 
 
 def bezier(start: np.ndarray, start_rad: float, end: np.ndarray, end_rad: float) -> Polyline:
-    """A smooth curve between two points with given headings, 13 points."""
+    """A cubic Bézier curve of 13 points between two points with given headings."""
     pull = 0.4 * float(np.hypot(*(end - start)))
     a = start + pull * np.array([np.cos(start_rad), np.sin(start_rad)])
     b = end - pull * np.array([np.cos(end_rad), np.sin(end_rad)])
@@ -63,5 +54,5 @@ def bezier(start: np.ndarray, start_rad: float, end: np.ndarray, end_rad: float)
 
 
 def polar(radius_m: float, angle_rad: float | np.ndarray) -> np.ndarray:
-    """The point (or points) at a distance and direction from the origin."""
+    """Points at a distance and direction from the origin."""
     return radius_m * np.stack([np.cos(angle_rad), np.sin(angle_rad)], axis=-1)

@@ -1,9 +1,7 @@
-"""Makes the sample recordings that ship with `asp_env`: `python -m scenarios.synthesize OUT`.
+"""The command `asp-env synthesize`, and the sample recordings that ship with `asp_env`.
 
-Give a new folder and put what is in it into `asp_env/samples`. One recording of two minutes for
-each site, tracks compressed.
-
-MERGED: The command `synthesize`: traffic made by a simulator, as recordings.
+`python -m scenarios.synthesize OUT` generates the samples; the content of OUT belongs in
+`asp_env/samples`.
 """
 
 from dataclasses import dataclass
@@ -15,22 +13,25 @@ from asp_env.errors import AspEnvError, MissingExtraError
 from scenarios.sumo.dataset import synthesize
 
 SEEDS = {"intersection": 14, "roundabout": 0}
-"""Chosen by eye: all classes and all turns occur, nothing jams."""
+"""Chosen by viewing: all classes and all turns occur, and traffic does not jam."""
 MINUTES = 2.0
+
+HIGHWAY = "highway:"
+"""Prefix of the names of highway-env's sites."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Samples:
-    """Write the sample recordings.
+    """Generate the sample recordings that ship with `asp_env`.
 
     Attributes:
-        out: folder to make.
+        out: folder to create.
     """
 
     out: tyro.conf.Positional[Path]
 
     def run(self) -> None:
-        """Writes one folder for each site."""
+        """Writes one folder per site: one recording of two minutes with compressed tracks."""
         for site, seed in SEEDS.items():
             synthesize(
                 self.out / site,
@@ -43,28 +44,21 @@ class Samples:
             )
 
 
-if __name__ == "__main__":
-    tyro.cli(Samples).run()
-
-
-HIGHWAY = "highway:"
-"""Before the names of highway-env's sites."""
-
-
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Synthesize:
-    """Write traffic made by SUMO or highway-env, in the inD layout.
+    """Generate traffic with SUMO or highway-env, in the inD layout.
 
     Attributes:
-        out: folder to make.
-        site: `intersection` (crossroads and T-junctions) or `roundabout` (one lane and two) of
+        out: folder to create.
+        site: `intersection` (crossroads and T-junctions) or `roundabout` (one and two lanes) of
             SUMO, `highway:intersection` or `highway:roundabout` of highway-env.
-        recordings: how many recordings.
-        minutes: length of each.
-        seed: same seed, same bytes.
-        noise: add measurement errors, smoothed as drone datasets are; the truth goes to `truth/`.
-        locations: how many places; by default one for every three recordings. A site of
-            highway-env is a single place.
+        recordings: number of recordings.
+        minutes: length of each recording.
+        seed: the same seed gives the same bytes.
+        noise: add measurement errors and smooth them as in drone datasets; true tracks go to
+            `truth/`.
+        locations: number of locations; by default one for every three recordings. A site of
+            highway-env has a single location.
     """
 
     out: tyro.conf.Positional[Path]
@@ -79,7 +73,8 @@ class Synthesize:
         """Writes the folder.
 
         Raises:
-            AspEnvError: an unknown site, an impossible number, or a folder that cannot be written.
+            AspEnvError: the site is unknown, a number is out of range, or the folder cannot be
+                written.
         """
         if self.site.startswith(HIGHWAY):
             self._run_highway(self.site.removeprefix(HIGHWAY))
@@ -98,7 +93,7 @@ class Synthesize:
     def _run_highway(self, site: str) -> None:
         if self.locations not in (None, 1):
             raise AspEnvError(
-                f"--locations {self.locations}: {self.site} is a single place; leave it out"
+                f"--locations {self.locations}: {self.site} has a single location; leave it out"
             )
         try:
             from scenarios.highway import dataset
@@ -113,3 +108,7 @@ class Synthesize:
             noise=self.noise,
             progress=True,
         )
+
+
+if __name__ == "__main__":
+    tyro.cli(Samples).run()

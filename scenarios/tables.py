@@ -1,4 +1,4 @@
-"""The files of one recording in the inD layout: exact columns, in order."""
+"""Writer of the tables of one recording in the inD layout."""
 
 import gzip
 from dataclasses import dataclass
@@ -21,13 +21,13 @@ TRACKS_COLUMNS = (
     "latVelocity", "lonAcceleration", "latAcceleration",
 )  # fmt: skip
 VULNERABLE = ("pedestrian", "bicycle")
-"""Classes that the format gives no size."""
+"""Classes whose size is written as zero."""
 _ROW = "%d,%d,%d,%d,%.4f,%.4f,%.4f,%s,%s,%.4f,%.4f,%.3f,%.3f,%.4f,%.4f,%.3f,%.3f\n"
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Track:
-    """One road user while it is in the picture, in the recording's frame."""
+    """The frames of one agent that are written, in the recording's frame."""
 
     kind: str
     length_m: float
@@ -40,18 +40,17 @@ class Track:
 
     @property
     def last_frame(self) -> int:
-        """The last frame in which it is seen."""
         return self.first_frame + len(self.xy) - 1
 
     @property
     def written_size_m(self) -> tuple[float, float]:
-        """(length, width) as the file gives them: zero for people on foot and on bicycles."""
+        """(length, width) as written: zero for pedestrians and bicycles, as in inD."""
         return (0.0, 0.0) if self.kind in VULNERABLE else (self.length_m, self.width_m)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Meta:
-    """What is written of a recording besides its tracks."""
+    """The metadata of a recording."""
 
     recording: int
     location: int
@@ -80,7 +79,7 @@ def write_recording_meta(path: Path, meta: Meta, tracks: list[Track]) -> None:
 
 
 def write_tracks_meta(path: Path, recording: int, tracks: list[Track]) -> None:
-    """Writes `XX_tracksMeta.csv`; a track's id is its place in the list."""
+    """Writes `XX_tracksMeta.csv`; the id of a track is its index."""
     rows = [",".join(TRACKS_META_COLUMNS)]
     for number, track in enumerate(tracks):
         length, width = track.written_size_m
@@ -90,11 +89,11 @@ def write_tracks_meta(path: Path, recording: int, tracks: list[Track]) -> None:
 
 
 def write_tracks(path: Path, recording: int, tracks: list[Track]) -> None:
-    """Writes `XX_tracks.csv`, compressed where the name ends in `.gz`."""
+    """Writes `XX_tracks.csv`, compressed if the name ends in `.gz`; equal tracks, equal bytes."""
     text = ",".join(TRACKS_COLUMNS) + "\n"
     text += "".join(_rows(recording, number, track) for number, track in enumerate(tracks))
     data = text.encode()
-    # No time in the header of the compressed file, so that equal tracks give equal bytes.
+    # mtime=0: the header of the compressed file must not contain the time of writing.
     path.write_bytes(gzip.compress(data, mtime=0) if path.suffix == ".gz" else data)
 
 

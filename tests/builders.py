@@ -1,4 +1,4 @@
-"""Small made-up recordings, so that a test needs no files."""
+"""Small synthetic recordings in memory, so that tests need no files."""
 
 import math
 from dataclasses import dataclass
@@ -12,20 +12,20 @@ from asp_env.data.road_map import LineType, Ragged, RoadMap
 from asp_env.dynamics import rollout
 
 ARM_M = 100.0
-"""The roads of the made-up crossing reach this far from its centre."""
+"""Length of each arm of the crossing."""
 
 LANE_M = 3.5
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Drive:
-    """One road user: where it starts, and what it does from then on."""
+    """The motion of one agent."""
 
     kind: AgentClass
     start: tuple[float, float, float, float]
     """[x m, y m, heading rad, speed m/s]."""
     phases: tuple[tuple[float, float, float], ...] = ()
-    """(duration s, acceleration m/s², steering rad), one after another; afterwards it coasts."""
+    """(duration s, acceleration m/s², steering rad) in succession; no action afterwards."""
     appears_s: float = 0.0
     leaves_s: float = math.inf
 
@@ -37,27 +37,27 @@ DRIVES = (
         start=(80.0, 1.75, math.pi, 9.0),
         phases=((4.0, -1.5, 0.0), (2.0, 0.0, 0.0), (4.0, 1.5, 0.0)),
     ),
-    Drive(  # turns left by a quarter at a radius of 12 m
+    Drive(  # turns left by 90° at a radius of 12 m
         kind=AgentClass.CAR,
         start=(1.75, -50.0, math.pi / 2, 6.0),
         phases=((6.0, 0.0, 0.0), (math.pi, 0.0, 0.2227)),
     ),
-    Drive(  # turns right by a quarter at a radius of 8 m
+    Drive(  # turns right by 90° at a radius of 8 m
         kind=AgentClass.VAN,
         start=(-1.75, 60.0, -math.pi / 2, 5.0),
         phases=((10.0, 0.0, 0.0), (2.513, 0.0, -0.399)),
     ),
-    Drive(  # comes to a halt, waits, and moves off
+    Drive(  # stops, waits and starts again
         kind=AgentClass.TRUCK,
         start=(-60.0, -1.75, 0.0, 7.0),
         phases=((4.0, 0.0, 0.0), (3.5, -2.0, 0.0), (4.0, 0.0, 0.0), (5.0, 1.2, 0.0)),
     ),
-    Drive(  # goes round in circles of 15 m
+    Drive(  # drives in circles of 15 m
         kind=AgentClass.CAR,
         start=(40.0, 25.0, 0.0, 5.0),
         phases=((600.0, 0.0, 0.18),),
     ),
-    Drive(  # comes late and leaves early
+    Drive(  # appears late and leaves early
         kind=AgentClass.MOTORCYCLE,
         start=(1.75, -80.0, math.pi / 2, 11.0),
         phases=((3.0, 0.5, 0.0),),
@@ -68,7 +68,8 @@ DRIVES = (
     Drive(kind=AgentClass.BICYCLE, start=(-70.0, -4.5, 0.0, 4.0)),
     Drive(kind=AgentClass.CAR, start=(25.0, -6.0, 0.0, 0.0)),  # parked
 )
-"""Straight, braking, turning, halting, circling; a pedestrian, a bicycle, one parked car."""
+"""Vehicles that drive straight, brake, turn, stop and circle, a pedestrian, a bicycle and a parked
+car."""
 
 
 def make_recording(
@@ -81,17 +82,17 @@ def make_recording(
     seed: int | None = None,
     road_map: RoadMap | None = None,
 ) -> Recording:
-    """A recording of a crossing of two roads, in memory.
+    """A recording of a crossing of two roads.
 
     Args:
-        name: its id.
-        location: where it was made.
+        name: id of the recording.
+        location: name of the place.
         frame_rate_hz: frames per second; motion is integrated frame by frame.
-        duration_s: its length.
-        drives: who is there; track ids are 1, 2, 3, … in this order.
-        seed: varies the speeds of moving vehicles by up to 20 % and their starts by up to 10 m
-            along their way; without one the recording is always the same.
-        road_map: another map than `make_map()`.
+        duration_s: length of the recording.
+        drives: the agents, with track ids 1, 2, 3, … in this order.
+        seed: varies the speeds of moving agents by up to 20 % and their starts by up to 10 m along
+            their heading; by default nothing varies.
+        road_map: the map, by default `make_map()`.
     """
     frames = round(duration_s * frame_rate_hz) + 1
     rng = None if seed is None else np.random.default_rng(seed)
@@ -126,18 +127,18 @@ def _drive(
         start[:2] += rng.uniform(-10, 10) * np.array([np.cos(start[2]), np.sin(start[2])])
         start[3] *= rng.uniform(0.8, 1.2)
     actions = np.zeros((num_frames - 1, 2))
-    at_s = 0.0
+    begin_s = 0.0
     for duration_s, *action in drive.phases:
-        until_s = at_s + duration_s
-        actions[round(at_s * rate_hz) : round(until_s * rate_hz)] = action
-        at_s = until_s
+        end_s = begin_s + duration_s
+        actions[round(begin_s * rate_hz) : round(end_s * rate_hz)] = action
+        begin_s = end_s
     length = np.array(FOOTPRINTS_M[int(drive.kind), 0], dtype=np.float64)
     states = rollout(start, actions, length, 1 / rate_hz)
     return np.concatenate([start[None], states]).astype(np.float32)
 
 
 def make_map() -> RoadMap:
-    """Two roads of two lanes that cross at the origin, along x and along y; one way to turn."""
+    """Two roads of two lanes along x and y that cross at the origin, and one left turn."""
     lane, half = LANE_M, LANE_M / 2
     curbs = [
         np.array([(sx * ARM_M, sy * lane), (sx * lane, sy * lane), (sx * lane, sy * ARM_M)])
@@ -157,11 +158,11 @@ def make_map() -> RoadMap:
     lanes = [
         np.array([(-ARM_M, -half), (-lane, -half)]),  # 0 eastbound, before the crossing
         np.array([(-lane, -half), (lane, -half)]),  # 1 across it
-        np.array([(lane, -half), (ARM_M, -half)]),  # 2 behind it
+        np.array([(lane, -half), (ARM_M, -half)]),  # 2 after it
         np.array([(ARM_M, half), (-ARM_M, half)]),  # 3 westbound
-        np.array([(half, lane), (half, ARM_M)]),  # 4 northbound, behind the crossing
+        np.array([(half, lane), (half, ARM_M)]),  # 4 northbound, after the crossing
         np.array([(-half, ARM_M), (-half, -ARM_M)]),  # 5 southbound
-        np.stack(  # 6 turns left from 0 into 4
+        np.stack(  # 6 left turn from 0 to 4
             [-lane + radius * np.sin(arc), -half + radius * (1 - np.cos(arc))], axis=-1
         ),
         np.array([(half, -ARM_M), (half, lane)]),  # 7 northbound, up to the far side

@@ -1,4 +1,4 @@
-"""Every run of the tests is the same run, and touches nobody's cache."""
+"""Reproducible tests with a cache folder of their own."""
 
 import os
 import shutil
@@ -9,9 +9,9 @@ import pytest
 from hypothesis import settings
 from selenium import webdriver
 
-# Several test processes share the cores, and sums over threads differ in their last bits.
+# Several test processes share the cores, and sums by several threads differ in their last bits.
 os.environ.setdefault("OMP_NUM_THREADS", "1")
-# Windows are opened where nobody sees them; tests that look at a screen bring their own.
+# Windows are invisible; tests that need a screen start their own.
 os.environ["SDL_VIDEODRIVER"] = "dummy"
 
 settings.register_profile("same-every-time", derandomize=True, deadline=None, max_examples=30)
@@ -20,7 +20,7 @@ settings.load_profile("same-every-time")
 
 @pytest.fixture(autouse=True, scope="session")
 def _own_cache(tmp_path_factory: pytest.TempPathFactory) -> Iterator[None]:
-    """What is derived from recordings is kept in a folder of this run alone."""
+    """A cache folder for this test run alone."""
     with pytest.MonkeyPatch.context() as patch:
         patch.setenv("ASP_ENV_CACHE", str(tmp_path_factory.mktemp("cache")))
         yield

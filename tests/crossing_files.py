@@ -1,4 +1,4 @@
-"""Writes the made-up crossing of `tests.builders` to disk in the inD layout."""
+"""Writes the crossing of `tests.builders` to disk in the inD layout."""
 
 from collections.abc import Sequence
 from pathlib import Path
@@ -12,13 +12,13 @@ from tests.builders import ARM_M, DRIVES, LANE_M, Drive, make_recording
 from tests.data.levelx_files import osm, write_map, write_recording
 
 ON_ROAD = tuple(drive for number, drive in enumerate(DRIVES) if number not in (5, 8))
-"""All but the two that are driven beside the road, so that everybody keeps to the map."""
+"""All drives except the two beside the road."""
 
 
 def write_crossing(
     folder: Path, *, drives: Sequence[Sequence[Drive]] = (ON_ROAD,), seconds: float = 20.0
 ) -> Path:
-    """A folder with one recording for each sequence of drives, all of one place."""
+    """A folder with one recording of the same place for each sequence of drives."""
     for number, each in enumerate(drives):
         recording = make_recording(drives=tuple(each), duration_s=seconds)
         write_recording(
@@ -38,7 +38,7 @@ def _rows(recording: Recording) -> pd.DataFrame:
         x, y, heading, speed = recording.track(track).astype(np.float64).T
         frames = recording.first_frames[track] + np.arange(len(x))
         length, width = recording.sizes[track]
-        v_x, v_y, nothing = speed * np.cos(heading), speed * np.sin(heading), np.zeros_like(x)
+        v_x, v_y, zeros = speed * np.cos(heading), speed * np.sin(heading), np.zeros_like(x)
         columns = {
             "recordingId": int(recording.name),
             "trackId": int(recording.track_ids[track]),
@@ -51,19 +51,19 @@ def _rows(recording: Recording) -> pd.DataFrame:
             "length": length,
             "xVelocity": v_x,
             "yVelocity": v_y,
-            "xAcceleration": nothing,
-            "yAcceleration": nothing,
+            "xAcceleration": zeros,
+            "yAcceleration": zeros,
             "lonVelocity": speed,
-            "latVelocity": nothing,
-            "lonAcceleration": nothing,
-            "latAcceleration": nothing,
+            "latVelocity": zeros,
+            "lonAcceleration": zeros,
+            "latAcceleration": zeros,
         }
         tables.append(pd.DataFrame(columns).round(6))
     return pd.concat(tables)
 
 
 def _two_roads() -> str:
-    """The crossing as four lanelets that run from end to end of their arms."""
+    """The crossing as four lanelets from end to end."""
     curb, line = {"type": "curbstone"}, {"type": "line_thin", "subtype": "dashed"}
     ways, lanelets = {}, {}
     for axis, names in enumerate((("s", "x", "n"), ("w", "y", "e"))):

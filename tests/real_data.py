@@ -1,4 +1,4 @@
-"""Where real recordings lie, if there are any: they are no part of the project."""
+"""Real recordings, which are not part of the project."""
 
 import os
 from pathlib import Path
@@ -9,7 +9,7 @@ _BESIDE = Path(__file__).resolve().parents[2] / "shared" / "data"
 
 
 def real_data(name: str) -> Path:
-    """The folder of a data set, such as `karlsruhe`; skips the test where it is absent."""
+    """The folder of a data set such as `karlsruhe`; skips the test if it is absent."""
     folder = Path(os.environ.get("ASP_ENV_TEST_DATA") or _BESIDE) / name
     if not folder.is_dir():
         pytest.skip(f"no real recordings at {folder}: set ASP_ENV_TEST_DATA to their folder")

@@ -15,7 +15,7 @@ PACKAGES = ("asp_env", "predictors", "scenarios")
 
 ON_ALL = {"errors", "registry", "geometry", "files", "workers"}
 ARROWS = {
-    "__init__": {"envs", "data", "errors"},
+    "__init__": {"envs", "planning", "data", "dynamics", "errors"},
     "errors": set[str](),
     "registry": {"errors"},
     "geometry": {"errors"},

@@ -1,4 +1,4 @@
-"""The command line: 0 when all is well, 2 and one line on stderr for bad input."""
+"""The command line: exit status 0 on success, 2 and one line on stderr for bad input."""
 
 import os
 import subprocess
@@ -15,13 +15,13 @@ from asp_env.errors import AspEnvError
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Fail:
-    """A command that fails in some way."""
+    """A command that fails."""
 
     how: str
-    """What is raised."""
+    """The kind of failure."""
 
     def run(self) -> None:
-        """Raises it."""
+        """Raises the failure."""
         raise {
             "input": AspEnvError("first line\nsecond line"),
             "system": PermissionError(13, "Permission denied", "/a/file"),
@@ -32,29 +32,29 @@ class Fail:
 
 @pytest.fixture
 def failing(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Every command is `Fail`."""
+    """Makes every command `Fail`."""
     monkeypatch.setattr(registry, "find", lambda *_: Fail)
 
 
-def _refused(capsys: pytest.CaptureFixture[str], *args: str) -> str:
-    """The one line that a command refuses its input with."""
+def _rejected(capsys: pytest.CaptureFixture[str], *args: str) -> str:
+    """Runs a command with bad input and returns its one line on stderr."""
     assert main(args) == 2
-    told = capsys.readouterr()
-    assert told.out == ""
-    assert told.err.count("\n") == 1
-    assert told.err.startswith("asp-env: ")
-    return told.err.strip()
+    output = capsys.readouterr()
+    assert output.out == ""
+    assert output.err.count("\n") == 1
+    assert output.err.startswith("asp-env: ")
+    return output.err.strip()
 
 
-def test_an_unknown_command_is_refused(capsys):
-    """The nearest one is suggested, all are listed."""
-    line = _refused(capsys, "drvie")
+def test_an_unknown_command_is_rejected(capsys):
+    """The message suggests the nearest command and lists all."""
+    line = _rejected(capsys, "drvie")
     assert "unknown command 'drvie' (did you mean 'drive'?): known are " in line
     assert "evaluate" in line
 
 
 @pytest.mark.parametrize(
-    ("args", "what"),
+    ("args", "message"),
     [
         (["x", "--out", "o", "--plannr", "idm"], "Unrecognized options: --plannr"),
         (["x", "y", "--out", "o"], "Unrecognized options: y"),
@@ -66,35 +66,38 @@ def test_an_unknown_command_is_refused(capsys):
     ],
     ids=["unknown", "too many", "missing option", "nothing", "no number", "no integer", "no part"],
 )
-def test_wrong_options_are_refused(capsys, args, what):
-    """What is wrong, and where the options are told, without a box around it."""
-    line = _refused(capsys, "drive", *args)
-    assert what in line
+def test_invalid_options_are_rejected(capsys, args, message):
+    """The message is tyro's, without its box."""
+    line = _rejected(capsys, "drive", *args)
+    assert message in line
     assert line.endswith("; see asp-env drive --help")
     assert not set("│─╭╰╮╯") & set(line)
 
 
 @pytest.mark.parametrize("command", ["evaluate", "drive", "inspect"])
-def test_data_that_is_not_there_is_refused(capsys, tmp_path, command):
-    """The folder is named; nothing is written."""
+def test_missing_data_are_rejected(capsys, tmp_path, command):
+    """Nothing is written."""
     out = [] if command == "inspect" else ["--out", str(tmp_path / "out")]
-    line = _refused(capsys, command, str(tmp_path / "nothing"), *out)
+    line = _rejected(capsys, command, str(tmp_path / "nothing"), *out)
     assert f"{tmp_path / 'nothing'} does not exist" in line
     assert list(tmp_path.iterdir()) == []
 
 
 @pytest.mark.parametrize("command", ["evaluate", "drive"])
-def test_an_unwritable_output_is_refused(capsys, tmp_path, command):
-    """Before anything is computed: below a file, and where there is something already."""
-    (tmp_path / "file").write_text("words")
-    for out, what in (("file/out", "cannot be written"), ("file", "exists already")):
-        line = _refused(capsys, command, str(tmp_path), "--out", str(tmp_path / out))
-        assert what in line
+def test_an_unwritable_output_is_rejected(capsys, tmp_path, command):
+    """Below a file, and where a file exists, before anything is computed."""
+    (tmp_path / "file").write_text("text")
+    for out, message in (
+        ("file/out", "cannot be written"),
+        ("file", "exists and is not an empty folder"),
+    ):
+        line = _rejected(capsys, command, str(tmp_path), "--out", str(tmp_path / out))
+        assert message in line
     assert [path.name for path in tmp_path.iterdir()] == ["file"]
 
 
 @pytest.mark.parametrize(
-    ("args", "what"),
+    ("args", "message"),
     [
         (["--predictors", "constant-velocty"], "unknown predictor 'constant-velocty'"),
         (["--predictors"], "none given"),
@@ -109,25 +112,25 @@ def test_an_unwritable_output_is_refused(capsys, tmp_path, command):
     ],
     ids=lambda value: "-".join(value) if isinstance(value, list) else None,
 )
-def test_wrong_values_are_refused(capsys, tmp_path, args, what):
-    """On shipped data, each in one line, and the output folder does not come into being."""
-    line = _refused(capsys, "drive", "sample:intersection", "--out", str(tmp_path / "out"), *args)
-    assert what in line
+def test_invalid_values_are_rejected(capsys, tmp_path, args, message):
+    """The output folder is not made."""
+    line = _rejected(capsys, "drive", "sample:intersection", "--out", str(tmp_path / "out"), *args)
+    assert message in line
     assert list(tmp_path.iterdir()) == []
 
 
 def test_help_lists_the_commands(capsys):
-    """With `--help`, `-h` or nothing: every registered command, status 0, nothing on stderr."""
+    """With `--help`, `-h` and no argument."""
     for args in (["--help"], ["-h"], []):
         assert main(args) == 0
-        told = capsys.readouterr()
-        assert told.err == ""
+        output = capsys.readouterr()
+        assert output.err == ""
         for name in registry.names("commands"):
-            assert f" {name} " in told.out
+            assert f" {name} " in output.out
 
 
-def test_help_survives_a_command_that_cannot_be_loaded(capsys, monkeypatch):
-    """A plug whose package is missing is listed with what it lacks."""
+def test_help_lists_commands_that_cannot_be_loaded(capsys, monkeypatch):
+    """With the missing package."""
 
     def find(_group: str, name: str) -> type:
         if name == "train":
@@ -136,14 +139,13 @@ def test_help_survives_a_command_that_cannot_be_loaded(capsys, monkeypatch):
 
     monkeypatch.setattr(registry, "find", find)
     assert main(["--help"]) == 0
-    told = capsys.readouterr().out
-    assert "needs the package 'torch'" in told
-    assert "A command that fails in some way." in told
+    output = capsys.readouterr().out
+    assert "needs the package 'torch'" in output
+    assert "A command that fails." in output
 
 
 @pytest.mark.parametrize("command", registry.names("commands"))
-def test_every_command_has_a_help(capsys, command):
-    """Status 0, and a line for every option."""
+def test_every_command_has_help(capsys, command):
     with pytest.raises(SystemExit) as stop:
         main([command, "--help"])
     assert not stop.value.code
@@ -152,41 +154,41 @@ def test_every_command_has_a_help(capsys, command):
 
 @pytest.mark.usefixtures("failing")
 def test_errors_of_a_command_are_one_line(capsys):
-    """Bad input and errors of the system; what has several lines becomes one."""
-    assert _refused(capsys, "any", "--how", "input") == "asp-env: first line second line"
-    assert _refused(capsys, "any", "--how", "system") == "asp-env: /a/file: Permission denied"
+    """Bad input and system errors; messages of several lines are joined."""
+    assert _rejected(capsys, "any", "--how", "input") == "asp-env: first line second line"
+    assert _rejected(capsys, "any", "--how", "system") == "asp-env: /a/file: Permission denied"
 
 
 @pytest.mark.usefixtures("failing")
-def test_an_interrupt_is_130(capsys):
-    """As shells have it, with one line."""
+def test_an_interrupt_exits_with_130(capsys):
+    """As in shells."""
     assert main(["any", "--how", "interrupt"]) == 130
     assert capsys.readouterr().err == "asp-env: interrupted\n"
 
 
 @pytest.mark.usefixtures("failing")
-def test_our_own_faults_are_not_hidden():
-    """Anything else is a bug and keeps its traceback."""
+def test_other_exceptions_keep_their_traceback():
     with pytest.raises(ZeroDivisionError):
         main(["any", "--how", "bug"])
 
 
 def test_the_installed_command_exits_with_the_status():
-    """Run as a process: 2, one line on stderr, nothing on stdout."""
     script = Path(sys.executable).with_name("asp-env")
     command = [str(script)] if script.exists() else [sys.executable, "-m", "asp_env.cli"]
     done = subprocess.run(
         [*command, "drive", "nowhere", "--out", os.devnull], capture_output=True, text=True
     )
     assert (done.returncode, done.stdout) == (2, "")
-    assert done.stderr == "asp-env: /dev/null: exists already; choose another --out or remove it\n"
+    assert done.stderr == (
+        "asp-env: /dev/null exists and is not an empty folder; choose another name or remove it\n"
+    )
 
 
 @pytest.mark.parametrize(("command", "old"), RENAMED_OPTIONS)
 def test_deprecated_options_warn_and_work(
     command: str, old: str, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    """An old name is taken like the new one, as two words or with an equals sign."""
+    """As two words and with an equals sign."""
     new = RENAMED_OPTIONS[command, old]
     fields = {
         "--" + name.replace("_", "-") for name in registry.find("commands", command).__annotations__

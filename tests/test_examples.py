@@ -1,13 +1,14 @@
-"""The examples run, and stay short."""
+"""The examples and the code in the documentation of the environments run."""
 
 import math
+import re
 from pathlib import Path
 
 import cv2
 import numpy as np
 import pytest
 
-from asp_env.envs.replay import ReplayEnv
+from asp_env import ReplayEnv
 from examples import (
     held_out,
     own_predictor,
@@ -22,25 +23,31 @@ EXAMPLES = sorted(Path(own_predictor.__file__).parent.glob("*.py"))
 
 
 @pytest.mark.parametrize("path", EXAMPLES, ids=lambda path: path.name)
-def test_an_example_has_at_most_80_lines(path: Path) -> None:
-    """Long examples are not read."""
+def test_examples_have_at_most_80_lines(path: Path) -> None:
     assert len(path.read_text().splitlines()) <= 80
 
 
-def test_random_actions_bring_every_episode_to_a_named_end() -> None:
-    """Three seeds give three lines, each with a scenario, an ending and a reward."""
+@pytest.mark.parametrize("page", ["environment.md", "rl.md"])
+def test_python_code_in_the_documentation_runs(page: str) -> None:
+    """The blocks of a page run one after another, except the one that trains for long."""
+    text = (Path(own_predictor.__file__).parents[1] / "docs" / page).read_text()
+    names: dict[str, object] = {}
+    for code in re.findall(r"```python\n(.*?)```", text, re.DOTALL):
+        if "PPO" not in code:
+            exec(code, names)
+
+
+def test_every_episode_of_random_actions_has_a_named_ending() -> None:
     lines = step_the_environment.main()
     assert len(lines) == 3
     assert all(line.split()[1].rstrip(",").isupper() for line in lines)
 
 
-def test_an_own_predictor_drives_the_planner() -> None:
-    """With forecasts of its own the planner gets somewhere."""
+def test_the_planner_drives_with_an_own_predictor() -> None:
     assert own_predictor.main() > 0.2
 
 
-def test_a_car_that_stops_is_hit_by_a_replay_alone(tmp_path: Path) -> None:
-    """Of highway-env's vehicles those behind brake, as they do not in their recording."""
+def test_only_replayed_traffic_hits_a_braking_car(tmp_path: Path) -> None:
     hits = traffic_that_reacts.main(tmp_path / "highway", minutes=1 / 3)
     (replayed, scenarios), (reacting, same) = hits["replayed"], hits["reacting"]
     assert scenarios == same
@@ -48,8 +55,8 @@ def test_a_car_that_stops_is_hit_by_a_replay_alone(tmp_path: Path) -> None:
     assert reacting == 0
 
 
-def test_the_picture_of_the_readme_can_be_drawn(tmp_path: Path) -> None:
-    """720 pixels high: a square frame, and the raster at 2:3 beside it."""
+def test_the_picture_of_the_readme_is_drawn(tmp_path: Path) -> None:
+    """A square frame of 720 pixels beside the raster at 2:3."""
     image = cv2.imread(str(picture.main(tmp_path / "scene.png")))
     assert image is not None
     assert image.shape == (720, 720 + 480, 3)
@@ -57,15 +64,15 @@ def test_the_picture_of_the_readme_can_be_drawn(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("example", [train_ppo_vectors, train_ppo_raster])
 def test_ppo_trains_and_is_compared(example) -> None:
-    """A rollout of 16 environments and its updates, then three scenarios of another place."""
+    """One rollout of 16 environments with its updates, then three scenarios of another place."""
     data = "sample:roundabout"
     scores = example.main("sample:intersection", (data,), steps=16, num_envs=16, count=3)
     assert set(scores) == {(name, data) for name in ("PPO", "zero actions", "random actions")}
     assert all(math.isfinite(mean) for means in scores.values() for mean in means.values())
 
 
-def test_scores_are_means_over_evenly_chosen_scenarios() -> None:
-    """Of 72 scenarios the first, the 36th and the last, as single environments drive them."""
+def test_scores_are_means_over_evenly_spaced_scenarios() -> None:
+    """The first, the 36th and the last of 72 scenarios, as in single environments."""
     env = ReplayEnv("sample:roundabout", observations=("state",))
     assert len(env.scenarios) == 72
     rewards, infos = np.zeros(3), []
@@ -78,7 +85,7 @@ def test_scores_are_means_over_evenly_chosen_scenarios() -> None:
             over = terminated or truncated
         infos.append(info)
     assert held_out.score(
-        lambda seen: np.tile([0.1, 0.0], (len(seen["state"]), 1)),
+        lambda obs: np.tile([0.1, 0.0], (len(obs["state"]), 1)),
         "sample:roundabout",
         3,
         observations=("state",),

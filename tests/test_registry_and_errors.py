@@ -1,4 +1,4 @@
-"""Plugs by name, and what a wrong name is answered."""
+"""Registered plugs, and error messages."""
 
 from importlib.metadata import EntryPoint
 
@@ -15,13 +15,12 @@ from asp_env.errors import (
 
 
 def one_line(error: BaseException) -> str:
-    """The message, which must be a single line."""
+    """The message, which must be one line."""
     (line,) = str(error).splitlines()
     return line
 
 
-def test_unknown_name() -> None:
-    """The error lists what is known, in order, and suggests the nearest."""
+def test_unknown_name_lists_known_names_and_suggests_one() -> None:
     assert one_line(unknown_name("fruit", "aple", ["pear", "apple"])) == (
         "unknown fruit 'aple' (did you mean 'apple'?): known are apple, pear"
     )
@@ -31,14 +30,12 @@ def test_unknown_name() -> None:
 
 
 @pytest.mark.parametrize("kind", [AspEnvError, DataError, CheckpointError, MissingExtraError])
-def test_one_family(kind: type[Exception]) -> None:
-    """Whoever catches AspEnvError, or ValueError as for any bad argument, catches them all."""
+def test_all_errors_are_value_errors(kind: type[Exception]) -> None:
     assert issubclass(kind, AspEnvError)
     assert issubclass(kind, ValueError)
 
 
-def test_missing_extra() -> None:
-    """It names the purpose, the package and the line to type, and is an ImportError too."""
+def test_missing_extra_names_purpose_package_and_command() -> None:
     error = MissingExtraError("plotly", "report", "the report")
     assert isinstance(error, ImportError)
     assert one_line(error) == (
@@ -56,15 +53,13 @@ def test_missing_extra() -> None:
         ("commands", "inspect"),
     ],
 )
-def test_names(group: registry.Group, name: str) -> None:
-    """Every group knows its plugs by name, in alphabetical order."""
+def test_names_are_sorted(group: registry.Group, name: str) -> None:
     names = registry.names(group)
     assert name in names
     assert list(names) == sorted(names)
 
 
-def test_find_gives_the_object() -> None:
-    """`expert` is the class that the entry point names."""
+def test_find_returns_the_object_of_the_entry_point() -> None:
     from asp_env.planning.planner import Expert
 
     assert registry.find("planners", "expert") is Expert
@@ -79,18 +74,16 @@ def test_find_gives_the_object() -> None:
         ("commands", "command"),
     ],
 )
-def test_wrong_name(group: registry.Group, kind: str) -> None:
-    """A letter too many is answered with the right name and all others."""
-    right = registry.names(group)[0]
+def test_misspelled_name(group: registry.Group, kind: str) -> None:
+    correct = registry.names(group)[0]
     with pytest.raises(AspEnvError) as caught:
-        registry.find(group, f"{right}x")
+        registry.find(group, f"{correct}x")
     line = one_line(caught.value)
-    assert line.startswith(f"unknown {kind} '{right}x' (did you mean '{right}'?): known are ")
+    assert line.startswith(f"unknown {kind} '{correct}x' (did you mean '{correct}'?): known are ")
     assert all(name in line for name in registry.names(group))
 
 
 def test_plug_whose_package_is_missing(monkeypatch: pytest.MonkeyPatch) -> None:
-    """A plug of a package that is not there is one line with what to install."""
     plug = EntryPoint(name="far", value="no_such_package.module:Far", group="asp_env.planners")
     monkeypatch.setattr(registry, "_plugs", lambda group: {"far": plug} if group else {})
     with pytest.raises(AspEnvError) as caught:

@@ -1,1 +1,45 @@
-"""What was measured and what may be known: recordings, maps, scenarios, scenes, forecasts."""
+"""Data: recordings, road maps, scenarios, scenes, forecasts and rollouts."""
+
+from asp_env.data.classes import AgentClass
+from asp_env.data.predictor import (
+    Forecast,
+    Predictor,
+    PredictorPlug,
+    fill_missing,
+    load_predictor,
+    make_forecast,
+)
+from asp_env.data.recording import Recording
+from asp_env.data.road_map import RoadMap
+from asp_env.data.rollout import Rollout
+from asp_env.data.scenarios import Scenario, ScenarioFilter, ScenarioSet, find_scenarios
+from asp_env.data.scene import Scene
+from asp_env.data.snippets import Future, SnippetIndex, gather_future, gather_scene, index_snippets
+from asp_env.data.source import Recordings, open_data
+from asp_env.data.split import TrainedOn
+
+__all__ = [
+    "AgentClass",
+    "Forecast",
+    "Future",
+    "Predictor",
+    "PredictorPlug",
+    "Recording",
+    "Recordings",
+    "RoadMap",
+    "Rollout",
+    "Scenario",
+    "ScenarioFilter",
+    "ScenarioSet",
+    "Scene",
+    "SnippetIndex",
+    "TrainedOn",
+    "fill_missing",
+    "find_scenarios",
+    "gather_future",
+    "gather_scene",
+    "index_snippets",
+    "load_predictor",
+    "make_forecast",
+    "open_data",
+]

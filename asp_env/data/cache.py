@@ -1,16 +1,14 @@
-"""What was read once, kept as arrays in one file per source, and mapped into memory from then on.
+"""Cache of derived data: arrays in one file per source, mapped into memory, and whole folders.
 
 A cache file is a magic word, the length of a JSON header, the header, and the arrays one after the
-other at multiples of 64 bytes. The header holds the stamp of the files that it was made from.
-A file is written aside and renamed, so that nobody reads half of one, however many processes fill
-the cache at once; one that is damaged or of another stamp counts as absent.
+other at multiples of 64 bytes. The header holds the stamp of the files that the arrays were made
+from. Files are written atomically, so that several processes may fill the cache at the same time;
+a file that is damaged or has another stamp counts as absent.
 """
 
-import contextlib
 import hashlib
 import json
 import os
-import tempfile
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -18,22 +16,22 @@ from typing import Any
 import numpy as np
 
 from asp_env.errors import AspEnvError, DataError
+from asp_env.files import atomic_file, atomic_folder, remove_stale
 
 FORMAT = 5
-"""Raise whenever a reader makes something else of the same files."""
-
-STALE_S = 3_600.0
-"""What a process that was killed left half written is removed when it is as old as this."""
+"""Version of the readers. Raise it whenever a reader gives other results for the same files."""
 
 _MAGIC = b"asp-env\0"
 _ALIGNMENT = 64
 
 
 def cache_folder() -> Path:
-    """Where derived data are kept: `ASP_ENV_CACHE`, else asp-env in the user's cache folder.
+    """The folder of derived data, created if missing.
+
+    It is `$ASP_ENV_CACHE`, else `$XDG_CACHE_HOME/asp-env`, else `~/.cache/asp-env`.
 
     Raises:
-        DataError: the folder cannot be made or written to.
+        DataError: the folder cannot be created or written to.
     """
     named = os.environ.get("ASP_ENV_CACHE")
     base = os.environ.get("XDG_CACHE_HOME")
@@ -50,34 +48,66 @@ def cache_folder() -> Path:
     )
 
 
-def stamp(files: Iterable[Path]) -> list[list[Any]]:
-    """Name, size and time of change of some files, and the version of the readers.
+def get_or_create(group: str, name: str, make: Callable[[Path], None]) -> Path:
+    """Returns a folder of the cache and creates it if it is missing.
+
+    Several processes may call this at the same time: the first to finish creates the folder, the
+    others discard their content and use it.
+
+    Args:
+        group: name of the folder that holds folders of this kind.
+        name: name of the folder. Different content needs a different name.
+        make: writes the content into an empty folder.
 
     Raises:
-        DataError: one of them is gone.
+        AspEnvError: the cache folder cannot be written.
     """
-    found: list[list[Any]] = [["format", FORMAT, 0]]
+    folder = cache_folder() / group / name
+    if folder.is_dir():
+        return folder
+    try:
+        with atomic_folder(folder) as partial:
+            make(partial)
+    except AspEnvError:
+        if not folder.is_dir():  # no other process was faster
+            raise
+    return folder
+
+
+def entry_path(folder: Path, source: Path, *salt: object) -> Path:
+    """The cache file for data read from `source`; `salt` distinguishes several of one source."""
+    key = hashlib.sha256(repr((str(source.resolve()), salt)).encode()).hexdigest()[:20]
+    return folder / f"{source.name.split('.')[0]}-{key}.bin"
+
+
+def stamp(files: Iterable[Path]) -> list[list[Any]]:
+    """Name, size and modification time of files, preceded by the version of the readers.
+
+    Raises:
+        DataError: a file is missing.
+    """
+    rows: list[list[Any]] = [["format", FORMAT, 0]]
     for path in files:
         try:
             status = path.stat()
         except OSError as error:
             raise DataError(f"{path}: {error.strerror}; expected a file to read") from error
-        found.append([path.name, status.st_size, status.st_mtime_ns])
-    return found
-
-
-def entry(folder: Path, path: Path, *salt: object) -> Path:
-    """The cache file for what is read from `path`, told apart by `salt`."""
-    key = hashlib.sha256(repr((str(path.resolve()), salt)).encode()).hexdigest()[:20]
-    return folder / f"{path.name.split('.')[0]}-{key}.bin"
+        rows.append([path.name, status.st_size, status.st_mtime_ns])
+    return rows
 
 
 def load(
     path: Path, current: Sequence[Sequence[Any]]
 ) -> tuple[dict[str, Any], dict[str, np.ndarray]] | None:
-    """The header and the read-only, memory-mapped arrays of a cache file.
+    """Loads a cache file.
 
-    None if it is absent, damaged, or was made from files of another stamp than `current`.
+    Args:
+        path: the cache file.
+        current: the stamp that its sources have now.
+
+    Returns:
+        The facts, and read-only, memory-mapped arrays by name. None if the file is absent, damaged,
+        or has another stamp.
     """
     try:
         with path.open("rb") as file:
@@ -91,8 +121,8 @@ def load(
             return None
         mapped = np.memmap(path, dtype=np.uint8, mode="r").view(np.ndarray)
         arrays = {
-            name: mapped[at : at + count].view(dtype).reshape(shape)
-            for name, (dtype, shape, at, count) in header["arrays"].items()
+            name: mapped[offset : offset + count].view(dtype).reshape(shape)
+            for name, (dtype, shape, offset, count) in header["arrays"].items()
         }
     except (OSError, ValueError, KeyError, TypeError):
         return None
@@ -105,48 +135,38 @@ def save(
     facts: Mapping[str, Any],
     arrays: Mapping[str, np.ndarray],
 ) -> None:
-    """Writes a cache file, replacing one of the same name.
+    """Writes a cache file atomically; an existing one is replaced.
+
+    Args:
+        path: the cache file.
+        made_from: the stamp of the sources.
+        facts: values that JSON can hold.
+        arrays: arrays of any shape, by name.
 
     Raises:
-        OSError: it cannot be written; nothing is left behind.
+        OSError: the file cannot be written.
     """
     plain = {name: np.ascontiguousarray(array) for name, array in arrays.items()}
-    at = 0
+    total = 0
     layout = {}
     for name, array in plain.items():
-        layout[name] = [array.dtype.str, list(array.shape), at, array.nbytes]
-        at += _aligned(array.nbytes)
-    header, start = _header(made_from, facts, layout, at)
-    handle, aside = tempfile.mkstemp(dir=path.parent, prefix=f".{path.name}-")
-    try:
-        with os.fdopen(handle, "wb") as file:
-            file.write(_MAGIC + len(header).to_bytes(8, "little") + header)
-            for name, array in plain.items():
-                file.seek(start + layout[name][2])
-                file.write(array.data if array.size else b"")
-            file.truncate(start + at)
-        os.replace(aside, path)
-        _sweep(path)
-    except BaseException:
-        with contextlib.suppress(OSError):
-            os.unlink(aside)
-        raise
-
-
-def _sweep(path: Path) -> None:
-    """Removes what killed writers of a cache file left beside it, but of none that may live."""
-    now = path.stat().st_mtime
-    for left in path.parent.glob(f".{path.name}-*"):
-        with contextlib.suppress(OSError):
-            if now - left.stat().st_mtime > STALE_S:
-                left.unlink()
+        layout[name] = [array.dtype.str, list(array.shape), total, array.nbytes]
+        total += _aligned(array.nbytes)
+    header, start = _header(made_from, facts, layout, total)
+    with atomic_file(path) as partial, partial.open("wb") as file:
+        file.write(_MAGIC + len(header).to_bytes(8, "little") + header)
+        for name, array in plain.items():
+            file.seek(start + layout[name][2])
+            file.write(array.data if array.size else b"")
+        file.truncate(start + total)
+    remove_stale(path)
 
 
 def digest(path: Path) -> str:
-    """A hash of a file's content.
+    """The SHA-256 hash of a file's content.
 
     Raises:
-        DataError: it cannot be read.
+        DataError: the file cannot be read.
     """
     try:
         with path.open("rb") as file:
@@ -160,18 +180,18 @@ def _aligned(count: int) -> int:
 
 
 def _header(
-    made_from: Sequence[Sequence[Any]], facts: Mapping[str, Any], layout: dict, room: int
+    made_from: Sequence[Sequence[Any]], facts: Mapping[str, Any], layout: dict, total: int
 ) -> tuple[bytes, int]:
-    """The header, padded to where the arrays start, and that place."""
+    """The header, padded to the offset at which the arrays start, and that offset."""
     start = _ALIGNMENT
     while True:
         shifted = {
-            name: [dtype, shape, start + at, count]
-            for name, (dtype, shape, at, count) in layout.items()
+            name: [dtype, shape, start + offset, count]
+            for name, (dtype, shape, offset, count) in layout.items()
         }
         content = {
             "stamp": made_from,
-            "size": start + room,
+            "size": start + total,
             "facts": dict(facts),
             "arrays": shifted,
         }
@@ -180,33 +200,3 @@ def _header(
         if needed <= start:
             return header.ljust(start - len(_MAGIC) - 8), start
         start = _aligned(needed)
-
-
-def get_or_create(shelf_name: str, name: str, make: Callable[[Path], None]) -> Path:
-    """A folder of the cache, made if it is not there yet.
-
-    Several processes may ask at once: the first to finish wins, the others take what it made.
-
-    Args:
-        shelf_name: what kind of folder it is.
-        name: of the folder; another one for other content.
-        make: makes the content in a new folder.
-
-    Raises:
-        AspEnvError: the cache folder cannot be written.
-    """
-    shelf = cache_folder() / shelf_name
-    folder = shelf / name
-    if folder.is_dir():
-        return folder
-    try:
-        shelf.mkdir(parents=True, exist_ok=True)
-        with tempfile.TemporaryDirectory(dir=shelf, prefix=f".{name}-") as aside:
-            made = Path(aside) / "made"
-            make(made)
-            if not folder.is_dir():
-                os.rename(made, folder)
-    except OSError as error:
-        if not folder.is_dir():  # else another process was faster
-            raise AspEnvError(f"cannot write to {shelf}: {error.strerror or error}") from error
-    return folder

@@ -1,24 +1,22 @@
-"""Filters that follow one road user forward in time: the compiled part of causal histories.
+"""Causal histories: the states that a tracker would know, from noisy measurements up to now.
 
-Vehicles: an interacting multiple model filter (Blom and Bar-Shalom 1988) of two hypotheses,
-that the vehicle stands and that it moves. The first knows [x, y, heading]; the second is an
-extended Kalman filter of [x, y, heading, speed, acceleration, curvature] that moves as
-`asp_env.dynamics` does: the box's centre travels at the slip angle asin(rear · curvature) to the
-heading, and yaw rate = curvature · speed, so that a standing vehicle does not turn and a backing
-one does so rightly. Acceleration and curvature fade exponentially and are stirred by white noise
-(Singer 1970). The answer is the mean of both, weighted by their probabilities.
+Recorded tracks are smoothed with look-ahead, so that a recorded state contains up to half a second
+of what follows. Here white noise (0.08 m, 1.5°) is added to each recorded position and heading, and
+the result is filtered forward: the state at a frame depends on measurements up to that frame only.
 
-Vulnerable road users: a Kalman filter of constant velocity along x and along y, stirred by white
-acceleration. They head where they move, as in recordings.
+Vehicles: an interacting multiple model filter (Blom and Bar-Shalom 1988) with two models, standing
+and moving. The state of the first is [x, y, heading]. The second is an extended Kalman filter of
+[x, y, heading, speed, acceleration, curvature] whose motion is that of `asp_env.dynamics`: the
+box's centre moves at the slip angle asin(rear · curvature) to the heading, and the yaw rate is
+curvature · speed, so that standing vehicles do not turn. Acceleration and curvature decay
+exponentially and are driven by white noise (Singer 1970). The result is the mean of both models,
+weighted by their probabilities.
 
-All kernels are in this one file because numba's cache watches only the file of the kernel that is
-called from Python. Row k of what they return depends on the rows 0 … k of what they are given.
+Vulnerable road users: a Kalman filter of constant velocity along x and y, driven by white
+acceleration. Their heading is their direction of motion, as in recordings.
 
-MERGED: Histories as a tracker would know them: filtered forward only, on positions with noise.
-
-Recorded tracks are smoothed with look-ahead, so a state of them holds about half a second of what
-comes next. Here each recorded position and heading gets white noise (0.08 m, 1.5°) and is filtered
-again, so that the state at a frame is made of measurements up to that frame alone.
+All kernels are in this file because numba's cache watches only the file of the kernel that is
+called from Python.
 """
 
 import dataclasses
@@ -26,7 +24,7 @@ import hashlib
 import math
 import warnings
 from collections.abc import Iterator, Sequence
-from typing import Any, SupportsIndex, no_type_check, overload
+from typing import Any, NamedTuple, SupportsIndex, no_type_check, overload
 
 import numpy as np
 from jaxtyping import Float
@@ -37,68 +35,222 @@ from asp_env.data.classes import VULNERABLE
 from asp_env.data.recording import Recording
 from asp_env.dynamics.bicycle import AXLE_SHARE_OF_LENGTH
 from asp_env.errors import DataError
+from asp_env.geometry import wrap_scalar
+
+VERSION = 1
+"""Raise it whenever the filter or its noise gives other states for the same recording."""
 
 POSITION_SIGMA_M = 0.08
-"""Standard deviation of a measured coordinate, white from frame to frame."""
+"""Standard deviation of the noise of a measured coordinate, white over frames. Chosen by hand."""
 
 HEADING_SIGMA_RAD = math.radians(1.5)
+"""Standard deviation of the noise of a measured heading. Chosen by hand."""
 
 SPEED_SIGMA_MPS = 0.1
-"""Of the one speed that is measured, at a track's first frame."""
+"""Standard deviation of the noise of the speed at a track's first frame, the only measured speed.
+Chosen by hand."""
 
 SPEED_SIGMA_SHARE = 0.05
-"""This share of that speed is added to its standard deviation."""
+"""Share of that speed that is added to its standard deviation. Chosen by hand."""
 
 ACCELERATION_SIGMA_MPS2 = 1.0
-"""A larger one follows braking sooner and shakes more."""
+"""Standard deviation of a vehicle's acceleration. Chosen by hand: more follows braking sooner, less
+gives calmer speeds."""
 
 ACCELERATION_FADES_S = 2.0
+"""Time constant of the decay of acceleration. Chosen by hand."""
+
 CURVATURE_SIGMA_PER_M = 0.04
+"""Standard deviation of the curvature of a slow vehicle's path. Chosen by hand: more follows turns
+sooner, less gives calmer steering."""
+
 CURVATURE_FADES_S = 3.0
+"""Time constant of the decay of curvature. Chosen by hand."""
+
 CALM_MPS = 5.0
-"""Curvature varies less the faster one goes: its sigma is divided by 1 + (speed / this)²."""
+"""Scale of speed above which curvature varies less: its standard deviation is divided by
+1 + (speed / this)². Chosen by hand."""
 
 HEADING_DRIFT = 1e-5
-"""Variance that a heading gains besides, rad²/s."""
+"""Variance that the heading gains in addition, rad²/s. Chosen by hand: covers errors of the
+model."""
 
 POSITION_DRIFT = 3e-4
-"""Variance that a coordinate gains besides, m²/s."""
+"""Variance that a coordinate gains in addition, m²/s. Chosen by hand: covers errors of the model.
+"""
 
 STANDS_FOR_S = 20.0
-"""How long a vehicle stands, on average, before it moves."""
+"""Mean time for which a vehicle stands. Chosen by hand: more delays the detection of a start."""
 
 MOVES_FOR_S = 2.0
-"""How long a slow vehicle moves before it stands; no faster one comes to a sudden stand."""
+"""Mean time for which a slow vehicle moves before it stands. Chosen by hand: more delays the
+detection of a stop."""
 
 SLOW_MPS = 0.4
-"""Scale of speed within which a vehicle may come to stand."""
+"""Scale of the speeds from which a vehicle may come to a stand. Chosen by hand."""
 
 NEVER_STANDS_MPS = 2.0
-"""Above this only the hypothesis of motion is followed."""
+"""Above this speed only the model of motion is used. Chosen by hand: five times `SLOW_MPS`, where
+the probability of a stop vanishes."""
 
 START_SIGMA_MPS = 0.2
-"""Speed of a vehicle that has just begun to move."""
+"""Standard deviation of the speed of a vehicle that starts to move. Chosen by hand."""
 
 WALK_NOISE = 0.15
-"""Spectral density of a vulnerable road user's acceleration, m²/s³."""
+"""Spectral density of a vulnerable road user's acceleration, m²/s³. Chosen by hand."""
 
-TURNS_ABOVE_MPS = 0.6
-"""Above this the direction of motion is a vulnerable road user's heading."""
+COURSE_ABOVE_MPS = 0.6
+"""Speed above which the direction of motion is a vulnerable road user's heading. Chosen by hand:
+above the speeds that noise causes in standing pedestrians."""
 
 _MAX_SIN_SLIP = 0.6
-_NEVER = 1e-9
+_MIN_PROBABILITY = 1e-9
+
+
+class CausalHistories(Sequence[Any]):  # not of Recording: checking its items would filter them
+    """Recordings with causal states, each opened and filtered on first access."""
+
+    def __init__(self, recordings: Sequence[Any]) -> None:
+        """Creates the sequence without filtering.
+
+        Args:
+            recordings: the recorded ones.
+        """
+        self._recorded = recordings
+        self._filtered: dict[int, Recording] = {}
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        """Copies in other processes take states from the cache, or filter again."""
+        return CausalHistories, (self._recorded,)
+
+    def __len__(self) -> int:
+        return len(self._recorded)
+
+    @overload
+    def __getitem__(self, index: SupportsIndex) -> Recording: ...
+    @overload
+    def __getitem__(self, index: slice) -> "CausalHistories": ...
+    def __getitem__(self, index: SupportsIndex | slice) -> "Recording | CausalHistories":
+        """One recording with causal states, or an unfiltered sequence of several."""
+        if isinstance(index, slice):
+            return CausalHistories(self._recorded[index])
+        number = range(len(self))[index]
+        if number not in self._filtered:
+            recording = self._recorded[number]
+            self._filtered[number] = dataclasses.replace(
+                recording, states=_cached_states(recording)
+            )
+        return self._filtered[number]
+
+    def __iter__(self) -> Iterator[Recording]:
+        return (self[index] for index in range(len(self)))
+
+
+def causal_histories(recordings: Sequence[Any]) -> CausalHistories:
+    """The same recordings with causal `states`; all other fields are unchanged.
+
+    Use these for scenes, and the recorded ones for snippets, futures and labels. Filtered states
+    are stored in the cache folder by the recording's content, and mapped into memory.
+
+    Args:
+        recordings: the recorded ones.
+    """
+    return CausalHistories(recordings)
+
+
+def causal_states(recording: Recording) -> Float[np.ndarray, "rows 4"]:
+    """Filters all tracks of a recording.
+
+    The noise of a track comes from a generator seeded by the names of location and recording and by
+    the track's id. The filter starts at the track's first measurement. Only there the speed is
+    measured as well, with an error of 0.1 m/s + 5 %.
+
+    Returns:
+        States [x m, y m, heading rad, speed m/s], read-only. A row depends only on the rows of its
+        track up to it.
+    """
+    states = np.empty(recording.states.shape, dtype=np.float32)
+    dt_s = 1.0 / recording.frame_rate_hz
+    vulnerable = np.isin(recording.classes, [int(kind) for kind in VULNERABLE])
+    for track, track_id in enumerate(recording.track_ids.tolist()):
+        rows = slice(int(recording.starts[track]), int(recording.starts[track + 1]))
+        source = f"{recording.location}\0{recording.name}\0{track_id}".encode()
+        rng = np.random.default_rng(int.from_bytes(hashlib.sha256(source).digest()[:16], "little"))
+        measured, speed_mps = _measure(rng, recording.states[rows])
+        if vulnerable[track]:
+            filter_vulnerable(measured, speed_mps, dt_s, states[rows])
+        else:
+            rear_m = AXLE_SHARE_OF_LENGTH * float(recording.sizes[track, 0])
+            filter_vehicle(measured, speed_mps, rear_m, dt_s, states[rows])
+    states.flags.writeable = False
+    return states
+
+
+def _measure(
+    rng: np.random.Generator, states: Float[np.ndarray, "n 4"]
+) -> tuple[Float[np.ndarray, "n 3"], float]:
+    """[x, y, heading] of all frames and the speed at the first frame, all with noise."""
+    first_mps = float(states[0, 3])
+    sigma_mps = SPEED_SIGMA_MPS + SPEED_SIGMA_SHARE * abs(first_mps)
+    speed_mps = first_mps + sigma_mps * float(rng.standard_normal())
+    errors = rng.standard_normal((len(states), 3))
+    errors *= (POSITION_SIGMA_M, POSITION_SIGMA_M, HEADING_SIGMA_RAD)
+    return states[:, :3] + errors, speed_mps
+
+
+def _cached_states(recording: Recording) -> Float[np.ndarray, "rows 4"]:
+    """The causal states, read-only, from the cache if they are there.
+
+    If the cache cannot be written, a warning says so and tracks are filtered every time.
+    """
+    content = _digest(recording)
+    stamp = [["causal", VERSION, content]]
+    try:
+        path = cache.cache_folder() / f"causal-{content[:20]}.bin"
+    except DataError as error:
+        warnings.warn(f"results are not cached: {error}", stacklevel=2)
+        return causal_states(recording)
+    if (found := cache.load(path, stamp)) is not None:
+        return found[1]["states"]
+    states = causal_states(recording)
+    try:
+        cache.save(path, stamp, {}, {"states": states})
+    except OSError as error:
+        warnings.warn(f"results are not cached: {path}: {error.strerror}", stacklevel=2)
+    found = cache.load(path, stamp)
+    return states if found is None else found[1]["states"]
+
+
+def _digest(recording: Recording) -> str:
+    """A hash of everything that the causal states depend on."""
+    digest = hashlib.sha256(
+        repr((recording.location, recording.name, recording.frame_rate_hz)).encode()
+    )
+    for column in ("track_ids", "classes", "sizes", "starts", "states"):
+        digest.update(np.ascontiguousarray(getattr(recording, column)).data)
+    return digest.hexdigest()
+
+
+class _Process(NamedTuple):
+    """Constants of a vehicle's motion from one frame to the next."""
+
+    rear_m: float
+    """Distance from the box's centre to the rear axle."""
+    dt_s: float
+    keep_acceleration: float
+    """Share of the acceleration that remains after a frame."""
+    keep_curvature: float
+    """Share of the curvature that remains after a frame."""
+    acceleration_noise: float
+    """Variance that the acceleration gains in a frame, m²/s⁴."""
+    curvature_noise: float
+    """Variance that the curvature of a slow vehicle gains in a frame, 1/m²."""
 
 
 @njit(cache=True, nogil=True)
 @no_type_check
-def _wrap(angle):
-    return (angle + math.pi) % (2.0 * math.pi) - math.pi
-
-
-@njit(cache=True, nogil=True)
-@no_type_check
-def _halt(m, before):
-    """Braking ends at standstill: who is to go the other way does so from the next frame on."""
+def _stop_at_zero(m, before):
+    """Sets speed and acceleration of state m (6,) to zero if the speed changed its sign."""
     if m[3] * before < 0.0:
         m[3] = 0.0
         m[4] = 0.0
@@ -106,18 +258,27 @@ def _halt(m, before):
 
 @njit(cache=True, nogil=True)
 @no_type_check
-def _predict(m, p, work, rear, dt, keep_a, keep_c, noise_a, noise_c):
-    """Moves state m (6,) and covariance p (6, 6) of the hypothesis of motion on by one frame."""
-    way = m[3] * dt + 0.5 * m[4] * dt * dt
+def _predict(m, p, work, process):
+    """Predicts the moving model one frame ahead.
+
+    Args:
+        m: (6,) state, updated in place.
+        p: (6, 6) covariance, updated in place.
+        work: (6, 6) buffer.
+        process: the constants of the motion.
+    """
+    rear, dt = process.rear_m, process.dt_s
+    keep_a, keep_c = process.keep_acceleration, process.keep_curvature
+    distance = m[3] * dt + 0.5 * m[4] * dt * dt
     sin_slip = min(max(rear * m[5], -_MAX_SIN_SLIP), _MAX_SIN_SLIP)
     cos_slip = math.sqrt(1.0 - sin_slip * sin_slip)
-    course = m[2] + math.asin(sin_slip) + 0.5 * m[5] * way
+    course = m[2] + math.asin(sin_slip) + 0.5 * m[5] * distance
     cosine, sine = math.cos(course), math.sin(course)
-    bend = rear / cos_slip + 0.5 * way
-    turn = 0.5 * m[5] * dt * way
-    # rows of the Jacobian that differ from the identity
-    x_t, x_v, x_c = -way * sine, dt * cosine - turn * sine, -way * sine * bend
-    y_t, y_v, y_c = way * cosine, dt * sine + turn * cosine, way * cosine * bend
+    bend = rear / cos_slip + 0.5 * distance
+    turn = 0.5 * m[5] * dt * distance
+    # Rows of the Jacobian that differ from the identity.
+    x_t, x_v, x_c = -distance * sine, dt * cosine - turn * sine, -distance * sine * bend
+    y_t, y_v, y_c = distance * cosine, dt * sine + turn * cosine, distance * cosine * bend
     t_v = m[5] * dt
     half = 0.5 * dt
     for j in range(6):
@@ -125,7 +286,7 @@ def _predict(m, p, work, rear, dt, keep_a, keep_c, noise_a, noise_c):
         mean_v = v + half * a
         work[0, j] = p[0, j] + x_t * t + x_v * mean_v + x_c * c
         work[1, j] = p[1, j] + y_t * t + y_v * mean_v + y_c * c
-        work[2, j] = t + t_v * mean_v + way * c
+        work[2, j] = t + t_v * mean_v + distance * c
         work[3, j] = v + dt * a
         work[4, j] = keep_a * a
         work[5, j] = keep_c * c
@@ -134,7 +295,7 @@ def _predict(m, p, work, rear, dt, keep_a, keep_c, noise_a, noise_c):
         mean_v = v + half * a
         p[i, 0] = work[i, 0] + x_t * t + x_v * mean_v + x_c * c
         p[i, 1] = work[i, 1] + y_t * t + y_v * mean_v + y_c * c
-        p[i, 2] = t + t_v * mean_v + way * c
+        p[i, 2] = t + t_v * mean_v + distance * c
         p[i, 3] = v + dt * a
         p[i, 4] = keep_a * a
         p[i, 5] = keep_c * c
@@ -142,23 +303,34 @@ def _predict(m, p, work, rear, dt, keep_a, keep_c, noise_a, noise_c):
     p[0, 0] += POSITION_DRIFT * dt
     p[1, 1] += POSITION_DRIFT * dt
     p[2, 2] += HEADING_DRIFT * dt
-    p[4, 4] += noise_a
-    p[5, 5] += noise_c / (calm * calm)
+    p[4, 4] += process.acceleration_noise
+    p[5, 5] += process.curvature_noise / (calm * calm)
 
-    m[0] += way * cosine
-    m[1] += way * sine
-    m[2] += m[5] * way
+    m[0] += distance * cosine
+    m[1] += distance * sine
+    m[2] += m[5] * distance
     before = m[3]
     m[3] += m[4] * dt
     m[4] *= keep_a
     m[5] *= keep_c
-    _halt(m, before)
+    _stop_at_zero(m, before)
 
 
 @njit(cache=True, nogil=True)
 @no_type_check
 def _update(m, p, i, innovation, variance):
-    """Takes in a measurement of component i; returns minus twice its log density."""
+    """Updates the moving model by a measurement of one component.
+
+    Args:
+        m: (6,) state, updated in place.
+        p: (6, 6) covariance, updated in place.
+        i: index of the measured component.
+        innovation: the measurement less `m[i]`.
+        variance: of the measurement.
+
+    Returns:
+        Minus twice the measurement's log density, up to a constant.
+    """
     s = p[i, i] + variance
     scaled = innovation / s
     g0, g1, g2, g3, g4, g5 = p[i, 0], p[i, 1], p[i, 2], p[i, 3], p[i, 4], p[i, 5]
@@ -178,15 +350,18 @@ def _update(m, p, i, innovation, variance):
 @njit(cache=True, nogil=True)
 @no_type_check
 def _mix(m, p, still, spread, standing, dt):
-    """Lets the hypotheses exchange what they know; returns the probability of standing now.
+    """Mixes the two models by the probabilities of starts and stops.
 
     Args:
-        m: state of motion, (6,).
-        p: its covariance, (6, 6).
-        still: [x, y, heading] of standing.
-        spread: their variances.
-        standing: probability of standing so far.
+        m: (6,) state of the moving model, updated in place.
+        p: (6, 6) its covariance, updated in place.
+        still: (3,) [x, y, heading] of the standing model, updated in place.
+        spread: (3,) its variances, updated in place.
+        standing: probability of the standing model before.
         dt: seconds between frames.
+
+    Returns:
+        The probability of the standing model before the next measurement.
     """
     to_move = dt / (STANDS_FOR_S + dt)
     to_stand = dt / (MOVES_FOR_S + dt) * math.exp(-0.5 * (m[3] / SLOW_MPS) ** 2)
@@ -222,29 +397,40 @@ def _mix(m, p, still, spread, standing, dt):
 @njit(cache=True, nogil=True)
 @no_type_check
 def _apart(seen, state, j):
-    """How far a measurement lies from a state in component j; headings the short way round."""
-    return _wrap(seen[j] - state[j]) if j == 2 else seen[j] - state[j]
+    """Difference of a measurement and a state in component j, wrapped for the heading."""
+    return wrap_scalar(seen[j] - state[j]) if j == 2 else seen[j] - state[j]
 
 
 @njit(cache=True, nogil=True)
 @no_type_check
-def _observe_standing(still, spread, seen, noise, drift):
-    """Takes in a measurement under the hypothesis of standing; returns as `_update` does."""
-    unlikely = 0.0
+def _update_standing(still, spread, seen, noise, drift):
+    """Updates the standing model by a measurement.
+
+    Args:
+        still: (3,) [x, y, heading], updated in place.
+        spread: (3,) variances, updated in place.
+        seen: (3,) measured [x, y, heading].
+        noise: three variances of the measurement.
+        drift: three variances that the state gains in a frame.
+
+    Returns:
+        Minus twice the measurement's log density, up to a constant.
+    """
+    cost = 0.0
     for j in range(3):
         innovation = _apart(seen, still, j)
         spread[j] += drift[j]
         s = spread[j] + noise[j]
         still[j] += spread[j] / s * innovation
         spread[j] *= noise[j] / s
-        unlikely += innovation * innovation / s + math.log(s)
-    return unlikely
+        cost += innovation * innovation / s + math.log(s)
+    return cost
 
 
 @njit(cache=True, nogil=True)
 @no_type_check
-def _turn_about(m, still):
-    """The same motion of a vehicle whose other end is the front."""
+def _swap_front(m, still):
+    """Describes the same motion with the vehicle's other end as its front."""
     m[2] += math.pi
     still[2] += math.pi
     for i in range(3, 6):
@@ -253,30 +439,37 @@ def _turn_about(m, still):
 
 @njit(cache=True, nogil=True)
 @no_type_check
-def _believe(standing, unlikely_standing, unlikely_moving):
-    """The probability of standing after a measurement."""
-    ratio = math.exp(min(max(0.5 * (unlikely_standing - unlikely_moving), -50.0), 50.0))
+def _posterior(standing, cost_standing, cost_moving):
+    """The probability of the standing model after a measurement.
+
+    Args:
+        standing: the probability before.
+        cost_standing: minus twice the log density under the standing model.
+        cost_moving: the same under the moving model.
+    """
+    ratio = math.exp(min(max(0.5 * (cost_standing - cost_moving), -50.0), 50.0))
     after = standing / (standing + (1.0 - standing) * ratio)
-    return min(max(after, _NEVER), 1.0 - _NEVER)
+    return min(max(after, _MIN_PROBABILITY), 1.0 - _MIN_PROBABILITY)
 
 
 @njit(cache=True, nogil=True)
 @no_type_check
-def follow_vehicle(measured, speed, rear, dt, states):
-    """Follows one vehicle.
+def filter_vehicle(measured, speed, rear, dt, states):
+    """Filters the track of one vehicle.
 
     Args:
         measured: (n, 3) float64, [x m, y m, heading rad] at consecutive frames.
         speed: measured at the first frame, m/s.
         rear: distance from the box's centre to the rear axle, m.
         dt: seconds between frames.
-        states: (n, 4) float32, receives [x, y, heading, speed].
+        states: (n, 4) float32, receives [x m, y m, heading rad, speed m/s].
     """
     noise = (POSITION_SIGMA_M**2, POSITION_SIGMA_M**2, HEADING_SIGMA_RAD**2)
     drift = (POSITION_DRIFT * dt, POSITION_DRIFT * dt, HEADING_DRIFT * dt)
     keep_a, keep_c = math.exp(-dt / ACCELERATION_FADES_S), math.exp(-dt / CURVATURE_FADES_S)
     noise_a = ACCELERATION_SIGMA_MPS2**2 * (1.0 - keep_a * keep_a)
     noise_c = CURVATURE_SIGMA_PER_M**2 * (1.0 - keep_c * keep_c)
+    process = _Process(rear, dt, keep_a, keep_c, noise_a, noise_c)
     m, p, work = np.zeros(6), np.zeros((6, 6)), np.empty((6, 6))
     still, spread = np.empty(3), np.empty(3)
     for j in range(3):
@@ -286,37 +479,44 @@ def follow_vehicle(measured, speed, rear, dt, states):
     p[3, 3] = (SPEED_SIGMA_MPS + SPEED_SIGMA_SHARE * abs(speed)) ** 2
     p[4, 4] = ACCELERATION_SIGMA_MPS2**2
     p[5, 5] = (CURVATURE_SIGMA_PER_M / (1.0 + (speed / CALM_MPS) ** 2)) ** 2
-    standing = max(0.5 * math.exp(-0.5 * (speed / SLOW_MPS) ** 2), _NEVER)
+    standing = max(0.5 * math.exp(-0.5 * (speed / SLOW_MPS) ** 2), _MIN_PROBABILITY)
     for k in range(len(measured)):
         if k > 0:
             seen = measured[k]
             if abs(_apart(seen, m, 2)) > 0.5 * math.pi:
-                _turn_about(m, still)
+                _swap_front(m, still)
             slow = abs(m[3]) < NEVER_STANDS_MPS
             if slow:
                 standing = _mix(m, p, still, spread, standing, dt)
-            _predict(m, p, work, rear, dt, keep_a, keep_c, noise_a, noise_c)
-            unlikely, before = 0.0, m[3]
+            _predict(m, p, work, process)
+            cost, before = 0.0, m[3]
             for j in range(3):
-                unlikely += _update(m, p, j, _apart(seen, m, j), noise[j])
-            _halt(m, before)
+                cost += _update(m, p, j, _apart(seen, m, j), noise[j])
+            _stop_at_zero(m, before)
             if slow:
-                other = _observe_standing(still, spread, seen, noise, drift)
-                standing = _believe(standing, other, unlikely)
+                cost_standing = _update_standing(still, spread, seen, noise, drift)
+                standing = _posterior(standing, cost_standing, cost)
             else:
-                standing = _NEVER
+                standing = _MIN_PROBABILITY
                 for j in range(3):
                     still[j], spread[j] = m[j], p[j, j]
         for j in range(2):
             states[k, j] = m[j] + standing * (still[j] - m[j])
-        states[k, 2] = _wrap(m[2] + standing * _apart(still, m, 2))
+        states[k, 2] = wrap_scalar(m[2] + standing * _apart(still, m, 2))
         states[k, 3] = (1.0 - standing) * m[3]
 
 
 @njit(cache=True, nogil=True)
 @no_type_check
-def follow_vulnerable(measured, speed, dt, states):
-    """Follows one pedestrian, bicycle or animal; arguments as in `follow_vehicle`."""
+def filter_vulnerable(measured, speed, dt, states):
+    """Filters the track of one vulnerable road user.
+
+    Args:
+        measured: (n, 3) float64, [x m, y m, heading rad] at consecutive frames.
+        speed: measured at the first frame, m/s.
+        dt: seconds between frames.
+        states: (n, 4) float32, receives [x m, y m, heading rad, speed m/s].
+    """
     x, y, heading = measured[0]
     speed_x, speed_y = speed * math.cos(heading), speed * math.sin(heading)
     noise = POSITION_SIGMA_M**2
@@ -339,129 +539,7 @@ def follow_vulnerable(measured, speed, dt, states):
             p_xv -= gain_v * p_xx
             p_xx -= gain_x * p_xx
         total = math.sqrt(speed_x * speed_x + speed_y * speed_y)
-        if total > TURNS_ABOVE_MPS:
+        if total > COURSE_ABOVE_MPS:
             heading = math.atan2(speed_y, speed_x)
         states[k, 0], states[k, 1] = x, y
-        states[k, 2], states[k, 3] = _wrap(heading), total
-
-
-VERSION = 1
-"""Raise whenever the filter or its noise gives other states for the same recording."""
-
-
-class CausalHistories(Sequence[Any]):  # not of Recording: checking its items would filter them
-    """Recordings with causal states, each filtered when it is first asked for."""
-
-    def __init__(self, recordings: Sequence[Any]) -> None:
-        """Filters nothing yet.
-
-        Args:
-            recordings: as they were recorded; opened no earlier than asked for.
-        """
-        self._recorded = recordings
-        self._filtered: dict[int, Recording] = {}
-
-    def __reduce__(self) -> tuple[Any, ...]:
-        """A copy in another process filters anew what is not in the cache."""
-        return CausalHistories, (self._recorded,)
-
-    def __len__(self) -> int:
-        """How many there are."""
-        return len(self._recorded)
-
-    @overload
-    def __getitem__(self, index: SupportsIndex) -> Recording: ...
-    @overload
-    def __getitem__(self, index: slice) -> "CausalHistories": ...
-    def __getitem__(self, index: SupportsIndex | slice) -> "Recording | CausalHistories":
-        """One recording with causal states, or some of them, still unfiltered."""
-        if isinstance(index, slice):
-            return CausalHistories(self._recorded[index])
-        number = range(len(self))[index]
-        if number not in self._filtered:
-            recording = self._recorded[number]
-            self._filtered[number] = dataclasses.replace(recording, states=_kept(recording))
-        return self._filtered[number]
-
-    def __iter__(self) -> Iterator[Recording]:
-        """Filters one after the other."""
-        return (self[index] for index in range(len(self)))
-
-
-def causal_histories(recordings: Sequence[Any]) -> CausalHistories:
-    """The same recordings with `states` as a causal tracker knows them; all else is unchanged.
-
-    Make scenes of these, and snippets, futures and labels of the recorded ones. What was filtered
-    is kept in the cache folder, by content, and mapped into memory from then on.
-    """
-    return CausalHistories(recordings)
-
-
-def causal_states(recording: Recording) -> Float[np.ndarray, "rows 4"]:
-    """The states of all rows, each made of its track's rows up to it.
-
-    The noise is drawn from a generator of each track's own, seeded by the location's and the
-    recording's name and the track's id. A track begins with its first measurement; its speed is
-    measured there and nowhere else, with an error of 0.1 m/s + 5 %: who comes into view has been
-    seen to move.
-    """
-    states = np.empty(recording.states.shape, dtype=np.float32)
-    dt_s = 1.0 / recording.frame_rate_hz
-    vulnerable = np.isin(recording.classes, [int(kind) for kind in VULNERABLE])
-    for track, track_id in enumerate(recording.track_ids.tolist()):
-        rows = slice(int(recording.starts[track]), int(recording.starts[track + 1]))
-        source = f"{recording.location}\0{recording.name}\0{track_id}".encode()
-        rng = np.random.default_rng(int.from_bytes(hashlib.sha256(source).digest()[:16], "little"))
-        measured, speed_mps = _measure(rng, recording.states[rows])
-        if vulnerable[track]:
-            follow_vulnerable(measured, speed_mps, dt_s, states[rows])
-        else:
-            rear_m = AXLE_SHARE_OF_LENGTH * float(recording.sizes[track, 0])
-            follow_vehicle(measured, speed_mps, rear_m, dt_s, states[rows])
-    states.flags.writeable = False
-    return states
-
-
-def _measure(
-    rng: np.random.Generator, states: Float[np.ndarray, "n 4"]
-) -> tuple[Float[np.ndarray, "n 3"], float]:
-    """Positions and headings with noise, and the speed at the first frame."""
-    first_mps = float(states[0, 3])
-    sigma_mps = SPEED_SIGMA_MPS + SPEED_SIGMA_SHARE * abs(first_mps)
-    speed_mps = first_mps + sigma_mps * float(rng.standard_normal())
-    errors = rng.standard_normal((len(states), 3))
-    errors *= (POSITION_SIGMA_M, POSITION_SIGMA_M, HEADING_SIGMA_RAD)
-    return states[:, :3] + errors, speed_mps
-
-
-def _kept(recording: Recording) -> Float[np.ndarray, "rows 4"]:
-    """The causal states, read-only, from the cache if it has them; otherwise it gets them.
-
-    Where the cache cannot be written to, they are filtered anew each time, and a warning says so.
-    """
-    content = _digest(recording)
-    stamp = [["causal", VERSION, content]]
-    try:
-        path = cache.cache_folder() / f"causal-{content[:20]}.bin"
-    except DataError as error:
-        warnings.warn(f"nothing is kept for next time: {error}", stacklevel=2)
-        return causal_states(recording)
-    if (found := cache.load(path, stamp)) is not None:
-        return found[1]["states"]
-    states = causal_states(recording)
-    try:
-        cache.save(path, stamp, {}, {"states": states})
-    except OSError as error:
-        warnings.warn(f"nothing is kept for next time: {path}: {error.strerror}", stacklevel=2)
-    found = cache.load(path, stamp)
-    return states if found is None else found[1]["states"]
-
-
-def _digest(recording: Recording) -> str:
-    """A hash of all that the causal states are made of."""
-    digest = hashlib.sha256(
-        repr((recording.location, recording.name, recording.frame_rate_hz)).encode()
-    )
-    for column in ("track_ids", "classes", "sizes", "starts", "states"):
-        digest.update(np.ascontiguousarray(getattr(recording, column)).data)
-    return digest.hexdigest()
+        states[k, 2], states[k, 3] = wrap_scalar(heading), total

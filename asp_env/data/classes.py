@@ -1,4 +1,4 @@
-"""Road users: one enumeration, the names that files use for them, and default footprints."""
+"""Classes of agents, the names that files use for them, and default footprints."""
 
 from enum import IntEnum
 
@@ -8,7 +8,7 @@ from asp_env.errors import DataError
 
 
 class AgentClass(IntEnum):
-    """What an agent is. The numbers are stored in caches and rollouts and never change."""
+    """Class of an agent. Caches and rollouts store the numbers, which therefore never change."""
 
     CAR = 0
     VAN = 1
@@ -35,7 +35,7 @@ ALIASES = {
     "lorry": AgentClass.TRUCK,
     "unknown": AgentClass.OTHER,
 }
-"""Lower-cased class names of files; inD, rounD, INTERACTION and its relatives."""
+"""Class by its lower-case name in the files of inD, rounD, INTERACTION and related data sets."""
 
 FOOTPRINTS_M = np.array(
     [
@@ -53,7 +53,7 @@ FOOTPRINTS_M = np.array(
     ],
     dtype=np.float32,
 )
-"""(classes, 2) default length and width where a file says 0."""
+"""(classes, 2) length and width, m, of agents whose file gives 0. Chosen by hand."""
 
 PREDICTED = frozenset(
     {
@@ -66,17 +66,18 @@ PREDICTED = frozenset(
         AgentClass.OTHER,
     }
 )
-"""Targets of prediction: every class but bicycles and pedestrians (paper), animals and trailers."""
+"""Classes that are predicted and can be driven: all but bicycles and pedestrians (as in Janjoš et
+al. 2021), animals and trailers."""
 
 VULNERABLE = frozenset({AgentClass.BICYCLE, AgentClass.PEDESTRIAN, AgentClass.ANIMAL})
-"""Road users whose recorded heading is not to be relied on."""
+"""Vulnerable road users, whose recorded heading is unreliable."""
 
 
 def parse_class(name: str) -> AgentClass:
-    """The class that a file calls `name`, in any case.
+    """The class of a name in a file, in upper or lower case.
 
     Raises:
-        DataError: the name is not known.
+        DataError: the name is unknown.
     """
     try:
         return ALIASES[name.strip().lower()]

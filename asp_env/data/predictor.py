@@ -1,12 +1,11 @@
-"""What a predictor says of its targets.
-
-MERGED: The socket for predictors, and how one is named: `name` or `name:RUN_DIR`.
-"""
+"""Predictors and their forecasts."""
 
 import dataclasses
+import warnings
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Protocol, runtime_checkable
+from operator import attrgetter
+from typing import Any, Protocol, runtime_checkable
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
@@ -20,23 +19,26 @@ from asp_env.dynamics import rollout
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Forecast:
-    """M modes of T ticks for each of N targets; step 0 is one tick ahead of the scene."""
+    """M modes of T ticks for each of N targets; step 0 is one tick after the scene."""
 
     states: Float[np.ndarray, "t m steps 4"]
     """[x m, y m, heading rad, speed m/s] in the recording's frame."""
     actions: Float[np.ndarray, "t m steps 2"]
+    """[acceleration m/s², steering rad] that lead to the states."""
     actions_valid: Bool[np.ndarray, " t"]
-    """False for a predictor that forecasts no actions."""
+    """False for targets without actions."""
     log_probs: Float[np.ndarray, "t m"]
     """Natural logarithms of the modes' probabilities, which sum to one."""
     ids: Int[np.ndarray, " t"]
+    """Track ids of the targets."""
     targets: Int[np.ndarray, "t 2"]
     """(situation, slot) in the scene."""
     tick: Int[np.ndarray, " t"]
-    """The scene's tick, so that a late forecast can be matched."""
+    """The scene's tick."""
     valid: Bool[np.ndarray, " t"]
-    """False for agents that this predictor does not forecast; their rows are zeros."""
+    """False for targets that the predictor does not forecast; their rows are zeros."""
     dt_s: float
+    """Seconds per tick."""
 
     @property
     def probabilities(self) -> Float[np.ndarray, "t m"]:
@@ -45,8 +47,93 @@ class Forecast:
 
     @property
     def most_probable(self) -> Int[np.ndarray, " t"]:
-        """The index of each target's most probable mode; the first one of equals."""
+        """Index of each target's most probable mode, the first of several."""
         return self.log_probs.argmax(axis=-1)
+
+
+@runtime_checkable
+class Predictor(Protocol):
+    """Forecasts the targets of a scene."""
+
+    @property
+    def name(self) -> str:
+        """The name in tables and messages."""
+        ...
+
+    @property
+    def privileged(self) -> bool:
+        """Whether `predict` uses the recorded future; tables mark such predictors as oracles."""
+        ...
+
+    @property
+    def dt_s(self) -> float:
+        """Seconds per tick of the scenes and forecasts."""
+        ...
+
+    @property
+    def history(self) -> int:
+        """Number of past ticks at which a target must be present."""
+        ...
+
+    @property
+    def horizon(self) -> int:
+        """Number of ticks of a forecast."""
+        ...
+
+    @property
+    def trained_on(self) -> TrainedOn | None:
+        """The training data; None for predictors without training."""
+        ...
+
+    @property
+    def metadata(self) -> Mapping[str, str]:
+        """Entries for tables and manifests: `trained_on`, `view`, `preset`, `weights`, if any."""
+        ...
+
+    def predict(self, scene: Scene, future: Future | None = None) -> Forecast:
+        """Forecasts the scene's targets.
+
+        Args:
+            scene: the scene.
+            future: the recorded future of the targets, only for privileged predictors.
+        """
+        ...
+
+
+@runtime_checkable
+class PredictorPlug(Protocol):
+    """The object that an entry point of the group `asp_env.predictors` names."""
+
+    def from_name(self, argument: str, *, horizon: int, dt_s: float) -> Predictor:
+        """Makes the predictor.
+
+        Args:
+            argument: the text behind the colon of the predictor's name, or an empty text.
+            horizon: number of ticks to forecast; a trained predictor has a horizon of its own.
+            dt_s: seconds per tick.
+
+        Raises:
+            AspEnvError: the argument is missing, superfluous, or cannot be loaded.
+        """
+        ...
+
+
+def load_predictor(name: str, *, horizon: int, dt_s: float) -> Predictor:
+    """Loads a predictor by its name, such as `constant-velocity` or `ffw-asp:runs/1`.
+
+    Args:
+        name: the registered name and, behind a colon, the run folder of a trained predictor.
+        horizon: number of ticks to forecast; a trained predictor has a horizon of its own.
+        dt_s: seconds per tick.
+
+    Raises:
+        AspEnvError: the name is unknown, or the predictor cannot be made for these values.
+    """
+    kind, _, argument = name.partition(":")
+    plug: PredictorPlug = registry.find("predictors", kind)
+    predictor = plug.from_name(argument, horizon=horizon, dt_s=dt_s)
+    _accept_about(predictor)
+    return predictor
 
 
 def make_forecast(
@@ -57,15 +144,23 @@ def make_forecast(
     log_probs: Float[np.ndarray, "t m"],
     valid: Bool[np.ndarray, " t"],
 ) -> Forecast:
-    """A forecast of the scene's targets, zeroed where not valid."""
+    """A forecast of the scene's targets, with zeros where not valid.
+
+    Args:
+        scene: the scene.
+        states: [x m, y m, heading rad, speed m/s] in the recording's frame.
+        actions: [acceleration m/s², steering rad], or None for a predictor without actions.
+        log_probs: natural logarithms of the modes' probabilities.
+        valid: which targets the predictor forecasts.
+    """
     at = (scene.targets[:, 0], scene.targets[:, 1])
-    keep = valid[:, None, None, None]
+    mask = valid[:, None, None, None]
     has_actions = actions is not None
     if actions is None:
         actions = np.zeros((*states.shape[:-1], 2), dtype=states.dtype)
     return Forecast(
-        states=np.where(keep, states, 0).astype(np.float32),
-        actions=np.where(keep, actions, 0).astype(np.float32),
+        states=np.where(mask, states, 0).astype(np.float32),
+        actions=np.where(mask, actions, 0).astype(np.float32),
         actions_valid=valid & has_actions,
         log_probs=log_probs.astype(np.float32),
         ids=scene.ids[at],
@@ -77,103 +172,48 @@ def make_forecast(
 
 
 def constant_velocity(scene: Scene, *, steps: int) -> Float[np.ndarray, "t steps 4"]:
-    """Each target goes on straight at its present speed: zero actions through the bicycle."""
+    """States of the targets that continue straight at their present speed.
+
+    Args:
+        scene: the scene.
+        steps: number of ticks.
+    """
     at = (scene.targets[:, 0], scene.targets[:, 1])
     now = scene.states[at][:, -1]
     actions = np.zeros((len(now), steps, 2), dtype=now.dtype)
-    lengths = np.maximum(scene.sizes[at][:, 0], 0.1)
-    return rollout(now, actions, lengths, scene.dt_s, reverse=True)
+    lengths_m = np.maximum(scene.sizes[at][:, 0], 0.1)
+    return rollout(now, actions, lengths_m, scene.dt_s, reverse=True)
 
 
 def fill_missing(forecast: Forecast, scene: Scene) -> Forecast:
-    """The forecast with constant velocity, in every mode alike, for targets that it leaves out.
+    """Adds constant velocity, in equally probable modes, for present targets without a forecast.
 
-    For planners and drivers, which need a word on everybody who is there now.
+    Planners and drivers need a forecast of every agent that is present.
     """
     at = (scene.targets[:, 0], scene.targets[:, 1])
-    fill = ~forecast.valid & scene.valid[at][:, -1]
-    if not fill.any():
+    missing = ~forecast.valid & scene.valid[at][:, -1]
+    if not missing.any():
         return forecast
     straight = constant_velocity(scene, steps=forecast.states.shape[2])[:, None]
-    states = np.where(fill[:, None, None, None], straight, forecast.states)
-    alike = np.float32(-np.log(forecast.log_probs.shape[1]))
+    states = np.where(missing[:, None, None, None], straight, forecast.states)
+    log_prob = np.float32(-np.log(forecast.log_probs.shape[1]))
     return dataclasses.replace(
         forecast,
         states=states.astype(np.float32),
-        log_probs=np.where(fill[:, None], alike, forecast.log_probs),
-        valid=forecast.valid | fill,
+        log_probs=np.where(missing[:, None], log_prob, forecast.log_probs),
+        valid=forecast.valid | missing,
     )
 
 
-@runtime_checkable
-class Predictor(Protocol):
-    """Anything that forecasts the targets of a scene."""
-
-    @property
-    def name(self) -> str:
-        """What tables call it."""
-        ...
-
-    @property
-    def privileged(self) -> bool:
-        """Whether it is handed the recorded future; tables name such a predictor as an oracle."""
-        ...
-
-    @property
-    def dt_s(self) -> float:
-        """The time step of the scenes that it takes and of its forecasts."""
-        ...
-
-    @property
-    def history(self) -> int:
-        """Past ticks that it needs to see of a target."""
-        ...
-
-    @property
-    def horizon(self) -> int:
-        """Ticks that it forecasts."""
-        ...
-
-    @property
-    def trained_on(self) -> TrainedOn | None:
-        """What it learned from; None for one that learns nothing."""
-        ...
-
-    @property
-    def metadata(self) -> Mapping[str, str]:
-        """For tables and manifests: `trained_on`, `view`, `preset`, `weights`, as they apply."""
-        ...
-
-    def predict(self, scene: Scene, future: Future | None = None) -> Forecast:
-        """Forecasts the scene's targets; only privileged predictors get a future."""
-        ...
-
-
-@runtime_checkable
-class PredictorPlug(Protocol):
-    """What the registry holds under a predictor's name."""
-
-    def from_name(self, argument: str, *, horizon: int, dt_s: float) -> Predictor:
-        """The predictor for what stands behind the colon of its name, possibly nothing.
-
-        Raises:
-            AspEnvError: the argument is missing, superfluous, or cannot be loaded.
-        """
-        ...
-
-
-def load_predictor(name: str, *, horizon: int, dt_s: float) -> Predictor:
-    """The predictor of a name such as `constant-velocity` or `ffw-asp:runs/1`.
-
-    Args:
-        name: the registered name, and behind a colon its folder if it is a trained one.
-        horizon: ticks to forecast, for predictors that can forecast any number; a trained one
-            keeps its own.
-        dt_s: the time step of the scenes to come.
-
-    Raises:
-        AspEnvError: the name is unknown, or the predictor cannot be made for it.
-    """
-    kind, _, argument = name.partition(":")
-    plug: PredictorPlug = registry.find("predictors", kind)
-    return plug.from_name(argument, horizon=horizon, dt_s=dt_s)
+def _accept_about(predictor: object) -> None:
+    """Defines `metadata` for predictors that still have it under its former name, `about`."""
+    if hasattr(predictor, "metadata") or not hasattr(predictor, "about"):
+        return
+    kind: Any = type(predictor)
+    warnings.warn(
+        f"{kind.__name__}.about is deprecated and will be ignored from the next release on: rename "
+        "it to `metadata`",
+        DeprecationWarning,
+        stacklevel=3,
+    )
+    kind.metadata = property(attrgetter("about"))

@@ -1,7 +1,4 @@
-"""Ticks: an integer number of a recording's frames.
-
-MERGED: What was measured at one place: a ragged table of tracks with an index by frame.
-"""
+"""Recordings: the tracks measured at one place, and ticks as a whole number of their frames."""
 
 import math
 from dataclasses import dataclass
@@ -17,13 +14,18 @@ from asp_env.data.road_map import RoadMap
 from asp_env.errors import AspEnvError, DataError
 
 DEFAULT_DT_S = 0.2
+"""Default seconds per tick."""
+
+PARKED_WITHIN_M = 1.0
+"""A track of the whole recording that stays within this distance of its start is parked. Chosen by
+hand: above the noise of measured positions."""
 
 
 def frames_per_tick(frame_rate_hz: float, dt_s: float = DEFAULT_DT_S) -> int:
-    """How many frames one tick of `dt_s` spans.
+    """Number of frames per tick.
 
     Raises:
-        AspEnvError: `dt_s` is no whole number of frames; those near it that are get listed.
+        AspEnvError: `dt_s` is not a whole number of frames; the message lists near ones that are.
     """
     if not (math.isfinite(frame_rate_hz) and frame_rate_hz > 0):
         raise AspEnvError(f"frame rate {frame_rate_hz} Hz: expected a positive number")
@@ -42,10 +44,10 @@ def frames_per_tick(frame_rate_hz: float, dt_s: float = DEFAULT_DT_S) -> int:
 
 
 def ticks(duration_s: float, dt_s: float) -> int:
-    """How many ticks a duration spans.
+    """Number of ticks of a duration.
 
     Raises:
-        AspEnvError: the duration is no whole, positive number of ticks.
+        AspEnvError: the duration is not a whole, positive number of ticks.
     """
     for what, value_s in (("time step", dt_s), ("duration", duration_s)):
         if not (math.isfinite(value_s) and value_s > 0):
@@ -56,53 +58,51 @@ def ticks(duration_s: float, dt_s: float) -> int:
     return count
 
 
-PARKED_WITHIN_M = 1.0
-"""A track of the whole recording that stays within this distance of its start is parked."""
-
-
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Background:
-    """A picture of the place from above, for people."""
+    """An aerial image of the place, for display only."""
 
     path: Path
     metres_per_pixel: float
-    """Pixel (column, row) shows the point (column, -row) times this."""
+    """Pixel (column, row) shows the point (column, -row) times this factor."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class Recording:
-    """Tracks of road users at one place. Arrays may be memory-mapped; nobody writes to them.
+    """Tracks of agents at one place. The arrays are read-only and may be memory-mapped.
 
-    A track has a row for every frame from its first to its last, so that row = start + frame -
-    first frame. Rows are sorted by track, then frame.
+    Rows are sorted by track, then frame. A track has a row for every frame from its first to its
+    last, so that the row of a frame is `starts[track] + frame - first_frames[track]`.
     """
 
     name: str
     """The recording's id in its files, such as `00`."""
     location: str
+    """The place where it was made, as named in its files."""
     frame_rate_hz: float
     num_frames: int
     speed_limit_mps: float | None
+    """None where the files give no limit."""
     track_ids: Int[np.ndarray, " tracks"]
     classes: Int[np.ndarray, " tracks"]
     """`AgentClass` of each track."""
     sizes: Float[np.ndarray, "tracks 2"]
-    """Length and width, metres, never zero."""
+    """Length and width, m; positive."""
     first_frames: Int[np.ndarray, " tracks"]
     starts: Int[np.ndarray, " tracks+1"]
-    """Track i has the rows `starts[i]:starts[i + 1]`."""
+    """Track i occupies the rows `starts[i]:starts[i + 1]`."""
     states: Float[np.ndarray, "rows 4"]
     """[x m, y m, heading rad, speed m/s signed along the heading]."""
     road_map: RoadMap
     background: Background | None = None
     repairs: tuple[str, ...] = ()
-    """What the reader had to mend, one line each."""
+    """One line for each fault of the files that the reader repaired."""
 
     def __post_init__(self) -> None:
-        """Checks that the parts fit together.
+        """Checks that the columns of the track table have matching lengths.
 
         Raises:
-            DataError: a count does not match.
+            DataError: they do not match.
         """
         tracks = len(self.track_ids)
         if not (
@@ -113,17 +113,17 @@ class Recording:
             raise DataError(f"recording {self.name}: the track table's columns differ in length")
 
     def __deepcopy__(self, memo: dict[int, Any]) -> "Recording":
-        """Itself, since nobody changes it."""
+        """Returns the same object, since recordings are immutable."""
         del memo
         return self
 
     def __len__(self) -> int:
-        """How many tracks there are."""
+        """Number of tracks."""
         return len(self.track_ids)
 
     @property
     def duration_s(self) -> float:
-        """From the first frame to the last."""
+        """Duration of all frames, s."""
         return self.num_frames / self.frame_rate_hz
 
     @cached_property
@@ -133,27 +133,31 @@ class Recording:
 
     @cached_property
     def parked(self) -> Bool[np.ndarray, " tracks"]:
-        """Present from the first frame that shows anybody to the last, and never moved 1 m."""
+        """Mask of parked agents.
+
+        They are present from the first to the last frame that has any agent, and never farther than
+        `PARKED_WITHIN_M` from where they start.
+        """
         begin, end = self.first_frames.min(initial=self.num_frames), self.last_frames.max(initial=0)
-        whole = (self.first_frames == begin) & (self.last_frames == end)
-        still = [
+        always_present = (self.first_frames == begin) & (self.last_frames == end)
+        parked = [
             bool(
-                whole[i]
+                always_present[i]
                 and np.hypot(*(self.track(i)[:, :2] - self.track(i)[0, :2]).T).max()
                 < PARKED_WITHIN_M
             )
             for i in range(len(self))
         ]
-        return np.array(still, dtype=bool)
+        return np.array(parked, dtype=bool)
 
     @cached_property
     def predicted(self) -> Bool[np.ndarray, " tracks"]:
-        """Which tracks may be targets of prediction: class is one that is, and not parked."""
+        """Mask of tracks that may be predicted or driven: of a predicted class, and not parked."""
         return np.isin(self.classes, [int(kind) for kind in PREDICTED]) & ~self.parked
 
     @cached_property
     def extent_m(self) -> tuple[float, float, float, float]:
-        """Smallest x, smallest y, largest x, largest y of all recorded positions."""
+        """Smallest x, smallest y, largest x and largest y of all positions, m."""
         if not len(self.states):
             return (0.0, 0.0, 1.0, 1.0)
         low, high = self.states[:, :2].min(axis=0), self.states[:, :2].max(axis=0)
@@ -161,7 +165,7 @@ class Recording:
 
     @cached_property
     def frame_index(self) -> tuple[Int[np.ndarray, " bounds"], Int[np.ndarray, " rows"]]:
-        """(starts, tracks): frame f shows `tracks[starts[f]:starts[f + 1]]`, in file order."""
+        """(starts, tracks): frame f has the tracks `tracks[starts[f]:starts[f + 1]]`, in order."""
         lengths = np.diff(self.starts)
         tracks = np.repeat(np.arange(len(self), dtype=np.int32), lengths)
         within = np.arange(len(tracks)) - np.repeat(self.starts[:-1], lengths)
@@ -171,10 +175,12 @@ class Recording:
         return np.concatenate([[0], np.cumsum(counts)]), tracks[order]
 
     def track(self, index: int) -> Float[np.ndarray, "frames 4"]:
-        """The states of track number `index` at all of its frames."""
+        """The states of a track at all of its frames."""
         return self.states[self.starts[index] : self.starts[index + 1]]
 
     def tracks_between(self, first_frame: int, last_frame: int) -> Int[np.ndarray, " found"]:
-        """Indices of the tracks seen in [first_frame, last_frame], by first frame, then id."""
-        seen = np.flatnonzero((self.first_frames <= last_frame) & (self.last_frames >= first_frame))
-        return seen[np.lexsort((self.track_ids[seen], self.first_frames[seen]))]
+        """Indices of the tracks in [first_frame, last_frame], sorted by first frame, then id."""
+        found = np.flatnonzero(
+            (self.first_frames <= last_frame) & (self.last_frames >= first_frame)
+        )
+        return found[np.lexsort((self.track_ids[found], self.first_frames[found]))]

@@ -1,4 +1,4 @@
-"""What the road looks like at one place, in its recording's metric frame."""
+"""Road maps: boundaries, drivable area and lanes, in the metric frame of a recording."""
 
 from collections import OrderedDict
 from collections.abc import Callable
@@ -13,7 +13,7 @@ from asp_env.errors import DataError
 
 
 class LineType(IntEnum):
-    """What a polyline of the map marks."""
+    """Type of a polyline of the map."""
 
     CURB = 0
     SOLID = 1
@@ -31,11 +31,10 @@ class Ragged:
     """Sequence i is `points[starts[i]:starts[i + 1]]`."""
 
     def __len__(self) -> int:
-        """How many sequences there are."""
         return len(self.starts) - 1
 
     def __getitem__(self, index: int) -> np.ndarray:
-        """The points (n, 2) of one sequence."""
+        """Points (n, 2) of one sequence, metres."""
         if not -len(self) <= index < len(self):
             raise IndexError(index)
         index %= len(self)
@@ -43,7 +42,7 @@ class Ragged:
 
     @classmethod
     def pack(cls, sequences: "list[np.ndarray]") -> "Ragged":
-        """Stores arrays (n_i, 2) back to back."""
+        """Stores arrays of shape (n_i, 2) back to back."""
         lengths = [len(sequence) for sequence in sequences]
         points = np.concatenate(sequences) if sequences else np.zeros((0, 2))
         return cls(
@@ -54,7 +53,7 @@ class Ragged:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class RoadMap:
-    """Boundary and lane lines, drivable area, and lanes with their successors."""
+    """Boundaries and lane markings, drivable area, and lanes with their successors."""
 
     name: str
     lines: Ragged
@@ -62,27 +61,27 @@ class RoadMap:
     line_types: Int[np.ndarray, " lines"]
     """`LineType` of each polyline."""
     drivable: Ragged
-    """Rings, not closed, whose union is what vehicles may drive on."""
+    """Rings, not closed, whose union is the drivable area."""
     lanes: Ragged
-    """Centre lines of the lanes for vehicles, in the direction of travel."""
+    """Centre lines of the vehicle lanes, in the direction of travel."""
     successors: Int[np.ndarray, "edges 2"]
-    """(lane, next lane) as indices into `lanes`."""
+    """(lane, next lane), indices into `lanes`."""
     areas: Ragged = field(default_factory=lambda: Ragged.pack([]))
-    """Ring, not closed, of what each lane covers; none at all where only centre lines are known."""
+    """Ring, not closed, that each lane covers; empty if only centre lines are known."""
     two_way: Bool[np.ndarray, " areas"] = field(default_factory=lambda: np.zeros(0, dtype=bool))
-    """Lanes that may be driven in both directions."""
+    """Mask of the lanes that may be driven in both directions."""
     limits_mps: Float[np.ndarray, " areas"] = field(default_factory=lambda: np.zeros(0))
     """Speed limit of each lane, where `limited`."""
     limited: Bool[np.ndarray, " areas"] = field(default_factory=lambda: np.zeros(0, dtype=bool))
-    """Lanes whose speed limit the map tells."""
+    """Mask of the lanes whose speed limit is in the map."""
     repairs: tuple[str, ...] = ()
-    """What the reader had to mend, one line each."""
+    """Repairs made by the reader, one line for each kind."""
 
     def __post_init__(self) -> None:
-        """Checks that the parts fit together.
+        """Checks that the numbers of lines, lanes and their properties agree.
 
         Raises:
-            DataError: a count does not match.
+            DataError: they do not.
         """
         if len(self.line_types) != len(self.lines):
             raise DataError(
@@ -93,21 +92,22 @@ class RoadMap:
                 f"map {self.name}: a successor names lane {self.successors.max()} "
                 f"of {len(self.lanes)}"
             )
-        told = {len(self.areas), len(self.two_way), len(self.limits_mps), len(self.limited)}
-        if told not in ({0}, {len(self.lanes)}):
+        columns = (self.areas, self.two_way, self.limits_mps, self.limited)
+        counts = {len(column) for column in columns}
+        if counts not in ({0}, {len(self.lanes)}):
             raise DataError(
-                f"map {self.name}: {sorted(told)} areas, directions and limits of lanes; expected "
-                f"one of each for all {len(self.lanes)} lanes, or none"
+                f"map {self.name}: {sorted(counts)} areas, directions and limits of lanes; "
+                f"expected one of each for all {len(self.lanes)} lanes, or none"
             )
 
     def __deepcopy__(self, memo: dict[int, Any]) -> "RoadMap":
-        """Itself, since nobody changes it."""
+        """The same object: maps are immutable."""
         del memo
         return self
 
     @property
     def extent_m(self) -> tuple[float, float, float, float]:
-        """Smallest x, smallest y, largest x, largest y over lines and drivable area."""
+        """Smallest x and y, largest x and y of lines and drivable area, metres."""
         points = np.concatenate([self.lines.points, self.drivable.points])
         if not len(points):
             return (0.0, 0.0, 1.0, 1.0)
@@ -115,28 +115,28 @@ class RoadMap:
         return (float(low[0]), float(low[1]), float(high[0]), float(high[1]))
 
 
-Made = TypeVar("Made")
+Value = TypeVar("Value")
 
 
 @final
-class MapCache(Generic[Made]):
-    """A function of a road map that remembers its latest results, by the identity of the map."""
+class MapCache(Generic[Value]):
+    """Caches the latest results of a function of a road map, by the identity of the map."""
 
-    def __init__(self, make: Callable[[RoadMap], Made], size: int = 512) -> None:
+    def __init__(self, make: Callable[[RoadMap], Value], size: int = 512) -> None:
         """Creates an empty cache.
 
         Args:
             make: the function.
-            size: number of maps; the least recently used one is forgotten first.
+            size: number of maps; the least recently used one is removed first.
         """
         self._make = make
         self._size = size
-        self._entries: OrderedDict[int, tuple[RoadMap, Made]] = OrderedDict()
+        self._entries: OrderedDict[int, tuple[RoadMap, Value]] = OrderedDict()
 
-    def __call__(self, road_map: RoadMap) -> Made:
+    def __call__(self, road_map: RoadMap) -> Value:
         """The value of `make(road_map)`."""
         key = id(road_map)
-        # The entry holds its map, so that an id cannot pass to another map while the entry lives.
+        # The entry refers to its map, so that no other map can get its id.
         if key not in self._entries:
             self._entries[key] = (road_map, self._make(road_map))
             while len(self._entries) > self._size:

@@ -3,7 +3,6 @@
 import dataclasses
 import json
 import math
-import os
 import zipfile
 import zlib
 from collections.abc import Mapping
@@ -17,14 +16,16 @@ from jaxtyping import Bool, Float, Int
 from asp_env.data.classes import AgentClass
 from asp_env.data.scenarios.scenario import Scenario
 from asp_env.errors import DataError
+from asp_env.files import atomic_file
 
 FORMAT = 1
+"""Version of the file format."""
 
-_DAMAGED = (
+_READ_ERRORS = (
     *(OSError, EOFError, ValueError, KeyError, TypeError),
-    *(zipfile.BadZipFile, zlib.error, RuntimeError),  # the last: encrypted, or of another method
+    *(zipfile.BadZipFile, zlib.error),
+    RuntimeError,  # an encrypted archive, or an unknown compression method
 )
-
 
 _AXES = (
     ("states", "ticks a 4", "f"),
@@ -42,37 +43,47 @@ _AXES = (
     ("forecast_ticks", "rows", "iu"),
     ("events", "ticks kinds", "b"),
 )
-"""Arrays with their axes and kinds of numbers."""
+"""Name, axes and dtype kinds of each array in a file."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Rollout:
-    """What happened in one episode of L steps with A agents; tick 0 is the first observation."""
+    """The log of one episode with A agents; tick 0 is the first observation."""
 
     scenario: Scenario
     dt_s: float
+    """Seconds per tick."""
     states: Float[np.ndarray, "ticks a 4"]
+    """[x m, y m, heading rad, speed m/s] of the episode."""
     valid: Bool[np.ndarray, "ticks a"]
+    """Whether the agent is present."""
     log_states: Float[np.ndarray, "ticks a 4"]
-    """What the recording holds, for comparison."""
+    """The recorded states at the same ticks."""
     log_valid: Bool[np.ndarray, "ticks a"]
     sizes: Float[np.ndarray, "a 2"]
+    """Length and width, m."""
     classes: Int[np.ndarray, " a"]
+    """`AgentClass` of each agent."""
     ids: Int[np.ndarray, " a"]
+    """Track ids."""
     route: Float[np.ndarray, "p 2"]
+    """The ego's route, points 1 m apart."""
     plans: Float[np.ndarray, "plans horizon 2"]
-    """The ego's planned positions at each tick where it planned; may be empty."""
+    """Planned positions of the ego from tick 0 on, m; empty if it follows no planner."""
     forecast_states: Float[np.ndarray, "rows modes steps 2"]
-    """Forecast positions of all ticks, back to back."""
+    """Forecast positions of all ticks, back to back, m."""
     forecast_log_probs: Float[np.ndarray, "rows modes"]
+    """Natural logarithms of the modes' probabilities."""
     forecast_slots: Int[np.ndarray, " rows"]
+    """The agent of each forecast."""
     forecast_ticks: Int[np.ndarray, " rows"]
-    """The tick of the episode at which each row was said."""
+    """The tick of the episode at which each forecast was made."""
     events: Bool[np.ndarray, "ticks kinds"]
+    """Which events of `event_names` occur at each tick."""
     event_names: tuple[str, ...]
 
     def save(self, path: Path) -> None:
-        """Writes one compressed `.npz`, aside first, then renamed."""
+        """Writes one compressed `.npz`, atomically."""
         header = {
             "format": FORMAT,
             "scenario": dataclasses.asdict(self.scenario),
@@ -85,16 +96,15 @@ class Rollout:
             if isinstance(value := getattr(self, field.name), np.ndarray)
         }
         text = np.frombuffer(json.dumps(header).encode(), dtype=np.uint8)
-        aside = path.with_name(f".{path.name}.{os.getpid()}.npz")
-        np.savez_compressed(aside, header=text, **arrays)
-        aside.replace(path)
+        with atomic_file(path) as partial, partial.open("wb") as file:
+            np.savez_compressed(file, header=text, **arrays)
 
     @classmethod
     def load(cls, path: Path) -> "Rollout":
-        """Reads what `save` wrote.
+        """Reads a file written by `save`.
 
         Raises:
-            DataError: the file is missing, damaged, or of another format.
+            DataError: the file is missing, damaged, or of another format version.
         """
         try:
             with path.open("rb") as raw, np.load(raw, allow_pickle=False) as file:
@@ -113,16 +123,16 @@ class Rollout:
             )
         except DataError as error:
             raise DataError(f"{path}: {error}") from error
-        except _DAMAGED as error:
-            why = str(error) or type(error).__name__
-            raise DataError(f"{path}: not a rollout that can be read ({why})") from error
+        except _READ_ERRORS as error:
+            reason = str(error) or type(error).__name__
+            raise DataError(f"{path}: not a readable rollout ({reason})") from error
 
 
 def _check(arrays: Mapping[str, np.ndarray], header: Mapping[str, Any]) -> None:
-    """Refuses parts that do not fit together.
+    """Checks shapes, dtypes and index ranges.
 
     Raises:
-        DataError: an axis, a kind of number or a number does not fit the others.
+        DataError: an array does not fit the others or the header.
     """
     sizes: dict[str, int] = {"kinds": len(header["event_names"])}
     for name, axes, kinds in _AXES:

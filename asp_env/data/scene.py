@@ -1,4 +1,4 @@
-"""All that may be known at one tick, for several situations at once."""
+"""Scenes: everything that a predictor or planner may use at one tick."""
 
 import dataclasses
 from dataclasses import dataclass
@@ -17,70 +17,80 @@ EGO = 0
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Scene:
-    """B situations of up to A agents with n past ticks and the present one. No future in it.
+    """B situations of up to A agents, with the present tick and n past ticks; it holds no future.
 
-    Slots of absent agents are zeros with id -1 and `valid` false. Slot 0 is the ego.
+    Slot 0 is the ego. Slots without an agent hold zeros, id -1 and `valid` false.
     """
 
     states: Float[np.ndarray, "b a ticks 4"]
-    """[x m, y m, heading rad, speed m/s]; the last tick is now."""
+    """[x m, y m, heading rad, speed m/s] at n past ticks and, last, now."""
     actions: Float[np.ndarray, "b a ticks-1 2"]
-    """[acceleration m/s², steering rad], inferred from the states; the last one ends now."""
+    """[acceleration m/s², steering rad] between consecutive states, inferred from them."""
     valid: Bool[np.ndarray, "b a ticks"]
+    """Whether the agent is present at each tick."""
     sizes: Float[np.ndarray, "b a 2"]
-    """Length and width, metres."""
+    """Length and width, m."""
     classes: Int[np.ndarray, "b a"]
+    """`AgentClass` of each agent."""
     ids: Int[np.ndarray, "b a"]
+    """Track ids."""
     tick: Int[np.ndarray, " b"]
+    """The present tick of each situation."""
     targets: Int[np.ndarray, "t 2"]
     """(situation, slot) of the agents to forecast."""
     route: Float[np.ndarray, "b p 2"]
-    """The ego's way, points 1 m apart: geometry, no times."""
+    """The ego's route, points 1 m apart, without times."""
     route_valid: Bool[np.ndarray, "b p"]
+    """Which points of the route exist; these come first."""
     maps: tuple[RoadMap, ...]
     map_index: Int[np.ndarray, " b"]
-    """Which of `maps` each situation lies on."""
+    """Index into `maps` of each situation."""
     dt_s: float
+    """Seconds per tick."""
 
     def with_targets(self, targets: Int[np.ndarray, "t 2"]) -> "Scene":
-        """The same scene with other agents to forecast."""
+        """The same scene with other targets."""
         return dataclasses.replace(self, targets=targets)
 
-    def situation(self, number: int) -> "Scene":
-        """One of the situations alone, as situation 0."""
+    def situation(self, index: int) -> "Scene":
+        """A scene of one of the situations, which becomes situation 0."""
         shared = ("targets", "maps", "dt_s")
         names = [field.name for field in dataclasses.fields(self) if field.name not in shared]
-        targets = self.targets[self.targets[:, 0] == number]
+        targets = self.targets[self.targets[:, 0] == index]
         targets[:, 0] = 0
-        mine = {name: getattr(self, name)[number : number + 1] for name in names}
-        return dataclasses.replace(self, targets=targets, **mine)
+        own = {name: getattr(self, name)[index : index + 1] for name in names}
+        return dataclasses.replace(self, targets=targets, **own)
 
     @property
     def history(self) -> int:
-        """n, the number of past ticks."""
+        """Number n of past ticks."""
         return self.states.shape[2] - 1
 
     @property
     def target_states(self) -> Float[np.ndarray, "t 4"]:
-        """The targets' states now."""
+        """Present states of the targets."""
         return self.states[self.targets[:, 0], self.targets[:, 1], -1]
 
     @property
     def predictable(self) -> Bool[np.ndarray, " t"]:
-        """Targets of a predicted class that were seen at every tick of the history."""
+        """Mask of targets of a predicted class that are present at every tick of the scene."""
         at = (self.targets[:, 0], self.targets[:, 1])
-        known = np.isin(self.classes[at], [int(kind) for kind in PREDICTED])
-        return known & self.valid[at].all(axis=-1)
+        predicted = np.isin(self.classes[at], [int(kind) for kind in PREDICTED])
+        return predicted & self.valid[at].all(axis=-1)
 
-    def check_dt(self, dt_s: float, who: str) -> None:
-        """Refuses a scene of another time step than a predictor was made for.
+    def check_dt(self, dt_s: float, name: str) -> None:
+        """Checks that the scene has the time step of a predictor.
+
+        Args:
+            dt_s: the predictor's time step, s.
+            name: the predictor's name, for the message.
 
         Raises:
             AspEnvError: the time steps differ.
         """
         if abs(self.dt_s - dt_s) > 1e-6:
             raise AspEnvError(
-                f"{who} was made for a time step of {dt_s:g} s, the scene has {self.dt_s:g} s"
+                f"{name} was made for a time step of {dt_s:g} s, the scene has {self.dt_s:g} s"
             )
 
 
@@ -90,7 +100,17 @@ def infer_actions(
     lengths_m: Float[np.ndarray, "*batch"],
     dt_s: float,
 ) -> Float[np.ndarray, "*batch ticks-1 2"]:
-    """The actions between consecutive states; zero where either state is not valid."""
+    """Actions between consecutive states by the inverse bicycle model.
+
+    Args:
+        states: [x m, y m, heading rad, speed m/s].
+        valid: whether the agent is present.
+        lengths_m: of the agents.
+        dt_s: seconds per tick.
+
+    Returns:
+        [acceleration m/s², steering rad]; zero where either state is not valid.
+    """
     both = valid[..., 1:] & valid[..., :-1]
     lengths = np.where(valid.any(axis=-1), lengths_m, 1).astype(states.dtype)[..., None]
     actions = inverse(states[..., :-1, :], states[..., 1:, :], lengths, dt_s)

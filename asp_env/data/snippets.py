@@ -1,4 +1,4 @@
-"""Snippets: a past and a future around one tick of one track, kept as integers, never as copies."""
+"""Snippets: the past and future around one tick of one track, stored as indices into recordings."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -10,76 +10,91 @@ from asp_env.data.recording import Recording, frames_per_tick, ticks
 from asp_env.data.scene import Scene, infer_actions
 
 HISTORY_S = 3.0
-EVERY_S = 0.6
+"""Default history of snippets and scenarios."""
+
+SNIPPET_INTERVAL_S = 0.6
+"""Time between consecutive snippets of a track."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class SnippetIndex:
-    """Which target at which tick of which recording; every snippet has its full past and future."""
+    """A table of snippets, each of which has its full history and future in its recording."""
 
     recording: Int[np.ndarray, " n"]
-    """Index into the recordings it was made from."""
+    """Index into the recordings from which the table was made."""
     track: Int[np.ndarray, " n"]
     """Index of the target's track."""
     tick: Int[np.ndarray, " n"]
-    """Now. The snippet spans the ticks [tick - history, tick + horizon]."""
+    """The present tick. A snippet spans the ticks [tick - history, tick + horizon_ticks]."""
     dt_s: float
+    """Seconds per tick."""
     history: int
-    horizon: int
+    """Number of past ticks."""
+    horizon_ticks: int
+    """Number of future ticks."""
 
     def __len__(self) -> int:
-        """How many there are."""
+        """Number of snippets."""
         return len(self.tick)
 
     def select(self, rows: Int[np.ndarray, " m"] | Bool[np.ndarray, " n"]) -> "SnippetIndex":
-        """The snippets at some rows, in their order."""
+        """The snippets at the given rows, in that order, or those of a mask."""
         return SnippetIndex(
             recording=self.recording[rows],
             track=self.track[rows],
             tick=self.tick[rows],
             dt_s=self.dt_s,
             history=self.history,
-            horizon=self.horizon,
+            horizon_ticks=self.horizon_ticks,
         )
 
     def shifted(self, ticks: int) -> "SnippetIndex":
-        """The same targets some ticks later, of whose future so much less is known."""
+        """The same targets some ticks later, with a horizon shorter by as many ticks."""
         return SnippetIndex(
             recording=self.recording,
             track=self.track,
             tick=self.tick + ticks,
             dt_s=self.dt_s,
             history=self.history,
-            horizon=self.horizon - ticks,
+            horizon_ticks=self.horizon_ticks - ticks,
         )
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Future:
-    """What the targets of a scene went on to do: for labels, and for privileged plugs alone."""
+    """Recorded futures of a scene's targets, for labels and privileged predictors only."""
 
     states: Float[np.ndarray, "t steps 4"]
+    """[x m, y m, heading rad, speed m/s]; step 0 is one tick after the scene."""
     valid: Bool[np.ndarray, "t steps"]
 
 
 def find_snippets(
-    recording: Recording, *, dt_s: float, history: int, horizon: int, every: int
+    recording: Recording, *, dt_s: float, history: int, horizon_ticks: int, interval_ticks: int
 ) -> tuple[Int[np.ndarray, " n"], Int[np.ndarray, " n"]]:
-    """(track, tick) of all snippets of one recording, ordered by tick, then track.
+    """All snippets of one recording, whose targets are of a predicted class and not parked.
 
-    Targets are tracks of a predicted class that are not parked; ticks are multiples of `every`.
+    Args:
+        recording: the recording.
+        dt_s: seconds per tick.
+        history: number of past ticks.
+        horizon_ticks: number of future ticks.
+        interval_ticks: snippets are at multiples of this tick.
+
+    Returns:
+        Track index and tick of each snippet, sorted by tick, then track.
     """
     stride = frames_per_tick(recording.frame_rate_hz, dt_s)
-    tracks, at = [], []
+    tracks, present_ticks = [], []
     for track in np.flatnonzero(recording.predicted):
         first = -(-int(recording.first_frames[track]) // stride) + history
-        last = int(recording.last_frames[track]) // stride - horizon
-        found = np.arange(-(-first // every) * every, last + 1, every)
-        at.append(found)
+        last = int(recording.last_frames[track]) // stride - horizon_ticks
+        found = np.arange(-(-first // interval_ticks) * interval_ticks, last + 1, interval_ticks)
+        present_ticks.append(found)
         tracks.append(np.full(len(found), track))
-    if not at:
+    if not tracks:
         return np.zeros(0, dtype=np.int64), np.zeros(0, dtype=np.int64)
-    track, tick = np.concatenate(tracks), np.concatenate(at)
+    track, tick = np.concatenate(tracks), np.concatenate(present_ticks)
     order = np.lexsort((track, tick))
     return track[order], tick[order]
 
@@ -90,13 +105,23 @@ def index_snippets(
     dt_s: float,
     horizon_s: float,
     history_s: float = HISTORY_S,
-    every_s: float = EVERY_S,
+    interval_s: float = SNIPPET_INTERVAL_S,
 ) -> SnippetIndex:
-    """All snippets of all recordings, ordered by recording, tick, track."""
-    history, horizon = ticks(history_s, dt_s), ticks(horizon_s, dt_s)
-    every = ticks(every_s, dt_s)
+    """All snippets of all recordings, sorted by recording, tick and track.
+
+    Raises:
+        AspEnvError: a duration is not a whole number of ticks, or a tick not one of frames.
+    """
+    history, horizon_ticks = ticks(history_s, dt_s), ticks(horizon_s, dt_s)
+    interval_ticks = ticks(interval_s, dt_s)
     parts = [
-        find_snippets(recording, dt_s=dt_s, history=history, horizon=horizon, every=every)
+        find_snippets(
+            recording,
+            dt_s=dt_s,
+            history=history,
+            horizon_ticks=horizon_ticks,
+            interval_ticks=interval_ticks,
+        )
         for recording in recordings
     ]
     counts = [len(tick) for _, tick in parts]
@@ -107,7 +132,7 @@ def index_snippets(
         tick=np.concatenate(empty + [tick for _, tick in parts]),
         dt_s=dt_s,
         history=history,
-        horizon=horizon,
+        horizon_ticks=horizon_ticks,
     )
 
 
@@ -119,7 +144,18 @@ def gather_window(
     num_ticks: int,
     stride: int,
 ) -> tuple[Float[np.ndarray, "a k 4"], Bool[np.ndarray, "a k"]]:
-    """States and presence of some tracks at consecutive ticks; zeros where absent."""
+    """States of some tracks at consecutive ticks.
+
+    Args:
+        recording: the recording.
+        tracks: indices of the tracks.
+        first_tick: the first of the ticks.
+        num_ticks: number of ticks.
+        stride: frames per tick.
+
+    Returns:
+        States [x m, y m, heading rad, speed m/s], zero where absent, and the mask of presence.
+    """
     frames = (first_tick + np.arange(num_ticks)) * stride
     first = recording.first_frames[tracks].astype(np.int64)[:, None]
     valid = (frames >= first) & (frames <= recording.last_frames[tracks][:, None])
@@ -130,10 +166,13 @@ def gather_window(
 
 
 def gather_scene(recordings: Sequence[Recording], index: SnippetIndex) -> Scene:
-    """The scene of some snippets: one situation per distinct tick, targets in the index's order.
+    """The scene of some snippets: one situation per distinct tick of a recording.
 
-    In each situation slot 0 is its first target, the rest follow by first appearance, then id.
-    The ego's route is left empty, since here the ego's way is what is to be forecast.
+    Slot 0 of a situation is its first target in the order of `index`; the other agents follow by
+    first frame, then id. The ego's route is empty, since here its path is what is to be forecast.
+
+    Returns:
+        A scene whose targets are in the order of `index`.
     """
     keys = np.stack([index.recording, index.tick], axis=-1)
     _, first_rows, inverse = np.unique(keys, axis=0, return_index=True, return_inverse=True)
@@ -159,8 +198,8 @@ def gather_scene(recordings: Sequence[Recording], index: SnippetIndex) -> Scene:
         sizes[number, :count] = recording.sizes[tracks]
         classes[number, :count] = recording.classes[tracks]
         ids[number, :count] = recording.track_ids[tracks]
-        mine = np.flatnonzero(situation == number)
-        slots[mine] = (index.track[mine][:, None] == tracks[None]).argmax(axis=1)
+        rows = np.flatnonzero(situation == number)
+        slots[rows] = (index.track[rows][:, None] == tracks[None]).argmax(axis=1)
     maps, map_index = _maps([recordings[int(index.recording[row])] for row in first_rows])
     return Scene(
         states=states,
@@ -180,55 +219,59 @@ def gather_scene(recordings: Sequence[Recording], index: SnippetIndex) -> Scene:
 
 
 def gather_future(recordings: Sequence[Recording], index: SnippetIndex) -> Future:
-    """What the targets of `gather_scene` went on to do."""
-    states, valid = gather_ticks(recordings, index, 1 + np.arange(index.horizon))
+    """The recorded futures of the targets of `gather_scene`."""
+    states, valid = gather_ticks(recordings, index, 1 + np.arange(index.horizon_ticks))
     return Future(states=states, valid=valid)
 
 
 def gather_present(
     recordings: Sequence[Recording], index: SnippetIndex
 ) -> tuple[Float[np.ndarray, "n 4"], Float[np.ndarray, " n"]]:
-    """The targets' states and lengths now: what `gather_scene` says of them, without the scene."""
+    """Present states and lengths (m) of the targets, as in `gather_scene` but without the scene."""
     states, _ = gather_ticks(recordings, index, np.zeros(1, dtype=np.int64))
-    lengths = np.zeros(len(index), dtype=np.float32)
+    lengths_m = np.zeros(len(index), dtype=np.float32)
     for number in np.unique(index.recording):
-        mine = index.recording == number
-        lengths[mine] = recordings[int(number)].sizes[index.track[mine], 0]
-    return states[:, 0], lengths
+        rows = index.recording == number
+        lengths_m[rows] = recordings[int(number)].sizes[index.track[rows], 0]
+    return states[:, 0], lengths_m
 
 
 def gather_ticks(
     recordings: Sequence[Recording], index: SnippetIndex, offsets: Int[np.ndarray, " steps"]
 ) -> tuple[Float[np.ndarray, "n steps 4"], Bool[np.ndarray, "n steps"]]:
-    """The targets' states some ticks from now, and whether they were there; zeros where not.
+    """States of the targets at given offsets from the present tick.
 
     Args:
-        recordings: what the snippets are of.
+        recordings: the recordings from which `index` was made.
         index: the snippets.
-        offsets: in ticks, negative ones before now.
+        offsets: in ticks; negative ones lie in the past.
+
+    Returns:
+        States [x m, y m, heading rad, speed m/s], zero where absent, and the mask of presence.
     """
     states = np.zeros((len(index), len(offsets), 4), dtype=np.float32)
     valid = np.zeros((len(index), len(offsets)), dtype=bool)
     for number in np.unique(index.recording):
-        mine = np.flatnonzero(index.recording == number)
+        rows = np.flatnonzero(index.recording == number)
         recording = recordings[int(number)]
         stride = frames_per_tick(recording.frame_rate_hz, index.dt_s)
-        frames = (index.tick[mine][:, None] + offsets) * stride
-        track = index.track[mine]
+        frames = (index.tick[rows][:, None] + offsets) * stride
+        track = index.track[rows]
         first = recording.first_frames[track].astype(np.int64)[:, None]
-        there = (frames >= first) & (frames <= recording.last_frames[track][:, None])
-        rows = np.where(there, recording.starts[track][:, None] + frames - first, 0)
-        states[mine] = np.where(there[..., None], recording.states[rows], 0)
-        valid[mine] = there
+        present = (frames >= first) & (frames <= recording.last_frames[track][:, None])
+        table_rows = np.where(present, recording.starts[track][:, None] + frames - first, 0)
+        states[rows] = np.where(present[..., None], recording.states[table_rows], 0)
+        valid[rows] = present
     return states, valid
 
 
 def _agents(recording: Recording, index: SnippetIndex, row: int) -> Int[np.ndarray, " a"]:
+    """Tracks of one situation: its first target, then all others within the history."""
     stride = frames_per_tick(recording.frame_rate_hz, index.dt_s)
     now = int(index.tick[row])
-    seen = recording.tracks_between((now - index.history) * stride, now * stride)
+    present = recording.tracks_between((now - index.history) * stride, now * stride)
     first = index.track[row]
-    return np.concatenate([[first], seen[seen != first]])
+    return np.concatenate([[first], present[present != first]])
 
 
 def _maps(recordings: Sequence[Recording]) -> tuple[tuple, Int[np.ndarray, " b"]]:

@@ -1,7 +1,8 @@
-"""DATA: from the name that a user gives to recordings that are opened when they are asked for."""
+"""Sources of data: `open_data` finds the recordings that a folder or a source's name stands for."""
 
 import hashlib
 import re
+import warnings
 from collections.abc import Iterable, Iterator, Sequence
 from importlib import resources
 from pathlib import Path
@@ -9,18 +10,18 @@ from typing import Any, SupportsIndex, overload
 
 from asp_env import registry
 from asp_env.data.readers import interaction, levelx
-from asp_env.data.readers.opening import Opened, RecordingFiles, content_hash, open_recording
+from asp_env.data.readers.opening import ReaderState, RecordingFiles, content_hash, open_recording
 from asp_env.data.recording import Recording
 from asp_env.errors import DataError, unknown_name
 
 _SCHEME = re.compile(r"^([a-z][a-z0-9-]+):(.*)$", re.DOTALL)
 
 
-class Recordings(Sequence[Any]):  # not of Recording: checking its items at run time opens them
-    """The recordings of one DATA, each read when it is first asked for and kept from then on.
+class Recordings(Sequence[Any]):  # not of Recording: run-time checks of its items would open them
+    """A sequence of recordings, each of which is read at its first access and then stays open.
 
     Attributes:
-        source: DATA as the user named it.
+        source: the data as the user named them.
         names: the recordings' ids, such as `00`.
     """
 
@@ -29,31 +30,31 @@ class Recordings(Sequence[Any]):  # not of Recording: checking its items at run 
         source: str,
         files: Sequence[RecordingFiles],
         *,
-        opened: Opened | None = None,
+        opened: ReaderState | None = None,
     ) -> None:
-        """Lists recordings; reads none.
+        """Creates the sequence without reading any recording.
 
         Args:
-            source: DATA as the user named it.
-            files: where each recording lies.
-            opened: those that are open already.
+            source: the data as the user named them.
+            files: the files of each recording.
+            opened: the recordings that are already open.
         """
         self.source = source
         self.names = tuple(each.name for each in files)
         self._files = tuple(files)
-        self._opened = Opened() if opened is None else opened
+        self._opened = ReaderState() if opened is None else opened
 
     def __deepcopy__(self, memo: dict[int, Any]) -> "Recordings":
-        """Itself: recordings never change."""
+        """Returns the same object, since recordings are immutable."""
         del memo
         return self
 
     def __reduce__(self) -> tuple[Any, ...]:
-        """A copy in another process opens its files anew, mapped from the same cache."""
+        """A copy in another process opens its files again, mapped from the same cache."""
         return Recordings, (self.source, self._files)
 
     def __len__(self) -> int:
-        """How many there are."""
+        """Number of recordings."""
         return len(self._files)
 
     @overload
@@ -61,30 +62,30 @@ class Recordings(Sequence[Any]):  # not of Recording: checking its items at run 
     @overload
     def __getitem__(self, index: slice) -> "Recordings": ...
     def __getitem__(self, index: SupportsIndex | slice) -> "Recording | Recordings":
-        """One recording, or some of them still unopened.
+        """Opens one recording, or selects several without opening them.
 
         Raises:
-            DataError: its files are damaged.
+            DataError: the recording's files are damaged.
         """
         if isinstance(index, slice):
             return self.subset(range(len(self))[index])
         return open_recording(self._files[index], self._opened)
 
     def __iter__(self) -> Iterator[Recording]:
-        """Opens one after the other."""
+        """Opens one recording after the other."""
         return (self[index] for index in range(len(self)))
 
     def subset(self, indices: Iterable[SupportsIndex]) -> "Recordings":
-        """Some of the recordings, sharing those that are open."""
-        chosen = [self._files[index] for index in indices]
-        return Recordings(self.source, chosen, opened=self._opened)
+        """The recordings at some indices, sharing those that are open."""
+        files = [self._files[index] for index in indices]
+        return Recordings(self.source, files, opened=self._opened)
 
     def tracks_path(self, index: SupportsIndex) -> Path:
-        """The file with the tracks of one recording, beside which a package may keep more."""
+        """The file with the tracks of one recording; worlds may store more files beside it."""
         return self._files[index].tracks
 
     def hashes(self) -> tuple[str, ...]:
-        """Of each recording, a hash of the content of its files and its map.
+        """A hash of the content of each recording's files and map.
 
         Raises:
             DataError: a file is missing.
@@ -92,7 +93,7 @@ class Recordings(Sequence[Any]):  # not of Recording: checking its items at run 
         return tuple(content_hash(files, self._opened) for files in self._files)
 
     def data_hash(self) -> str:
-        """A hash of the content of all recordings, whatever their folder is called.
+        """A hash of the content of all recordings, independent of the folder's name.
 
         Raises:
             DataError: a file is missing.
@@ -101,16 +102,19 @@ class Recordings(Sequence[Any]):  # not of Recording: checking its items at run 
 
 
 def open_data(data: str | Path) -> Recordings:
-    """The recordings of DATA.
+    """Finds recordings; each is read at its first access.
 
     Args:
-        data: a folder with recordings in the inD/rounD or the INTERACTION layout, or both;
-            `sample:intersection`, `sample:roundabout`, or `scheme:argument` of a source that a
-            package registers.
+        data: a folder with recordings in the inD/rounD layout, the INTERACTION layout, or both;
+            `sample:intersection` or `sample:roundabout`; or `scheme:argument` of a registered
+            source.
+
+    Returns:
+        The recordings, sorted by name within each layout.
 
     Raises:
-        AspEnvError: no such source.
-        DataError: no such folder, or no recordings in it.
+        AspEnvError: the source is unknown.
+        DataError: the folder does not exist, or has no recordings.
     """
     source = str(data)
     folder = _resolve(source)
@@ -125,21 +129,26 @@ def open_data(data: str | Path) -> Recordings:
             "in the folder or below"
         )
     names = [each.name for each in files]
-    if double := next((name for name in names if names.count(name) > 1), None):
+    if duplicate := next((name for name in names if names.count(name) > 1), None):
         raise DataError(
-            f"data {source!r}: two recordings are called {double}, expected names of their own; "
-            "put the layouts in folders of their own"
+            f"data {source!r}: two recordings are called {duplicate}, expected unique names; "
+            "put each layout in a folder of its own"
         )
     return Recordings(source, files)
 
 
 def load(path: str | Path) -> Recordings:
-    """The recordings in a folder, lazily: the same as `open_data`."""
+    """Deprecated former name of `open_data`."""
+    warnings.warn(
+        "asp_env.load is deprecated and will be removed in the next release: use asp_env.open_data",
+        DeprecationWarning,
+        stacklevel=2,
+    )
     return open_data(path)
 
 
 def scheme_of(source: str) -> str | None:
-    """What stands before the colon of DATA such as `synthetic:intersection`; None for a folder."""
+    """The scheme of a source such as `synthetic:intersection`; None for a folder."""
     match = _SCHEME.match(source)
     return None if match is None or Path(source).exists() else match.group(1)
 
@@ -148,7 +157,7 @@ def _resolve(source: str) -> Path:
     scheme = scheme_of(source)
     if scheme is None:
         path = Path(source).expanduser().absolute()
-        return path.resolve() if ".." in path.parts else path  # folders' names are places' names
+        return path.resolve() if ".." in path.parts else path  # folder names are location names
     argument = source[len(scheme) + 1 :]
     if scheme == "sample":
         return _sample(argument)

@@ -1,10 +1,10 @@
 """Kinematic bicycle model with the reference point at the centre of the vehicle's box.
 
-State `[x, y, heading, speed]` (m, m, rad counter-clockwise from +x, m/s, signed along the
-heading); action `[acceleration, steering]` (m/s², rad, left positive). Both axles lie 0.3 times
-the length from the centre. Equations (bicycle) and (inv_bicycle) of Janjoš et al. 2021, with the
-missing time step restored and the slip angle's denominator read as l_f + l_r. Every function takes
-NumPy arrays or torch tensors, float32 or float64, with any leading batch axes.
+A state is `[x, y, heading, speed]` in m, m, rad counter-clockwise from +x, and m/s signed along the
+heading; an action is `[acceleration, steering]` in m/s² and rad, left positive. Both axles are 0.3
+times the length from the centre. The equations are (bicycle) and (inv_bicycle) of Janjoš et al.
+2021, with the missing time step restored and the slip angle's denominator read as l_f + l_r. All
+functions take NumPy arrays or torch tensors, float32 or float64, with any leading batch axes.
 """
 
 import math
@@ -16,15 +16,20 @@ from jaxtyping import Float
 from asp_env.geometry import namespace, wrap_angle
 
 MAX_ACCELERATION_MPS2 = 5.0
+"""Limit of accelerations in actions, in either direction, as in highway-env."""
+
 MAX_STEERING_RAD = math.pi / 4
+"""Limit of steering angles in actions, to either side, as in highway-env."""
 
 Integrator = Literal["heun", "euler"]
+"""Second order, or first order as in the paper and in highway-env."""
 
 AXLE_SHARE_OF_LENGTH = 0.3
-"""Distance from the centre of the box to either axle, as a share of the vehicle's length."""
+"""Distance from the centre of the box to each axle, as a share of the vehicle's length."""
 
-STANDSTILL_MPS = 0.5
-"""Below this mean speed a change of heading says nothing of the steering, which is then 0."""
+MIN_STEERING_SPEED_MPS = 0.5
+"""`inverse` returns no steering below this mean speed, since noise dominates changes of heading.
+Chosen by hand."""
 
 _MAX_SIN_SLIP = math.sin(math.atan(0.5 * math.tan(MAX_STEERING_RAD)))
 
@@ -38,18 +43,18 @@ def forward(
     integrator: Integrator = "heun",
     reverse: bool = False,
 ) -> Float[Any, "*batch 4"]:
-    """The states one step later.
+    """Advances states by one step.
 
     Args:
-        states: states now.
-        actions: actions held during the step.
-        lengths_m: vehicle lengths, one per state or broadcast against them; must be positive.
+        states: present states.
+        actions: actions, constant during the step.
+        lengths_m: vehicle lengths, positive, broadcast against the states.
         dt_s: duration of the step.
-        integrator: `heun` (second order, default) or `euler` (the paper's, and highway-env's).
-        reverse: whether speed may become negative. Otherwise braking ends at speed 0.
+        integrator: `heun` or `euler`.
+        reverse: whether the speed may become negative; otherwise braking ends at speed 0.
 
     Returns:
-        States after the step; the heading is wrapped to [-π, π).
+        States after the step, with headings in [-π, π).
     """
     return _integrate(states, actions[..., None, :], lengths_m, dt_s, integrator, reverse)[
         ..., 0, :
@@ -65,11 +70,22 @@ def rollout(
     integrator: Integrator = "heun",
     reverse: bool = False,
 ) -> Float[Any, "*batch steps 4"]:
-    """The states after each of several steps, without a loop over them.
+    """Advances states by several steps, without a loop over them.
 
-    Arguments as in `forward`, which this equals step by step up to rounding. The model is
-    sequential only in sums (speed, then heading, then position) and in the running minimum that
-    keeps the speed from becoming negative.
+    The result equals repeated calls of `forward` up to rounding: the model is sequential only in
+    cumulative sums (speed, then heading, then position) and in the running minimum that prevents
+    negative speeds.
+
+    Args:
+        states: present states.
+        actions: actions of each step.
+        lengths_m: as in `forward`.
+        dt_s: as in `forward`.
+        integrator: as in `forward`.
+        reverse: as in `forward`.
+
+    Returns:
+        States after each step, with headings in [-π, π).
     """
     return _integrate(states, actions, lengths_m, dt_s, integrator, reverse)
 
@@ -107,19 +123,19 @@ def _integrate(
 
 
 def _before(first: Any, after: Any) -> Any:
-    """The values at the beginning of each step."""
+    """Values at the beginning of each step."""
     if after.shape[-1] == 1:
         return first
     return namespace(first).concatenate([first, after[..., :-1]], axis=-1)
 
 
 def _running_sum(values: Any) -> Any:
-    """Sums over the steps; a single step, which is most calls, needs none."""
+    """Cumulative sum over the steps; the most frequent case, a single step, is a shortcut."""
     return values if values.shape[-1] == 1 else namespace(values).cumsum(values, axis=-1)
 
 
 def _lowest_below_zero(values: Any) -> Any:
-    """The least of each value and those before it, or 0 if none is negative."""
+    """Running minimum of the values, at most 0."""
     xp = namespace(values)
     if xp is np:
         lowest = values if values.shape[-1] == 1 else np.minimum.accumulate(values, axis=-1)
@@ -135,18 +151,28 @@ def inverse(
     *,
     integrator: Integrator = "heun",
 ) -> Float[Any, "*batch 2"]:
-    """The actions that lead from `states` to the headings and speeds of `next_states`.
+    """Infers the actions that lead from `states` to the headings and speeds of `next_states`.
 
-    Exact for what `forward` made with the same integrator and steering within ±π/4, away from
-    standstill. Positions are not read: the problem is overdetermined, and like the paper we trust
-    heading and speed. Below a mean speed of 0.5 m/s the steering is 0; never NaN.
+    This inverts `forward` with the same integrator for steering within ±π/4, away from standstill.
+    Positions are not used: the problem is overdetermined, and as in the paper headings and speeds
+    decide. Below a mean speed of `MIN_STEERING_SPEED_MPS` the steering is 0; it is never NaN.
+
+    Args:
+        states: states before the step.
+        next_states: states after the step.
+        lengths_m: vehicle lengths, positive, broadcast against the states.
+        dt_s: duration of the step.
+        integrator: `heun` or `euler`.
+
+    Returns:
+        [acceleration m/s², steering rad]; the steering is limited to ±π/4, the acceleration is not.
     """
     xp = namespace(states)
     rear_m = AXLE_SHARE_OF_LENGTH * lengths_m
     speed, next_speed = states[..., 3], next_states[..., 3]
     acceleration = (next_speed - speed) / dt_s
     mean = speed if integrator == "euler" else 0.5 * (speed + next_speed)
-    moves = xp.abs(mean) >= STANDSTILL_MPS
+    moves = xp.abs(mean) >= MIN_STEERING_SPEED_MPS
     safe_mean = xp.where(moves, mean, xp.ones_like(mean))
     turned = wrap_angle(next_states[..., 2] - states[..., 2])
     sin_slip = xp.clip(rear_m * turned / (safe_mean * dt_s), -_MAX_SIN_SLIP, _MAX_SIN_SLIP)
@@ -155,8 +181,34 @@ def inverse(
 
 
 def clip_actions(actions: Float[Any, "*batch 2"]) -> Float[Any, "*batch 2"]:
-    """Actions [acceleration m/s², steering rad] moved to the nearest that is allowed."""
+    """Actions [acceleration m/s², steering rad], clipped to the limits of both."""
     xp = namespace(actions)
     acceleration = xp.clip(actions[..., 0], -MAX_ACCELERATION_MPS2, MAX_ACCELERATION_MPS2)
     steering = xp.clip(actions[..., 1], -MAX_STEERING_RAD, MAX_STEERING_RAD)
     return xp.stack([acceleration, steering], axis=-1)
+
+
+_ACTION_LIMITS = (MAX_ACCELERATION_MPS2, MAX_STEERING_RAD)
+
+
+def normalize_actions(actions: Float[Any, "*batch 2"]) -> Float[Any, "*batch 2"]:
+    """Actions in the action space [-1, 1] of the environments, of the same type.
+
+    Args:
+        actions: [acceleration m/s², steering rad]. Actions beyond the limits are not clipped; the
+            environments do that.
+    """
+    if namespace(actions) is np:
+        return (actions / np.array(_ACTION_LIMITS)).astype(actions.dtype)
+    return actions / actions.new_tensor(_ACTION_LIMITS)
+
+
+def denormalize_actions(actions: Float[Any, "*batch 2"]) -> Float[Any, "*batch 2"]:
+    """Actions [acceleration m/s², steering rad]; the inverse of `normalize_actions`.
+
+    Args:
+        actions: in the action space [-1, 1] of the environments.
+    """
+    if namespace(actions) is np:
+        return actions * np.array(_ACTION_LIMITS, dtype=actions.dtype)
+    return actions * actions.new_tensor(_ACTION_LIMITS)

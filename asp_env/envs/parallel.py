@@ -1,6 +1,8 @@
-"""Several agents driven in one episode: who they are, and how each sees all others drive.
+"""Recorded traffic in which many vehicles are agents, as a PettingZoo parallel environment.
 
-MERGED: Recorded traffic in which the vehicles are agents, for PettingZoo.
+An episode of V agents is simulated in V rows of the world. Row v is the scenario from the view of
+agent v, which is the ego of that row; `JointPolicyDriver` moves the other agents of the row in the
+same way as in their own rows. Each agent thus gets observations, rewards and infos of an ego.
 """
 
 import dataclasses
@@ -15,110 +17,128 @@ from jaxtyping import Bool, Float, Int
 from pettingzoo import ParallelEnv
 
 from asp_env.data.classes import PREDICTED, AgentClass
-from asp_env.data.recording import Recording, frames_per_tick
-from asp_env.data.scenarios.scenario import Scenario, ScenarioSet
+from asp_env.data.recording import DEFAULT_DT_S, Recording, frames_per_tick
+from asp_env.data.scenarios.scenario import Scenario, ScenarioFilter, ScenarioSet
 from asp_env.data.scene import EGO, Scene
-from asp_env.dynamics import MAX_ACCELERATION_MPS2, MAX_STEERING_RAD
-from asp_env.envs.episodes import OPTIONS, ReplayEpisodes, StepResult, as_actions
+from asp_env.dynamics import denormalize_actions
+from asp_env.envs.episodes import RESET_OPTIONS, ReplayEpisodes, StepResult, valid_actions
+from asp_env.envs.options import ReplayOptions, suggest_options
 from asp_env.errors import AspEnvError, unknown_name
 from asp_env.render.frames import draw_frame
 from asp_env.sim.reward import MIN_GOAL_M
 from asp_env.sim.traffic import Control, Driver
-from asp_env.sim.traffic.driver import vehicles
+from asp_env.sim.traffic.assignment import TrafficSpec
+from asp_env.sim.traffic.driver import controllable_agents
 from asp_env.sim.world import World
 
 
 @dataclasses.dataclass(frozen=True, slots=True, kw_only=True)
 class AgentSelection:
-    """Which vehicles shall be agents."""
+    """The vehicles that may be agents."""
 
     classes: Sequence[str] | None = None
-    """Names of classes such as `car`; by default all that are predicted."""
+    """Names of classes such as `car`; by default all predicted classes."""
     ids: Sequence[int] | None = None
-    """Track ids, in whatever recording; by default all."""
+    """Track ids, in any recording; by default all."""
 
     def __post_init__(self) -> None:
-        """Refuses what no vehicle is.
+        """Checks the selection.
 
         Raises:
-            AspEnvError: a class is unknown, or there is none.
+            AspEnvError: a class is unknown, or a sequence is empty.
         """
         known = sorted(kind.name.lower() for kind in PREDICTED)
-        for what, given in (("classes", self.classes), ("ids", self.ids)):
-            if given is not None and (isinstance(given, str) or not len(given)):
-                raise AspEnvError(f"{what} {given!r}: expected a sequence with at least one entry")
+        for field, values in (("classes", self.classes), ("ids", self.ids)):
+            if values is not None and (isinstance(values, str) or not len(values)):
+                raise AspEnvError(
+                    f"{field} {values!r}: expected a sequence with at least one entry"
+                )
         for name in self.classes or ():
             if name not in known:
                 raise unknown_name("class of agents", name, known)
 
-    def among(self, recording: Recording) -> Bool[np.ndarray, " tracks"]:
-        """The tracks of a recording that may be agents."""
-        chosen = recording.predicted.copy()
+    def mask(self, recording: Recording) -> Bool[np.ndarray, " tracks"]:
+        """Returns the mask of a recording's tracks that may be agents."""
+        selected = recording.predicted.copy()
         if self.classes is not None:
             kinds = [int(AgentClass[name.upper()]) for name in self.classes]
-            chosen &= np.isin(recording.classes, kinds)
+            selected &= np.isin(recording.classes, kinds)
         if self.ids is not None:
-            chosen &= np.isin(recording.track_ids, np.asarray(self.ids))
-        return chosen
+            selected &= np.isin(recording.track_ids, np.asarray(self.ids))
+        return selected
 
 
-def candidates(
+def present_tracks(
     recording: Recording, scenario: Scenario, *, dt_s: float, history: int
 ) -> Bool[np.ndarray, " tracks"]:
-    """Tracks that could drive in a scenario: there for the history before it and a tick after."""
+    """Returns the mask of tracks that last from the start of the history to one tick after now."""
     stride = frames_per_tick(recording.frame_rate_hz, dt_s)
     first, last = (scenario.start_tick - history) * stride, (scenario.start_tick + 1) * stride
     return (recording.first_frames <= first) & (recording.last_frames >= last)
 
 
-def viewpoints(
+def agent_scenarios(
     recording: Recording,
-    wanted: Bool[np.ndarray, " tracks"],
+    selected: Bool[np.ndarray, " tracks"],
     scenario: Scenario,
     *,
     dt_s: float,
     history: int,
-    most: int,
+    max_agents: int,
 ) -> list[Scenario]:
-    """The scenario from the view of each of its agents, that of its own ego first.
+    """Returns a scenario from the view of each of its agents.
 
-    Agents are the ego and the wanted vehicles that could be one: there for the whole history, and
-    in the log once 1 m away before the scenario or their track ends. Of more than `most` those that
-    start nearest to the ego are taken. They are in the order of slots.
+    Agents are the ego, and the selected vehicles that are present during the whole history and
+    move away from their start by at least 1 m in the log. If there are more than `max_agents`,
+    those nearest to the ego at the start are taken.
+
+    Args:
+        recording: the recording of the scenario.
+        selected: mask of the tracks that may be agents.
+        scenario: the scenario from the view of its ego.
+        dt_s: length of a tick in seconds.
+        history: past ticks before the start.
+        max_agents: the largest number of agents, at least 1.
+
+    Returns:
+        The scenario itself, then those of the other agents in the order of slots.
     """
     stride, start = frames_per_tick(recording.frame_rate_hz, dt_s), scenario.start_tick
-    chosen = candidates(recording, scenario, dt_s=dt_s, history=history) & wanted
-    chosen &= recording.track_ids != scenario.ego_id
+    others = present_tracks(recording, scenario, dt_s=dt_s, history=history) & selected
+    others &= recording.track_ids != scenario.ego_id
     ego = int(np.flatnonzero(recording.track_ids == scenario.ego_id)[0])
-    here = recording.track(ego)[start * stride - recording.first_frames[ego], :2]
-    found: list[tuple[float, int, int, Scenario]] = []
-    for track in np.flatnonzero(chosen).tolist():
+    ego_position = recording.track(ego)[start * stride - recording.first_frames[ego], :2]
+    moving: list[tuple[float, int, int, Scenario]] = []
+    for track in np.flatnonzero(others).tolist():
         first, last = int(recording.first_frames[track]), int(recording.last_frames[track])
         length = min(scenario.length, last // stride - start)
-        way = recording.track(track)[(start + np.arange(length + 1)) * stride - first, :2]
-        # not the length of the way, which jitter adds up to while a vehicle stands
-        if np.hypot(*(way - way[0]).T).max() >= MIN_GOAL_M:
-            number = int(recording.track_ids[track])
-            view = dataclasses.replace(scenario, ego_id=number, length=length, tags=())
-            found.append((float(np.hypot(*(way[0] - here))), first, number, view))
-    nearest = sorted(found, key=lambda each: (each[0], each[2]))[: most - 1]
-    return [scenario, *(each[3] for each in sorted(nearest, key=lambda each: each[1:3]))]
+        path = recording.track(track)[(start + np.arange(length + 1)) * stride - first, :2]
+        # The distance from the start: jitter adds up in the path length of a standing vehicle.
+        if np.hypot(*(path - path[0]).T).max() >= MIN_GOAL_M:
+            track_id = int(recording.track_ids[track])
+            view = dataclasses.replace(scenario, ego_id=track_id, length=length, tags=())
+            distance_m = float(np.hypot(*(path[0] - ego_position)))
+            moving.append((distance_m, first, track_id, view))
+    nearest = sorted(moving, key=lambda entry: (entry[0], entry[2]))[: max_agents - 1]
+    return [scenario, *(entry[3] for entry in sorted(nearest, key=lambda entry: entry[1:3]))]
 
 
 class JointPolicyDriver:
-    """Moves all but the ego in rows that show one episode, each to another of its agents.
+    """Moves all agents but the ego in rows that show one episode from the views of its agents.
 
-    Row v has agent v in the slot of the ego. In every row the agents do what is given for them in
-    `actions`, and the others what the traffic's driver says in row 0.
+    Row v has agent v in the slot of the ego. In each row the agents follow `actions`, and the other
+    vehicles follow the traffic driver, which controls row 0 only.
     """
 
     def __init__(self, traffic: Driver) -> None:
-        """Agents among a traffic that has this driver."""
+        """Wraps the driver of the vehicles that are not agents."""
         self._traffic = traffic
         self.actions = np.zeros((0, 2), dtype=np.float32)
-        """[acceleration m/s², steering rad] of each agent in the coming tick."""
-        self._agents = np.zeros((0, 0), dtype=np.int64)
+        """(V, 2) [acceleration m/s², steering rad] of each agent in the coming tick."""
+        self._agent_index = np.zeros((0, 0), dtype=np.int64)
+        """(V, A) number of the agent in each slot, -1 for other vehicles."""
         self._slots = np.zeros((0, 0), dtype=np.int64)
+        """(V, A) slot in row 0 of the vehicle in each slot, -1 for vehicles not in row 0."""
 
     def reset(
         self,
@@ -126,73 +146,91 @@ class JointPolicyDriver:
         reset_mask: Bool[np.ndarray, " b"],
         agent_mask: Bool[np.ndarray, "b a"] | None = None,
     ) -> None:
-        """Learns who is who in the rows at `where`; the others take no part."""
+        """Matches the slots of the rows in `reset_mask`; the other rows are empty."""
         tracks = world.episodes.tracks
-        here = np.where(reset_mask[:, None] & (tracks >= 0), tracks, -1)
-        self._agents = _positions(here, here[:, EGO])
-        self._slots = _positions(here, here[0])
+        tracks = np.where(reset_mask[:, None] & (tracks >= 0), tracks, -1)
+        self._agent_index = _match(tracks, tracks[:, EGO])
+        self._slots = _match(tracks, tracks[0])
         self.actions = np.zeros((len(tracks), 2), dtype=np.float32)
-        traffic = (vehicles(world) if agent_mask is None else agent_mask) & (self._agents < 0)
+        others = controllable_agents(world) if agent_mask is None else agent_mask
+        traffic = others & (self._agent_index < 0)
         traffic[1:] = False
         self._traffic.reset(world, reset_mask, traffic)
 
     def control(self, world: World) -> Control:
-        """What everybody but the ego does in each row."""
-        said = self._traffic.control(world)
-        known, agent = self._slots >= 0, self._agents >= 0
+        """Returns the control of all agents but the ego in each row."""
+        control = self._traffic.control(world)
+        in_row_0, is_agent = self._slots >= 0, self._agent_index >= 0
         return Control(
             actions=np.where(
-                agent[..., None], self.actions[self._agents], said.actions[0, self._slots]
+                is_agent[..., None],
+                self.actions[self._agent_index],
+                control.actions[0, self._slots],
             ),
-            driven=agent | (said.driven[0, self._slots] & known),
-            leaving=~agent & said.leaving[0, self._slots] & known,
+            controlled=is_agent | (control.controlled[0, self._slots] & in_row_0),
+            leaving=~is_agent & control.leaving[0, self._slots] & in_row_0,
         )
 
     def slots_of(self, agents: Bool[np.ndarray, " b"]) -> Bool[np.ndarray, "b a"]:
-        """Where in each row some agents are."""
-        return (self._agents >= 0) & agents[self._agents]
+        """Returns the mask of the slots that hold some agents, in all rows."""
+        return (self._agent_index >= 0) & agents[self._agent_index]
 
 
-def _positions(
-    tracks: Int[np.ndarray, "b a"], known: Int[np.ndarray, " n"]
-) -> Int[np.ndarray, "b a"]:
-    """Where each track is among the known ones, else -1; tracks below 0 are nobody."""
+def _match(tracks: Int[np.ndarray, "b a"], known: Int[np.ndarray, " n"]) -> Int[np.ndarray, "b a"]:
+    """Returns the index of each track among the known ones, -1 for none and for negative tracks."""
     same = (tracks[..., None] == known) & (tracks >= 0)[..., None]
     return np.where(same.any(axis=-1), same.argmax(axis=-1), -1)
 
-
-_LIMITS = np.array([MAX_ACCELERATION_MPS2, MAX_STEERING_RAD], dtype=np.float32)
 
 Observations = dict[str, dict[str, np.ndarray]]
 
 
 class ParallelReplayEnv(ParallelEnv[str, dict[str, np.ndarray], Any]):
-    """Drive many vehicles of a drone recording at once; the rest is replayed or reacts.
+    """Controls many vehicles of a recording at once; the others are replayed or react.
 
+    ## Description
     Each agent has the observations, actions, rewards and infos that `ReplayEnv` has for its ego,
-    from its own point of view.
+    from its own view. `vehicle_0` is the ego of the scenario. The other agents are the vehicles
+    that are present during the whole history and move by at least 1 m until the scenario, or their
+    own track, ends. Vehicles that stand all the time or appear later are traffic, so the list
+    `agents` only shrinks. After a `reset`, `possible_agents` are the agents of the episode; before,
+    as many as any scenario can have.
 
-    ## Agents
-    `vehicle_0` is the vehicle of the scenario. The others are those that were there for the whole
-    history when it begins and get on by at least 1 m until it, or their own track, ends. Whoever
-    stands all the while or comes later is traffic. The list `agents` therefore only shrinks.
-    `possible_agents` are those of the episode; before the first `reset`, as many as any scenario
-    can have.
+    ## Action Space
+    That of `ReplayEnv` for each agent.
 
-    ## End of an agent
-    As in `ReplayEnv`: terminated by `COLLISION` (one that it answers for), `OFF_ROAD` or `GOAL`,
-    truncated by `OUT_OF_DATA` when its own track ends. It vanishes behind its last observation,
-    a crashed one too: replayed traffic would drive through a wreck. Whoever was hit drives on.
+    ## Observation Space
+    That of `ReplayEnv` for each agent.
+
+    ## Rewards
+    Those of `ReplayEnv` for each agent.
+
+    ## Starting State
+    As in `ReplayEnv`; only scenarios whose ego may be an agent are drawn. `reset` ignores unknown
+    options, since PettingZoo's own tests pass one.
+
+    ## Episode End
+    As in `ReplayEnv` for each agent: terminated by `COLLISION` at its own fault, `OFF_ROAD` or
+    `GOAL`, truncated by `OUT_OF_DATA` when its own track ends. An agent disappears after its last
+    observation, also after a collision, since replayed traffic would pass through a wreck. A
+    vehicle that was hit continues. The episode is over when no agent is left.
 
     ## Arguments
-    Those of `ReplayEnv`, and `classes` (names such as `car`), `ids` (track ids, of whatever
-    recording) and `max_agents` (those that start nearest to `vehicle_0`), which say who may be an
-    agent. Scenarios are those whose own vehicle may be one.
+    The arguments of `ReplayEnv` (as `render_mode` only `rgb_array`), and
 
-    ## Options of `reset`
-    Those of `ReplayEnv`; others are passed over, since PettingZoo's own test gives one.
+    | argument | default | meaning |
+    |---|---|---|
+    | `classes` | `None` | names of the classes of vehicles that may be agents, such as `car`; by \
+default all |
+    | `ids` | `None` | track ids of the vehicles that may be agents, in any recording; by default \
+all |
+    | `max_agents` | `None` | the largest number of agents; those nearest to `vehicle_0` are taken |
+
+    ## Version History
+    - v0: initial version
     """
 
+    @suggest_options
     def __init__(
         self,
         data: str = "sample:intersection",
@@ -201,66 +239,84 @@ class ParallelReplayEnv(ParallelEnv[str, dict[str, np.ndarray], Any]):
         ids: Sequence[int] | None = None,
         max_agents: int | None = None,
         render_mode: str | None = None,
-        **options: Any,
+        observations: Sequence[str] = ("raster", "actions", "state"),
+        view: str = "chauffeurnet",
+        raster_px: tuple[int, int] | None = None,
+        traffic: TrafficSpec | None = None,
+        dt_s: float = DEFAULT_DT_S,
+        reward_weights: Mapping[str, float] | None = None,
+        scenarios: ScenarioSet | ScenarioFilter | str = "",
     ) -> None:
-        """See the class documentation for the arguments.
+        """Makes the environment; the arguments are those of the class documentation.
 
         Raises:
-            AspEnvError: an argument is not understood, or no scenario is left.
+            AspEnvError: an argument is invalid, or no scenario fits.
         """
         if render_mode not in (None, "rgb_array"):
             raise AspEnvError(f"render mode {render_mode!r}: expected rgb_array or None")
         if max_agents is not None and max_agents < 1:
             raise AspEnvError(f"max_agents {max_agents}: expected at least 1")
+        options = ReplayOptions(
+            observations=observations,
+            view=view,
+            raster_px=raster_px,
+            traffic=traffic,
+            dt_s=dt_s,
+            reward_weights=reward_weights,
+            scenarios=scenarios,
+        )
         self.metadata = {"name": "asp_env/ParallelReplay-v0", "render_modes": ["rgb_array"]}
         self.render_mode = render_mode
         self._episodes = ReplayEpisodes(data, options, 1)
-        self.metadata["render_fps"] = 1 / self._episodes.simulation.world.dt_s
+        self.metadata["render_fps"] = 1 / dt_s
         self.recordings = self._episodes.recordings
-        self._wanted = tuple(
-            AgentSelection(classes=classes, ids=ids).among(r) for r in self.recordings
-        )
-        self.scenarios, most = self._scenarios(data)
-        self._most = most if max_agents is None else min(most, max_agents)
-        self._episodes.restrict(self.scenarios, self._most)
+        selection = AgentSelection(classes=classes, ids=ids)
+        self._selected = tuple(selection.mask(recording) for recording in self.recordings)
+        self.scenarios, num_agents = self._drivable_scenarios(data)
+        self._max_agents = num_agents if max_agents is None else min(num_agents, max_agents)
+        self._episodes.restrict(self.scenarios, self._max_agents)
         simulation = self._episodes.simulation
         simulation.driver = JointPolicyDriver(simulation.driver)
-        self.possible_agents = [f"vehicle_{number}" for number in range(self._most)]
+        self.possible_agents = [f"vehicle_{row}" for row in range(self._max_agents)]
         self.agents: list[str] = []
-        self._numbers = {name: number for number, name in enumerate(self.possible_agents)}
+        self._rows = {name: row for row, name in enumerate(self.possible_agents)}
         space: spaces.Space[Any] = self._episodes.observer.space
-        self.observation_spaces: dict[str, Any] = dict.fromkeys(self._numbers, space)
+        self.observation_spaces: dict[str, Any] = dict.fromkeys(self._rows, space)
         self.action_spaces: dict[str, spaces.Space[Any]] = {
-            name: spaces.Box(-1.0, 1.0, (2,), dtype=np.float32) for name in self._numbers
+            name: spaces.Box(-1.0, 1.0, (2,), dtype=np.float32) for name in self._rows
         }
-        self.state_space = spaces.Box(-np.inf, np.inf, (self._most, 7), dtype=np.float32)
+        self.state_space = spaces.Box(-np.inf, np.inf, (self._max_agents, 7), dtype=np.float32)
         self._np_random: np.random.Generator | None = None
 
     def reset(
         self, seed: int | None = None, options: dict[str, Any] | None = None
     ) -> tuple[Observations, dict[str, dict[str, Any]]]:
-        """Starts the scenario that the options ask for, or one drawn with the seed.
+        """Starts an episode.
+
+        Args:
+            seed: seed of the generator that draws the scenario.
+            options: those of `ReplayEnv.reset`; others are ignored.
 
         Raises:
-            AspEnvError: what an option asks for does not exist.
+            AspEnvError: there is no such scenario.
         """
         if seed is not None or self._np_random is None:
             self._np_random, _ = seeding.np_random(seed)
-        known = {name: value for name, value in (options or {}).items() if name in OPTIONS}
+        known = {name: value for name, value in (options or {}).items() if name in RESET_OPTIONS}
         scenario, rng = self._episodes.draw(self._np_random, known)
         world = self._episodes.simulation.world
-        views = viewpoints(
+        views = agent_scenarios(
             self.recordings[scenario.recording],
-            self._wanted[scenario.recording],
+            self._selected[scenario.recording],
             scenario,
             dt_s=world.dt_s,
             history=world.history,
-            most=self._most,
+            max_agents=self._max_agents,
         )
-        reset_mask = np.arange(self._most) < len(views)
-        padding = [scenario] * (self._most - len(views))
-        self._episodes.begin([*views, *padding], [rng] * self._most, reset_mask)
-        self.possible_agents = list(self._numbers)[: len(views)]
+        reset_mask = np.arange(self._max_agents) < len(views)
+        padding = [scenario] * (self._max_agents - len(views))
+        self._episodes.begin([*views, *padding], [rng] * self._max_agents, reset_mask)
+        self.possible_agents = list(self._rows)[: len(views)]
         self.agents = self.possible_agents.copy()
         return self._observe(), self._infos()
 
@@ -273,7 +329,7 @@ class ParallelReplayEnv(ParallelEnv[str, dict[str, np.ndarray], Any]):
         dict[str, bool],
         dict[str, dict[str, Any]],
     ]:
-        """One tick; the actions of all `agents`, moved to the nearest ones in the space.
+        """Steps by one tick with an action (2,) for each of `agents`, which is clipped to [-1, 1].
 
         Raises:
             gymnasium.error.ResetNeeded: the episode is over, or none has begun.
@@ -281,29 +337,29 @@ class ParallelReplayEnv(ParallelEnv[str, dict[str, np.ndarray], Any]):
         """
         if not self.agents:
             raise gymnasium.error.ResetNeeded("no agent is left: call reset before step")
-        given = np.zeros((self._most, 2), dtype=np.float32)
+        joint = np.zeros((self._max_agents, 2), dtype=np.float32)
         for name in self.agents:
             if name not in actions:
                 raise AspEnvError(f"no action for {name}: expected one for each of env.agents")
-            given[self._numbers[name]] = as_actions(actions[name], (2,))
+            joint[self._rows[name]] = valid_actions(actions[name], (2,))
         driver = self._episodes.simulation.driver
         assert isinstance(driver, JointPolicyDriver)
-        driver.actions = given * _LIMITS
-        outcome = self._episodes.step(given)
-        over = outcome.terminated | outcome.truncated
+        driver.actions = denormalize_actions(joint)
+        result = self._episodes.step(joint)
+        over = result.terminated | result.truncated
         returned = (
             self._observe(),
-            self._told(outcome.reward),
-            self._told(outcome.terminated),
-            self._told(outcome.truncated),
-            self._infos(outcome),
+            self._by_agent(result.reward),
+            self._by_agent(result.terminated),
+            self._by_agent(result.truncated),
+            self._infos(result),
         )
-        self._episodes.simulation.world.episodes.gone |= driver.slots_of(over)
-        self.agents = [name for name in self.agents if not over[self._numbers[name]]]
+        self._episodes.simulation.world.episodes.departed |= driver.slots_of(over)
+        self.agents = [name for name in self.agents if not over[self._rows[name]]]
         return returned
 
     def scene(self, agent: str) -> Scene:
-        """All that an agent may know now, for a predictor in its loop; it is slot 0.
+        """Returns everything that an agent may know now, for predictors; it is slot 0.
 
         Raises:
             gymnasium.error.ResetNeeded: no episode has begun.
@@ -314,31 +370,33 @@ class ParallelReplayEnv(ParallelEnv[str, dict[str, np.ndarray], Any]):
         world = self._episodes.simulation.world
         if world.scenarios[0] is None:
             raise gymnasium.error.ResetNeeded("no episode has begun: call reset first")
-        return world.scene().situation(self._numbers[agent])
+        return world.scene().situation(self._rows[agent])
 
     def state(self) -> Float[np.ndarray, "agents 7"]:
-        """Of every possible agent x m, y m, heading rad, speed m/s, length m, width m, 1.
+        """Returns the states of all possible agents in the recording's frame.
 
-        Zeros for those that are not there. Positions are in the recording's frame.
+        Returns:
+            [x m, y m, heading rad, speed m/s, length m, width m, 1] of each agent; zeros for those
+            that have left.
         """
         world = self._episodes.simulation.world
         state = np.zeros(self.state_space.shape or (), dtype=np.float32)
-        rows = [self._numbers[name] for name in self.agents]
+        rows = [self._rows[name] for name in self.agents]
         state[rows, :4] = world.ego_states()[rows]
         state[rows, 4:6] = world.episodes.sizes[rows, 0]
         state[rows, 6] = 1.0
         return state
 
     def observation_space(self, agent: str) -> spaces.Space[Any]:
-        """The same for all agents."""
+        """Returns the observation space, which all agents share."""
         return self.observation_spaces[agent]
 
     def action_space(self, agent: str) -> spaces.Space[Any]:
-        """The agent's own, with its own seed."""
+        """Returns the action space of an agent, which has its own seed."""
         return self.action_spaces[agent]
 
     def render(self) -> Any:
-        """An RGB picture uint8 (H, W, 3) of the whole place in mode `rgb_array`, else None."""
+        """Returns a picture of the whole place, uint8 (H, W, 3) RGB, or None without a mode."""
         if self.render_mode is None:
             return None
         scene = self.scene((self.agents or self.possible_agents)[0])
@@ -347,45 +405,48 @@ class ParallelReplayEnv(ParallelEnv[str, dict[str, np.ndarray], Any]):
         return draw_frame(scene, extent_m=None, background=background)
 
     def close(self) -> None:
-        """Nothing is held open."""
+        """Does nothing: the environment has no window."""
 
-    def _scenarios(self, data: str) -> tuple[ScenarioSet, int]:
-        """The scenarios whose own vehicle may be an agent, and the most agents of one of them."""
-        world, found = self._episodes.simulation.world, self._episodes.scenarios
-        kept, most = np.zeros(len(found), dtype=bool), 0
-        for row, scenario in enumerate(found):
+    def _drivable_scenarios(self, data: str) -> tuple[ScenarioSet, int]:
+        """Returns the scenarios whose ego may be an agent, and the most agents of any of them."""
+        world, scenarios = self._episodes.simulation.world, self._episodes.scenarios
+        drivable, num_agents = np.zeros(len(scenarios), dtype=bool), 0
+        for row, scenario in enumerate(scenarios):
             recording = self.recordings[scenario.recording]
-            wanted = self._wanted[scenario.recording]
-            if wanted[recording.track_ids == scenario.ego_id].any():
-                there = candidates(recording, scenario, dt_s=world.dt_s, history=world.history)
-                most = max(most, int((there & wanted).sum()))
-                kept[row] = True
-        if not most:
-            raise AspEnvError(f"{data}: no scenario's vehicle is of the given classes and ids")
-        return found.select(kept), most
+            selected = self._selected[scenario.recording]
+            if selected[recording.track_ids == scenario.ego_id].any():
+                present = present_tracks(
+                    recording, scenario, dt_s=world.dt_s, history=world.history
+                )
+                num_agents = max(num_agents, int((present & selected).sum()))
+                drivable[row] = True
+        if not num_agents:
+            raise AspEnvError(
+                f"{data}: the ego of no scenario has one of the given classes and ids"
+            )
+        return scenarios.select(drivable), num_agents
 
     def _observe(self) -> Observations:
-        rows = np.array([self._numbers[name] for name in self.agents])
+        rows = np.array([self._rows[name] for name in self.agents])
         observed = self._episodes.observe(rows)
         return {
-            name: {part: value[row] for part, value in observed.items()}
+            name: {key: value[row] for key, value in observed.items()}
             for row, name in enumerate(self.agents)
         }
 
-    def _infos(self, outcome: StepResult | None = None) -> dict[str, dict[str, Any]]:
-        columns = {name: self._told(value) for name, value in self._episodes.info().items()}
-        if outcome is not None:
-            terms = {name: self._told(value) for name, value in outcome.terms.items()}
+    def _infos(self, result: StepResult | None = None) -> dict[str, dict[str, Any]]:
+        columns = {name: self._by_agent(value) for name, value in self._episodes.info().items()}
+        if result is not None:
+            terms = {name: self._by_agent(value) for name, value in result.terms.items()}
             columns["reward_terms"] = {
                 agent: {name: value[agent] for name, value in terms.items()}
                 for agent in self.agents
             }
-            columns["ending"] = self._told(outcome.ending)
+            columns["ending"] = self._by_agent(result.ending)
         return {
             agent: {name: value[agent] for name, value in columns.items()} for agent in self.agents
         }
 
-    def _told(self, values: np.ndarray) -> dict[str, Any]:
-        """One plain value for each agent that is there."""
+    def _by_agent(self, values: np.ndarray) -> dict[str, Any]:
         plain = values.tolist()
-        return {name: plain[self._numbers[name]] for name in self.agents}
+        return {name: plain[self._rows[name]] for name in self.agents}

@@ -1,6 +1,6 @@
-"""`asp_env/Replay-v0`: drive one vehicle of a recording."""
+"""`asp_env/Replay-v0`: control one vehicle of a recording."""
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, fields
 from functools import partial
 from typing import Any
@@ -10,13 +10,15 @@ import numpy as np
 from jaxtyping import Float, Shaped
 
 from asp_env.data.predictor import Forecast
-from asp_env.data.recording import Background
-from asp_env.data.scenarios.scenario import Scenario, ScenarioSet
+from asp_env.data.recording import DEFAULT_DT_S, Background
+from asp_env.data.scenarios.scenario import Scenario, ScenarioFilter, ScenarioSet
 from asp_env.data.scene import Scene
 from asp_env.data.snippets import Future
 from asp_env.data.source import Recordings
-from asp_env.envs.episodes import ReplayEpisodes, StepResult, as_actions
-from asp_env.render.live import MODES, Live
+from asp_env.envs.episodes import ReplayEpisodes, StepResult, valid_actions
+from asp_env.envs.options import ReplayOptions, suggest_options
+from asp_env.render.live import MODES, LiveRenderer
+from asp_env.sim.traffic.assignment import TrafficSpec
 from asp_env.sim.world import World, recorded_future
 
 NOT_BEGUN = "no episode has begun: call reset first"
@@ -25,17 +27,17 @@ METADATA = {"render_modes": [*MODES], "render_fps": 5}
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class EnvSnapshot:
-    """The whole state of an environment: how it came about, and the arrays of it.
+    """The whole state of an environment: the course of the episode, and its arrays.
 
-    Pickles hold only how it came about, a few kilobytes; from those an environment that is made
-    with the same arguments gets to the same state by driving there.
+    A pickle leaves the arrays out and has a few kilobytes. An environment made with the same
+    arguments restores it by stepping through the actions again.
     """
 
     scenario: Scenario
     rng: Mapping[str, Any]
-    """State of the episode's own generator at its start."""
+    """State of the episode's generator at its start."""
     actions: Float[np.ndarray, "steps 2"]
-    """Since the start, in [-1, 1]."""
+    """Actions since the start, in [-1, 1]."""
     generator: Mapping[str, Any]
     """State of `np_random`."""
     seed: int | None
@@ -43,122 +45,213 @@ class EnvSnapshot:
     arrays: Any = None
 
     def __reduce__(self) -> tuple[Any, ...]:
-        """Without the arrays."""
+        """Pickles the snapshot without the arrays."""
         names = [field.name for field in fields(self) if field.name != "arrays"]
         return partial(EnvSnapshot, **{name: getattr(self, name) for name in names}), ()
 
 
 class ReplayEnv(gymnasium.Env[dict[str, Any], Any]):
-    """Drive one vehicle of a recording; the traffic around it is replayed or reacts.
+    """Controls one vehicle of a recording, the ego, among replayed or reacting traffic.
 
-    ## Action space
-    `Box(-1, 1, (2,), float32)`: acceleration (times 5 m/s²) and steering (times π/4 rad, left
-    positive), held for one tick of the kinematic bicycle model. Braking ends at speed 0.
+    ## Description
+    An episode is a scenario of a drone recording: one vehicle, a start and a length. The ego starts
+    in the recorded state after 3 s of recorded history and follows the actions through a kinematic
+    bicycle model. Other agents replay their recorded tracks, or a traffic driver moves them. The
+    task is to follow the recorded route at least as far as the recorded vehicle, without a
+    collision and without leaving the road.
 
-    ## Observation space
-    A `Dict` of what `observations` names, in any choice; only that is computed. All values are
-    finite and within finite bounds: what would lie beyond is shown at the bound.
+    ## Action Space
+    `Box(-1, 1, (2,), float32)`, held for one tick. `asp_env.normalize_actions` and
+    `asp_env.denormalize_actions` convert from and to physical units. Actions outside the space are
+    clipped.
 
-    | name | parts and spaces | what it is |
+    | index | action | -1 | 1 | unit |
+    |---|---|---|---|---|
+    | 0 | acceleration; braking ends at speed 0 | -5 | 5 | m/s² |
+    | 1 | steering, left positive | -π/4 | π/4 | rad |
+
+    ## Observation Space
+    A `Dict` of the components that `observations` names; only these are computed. All values are
+    finite and clipped to the bounds. Coordinates are in the present frame of the ego: x ahead,
+    y to the left. Each component has an entry of its own name, except `vectors`, which has the last
+    four. The shape of `actions` is that of `dt_s=0.2`.
+
+    | entry | shape | dtype | bounds | unit | content |
+    |---|---|---|---|---|---|
+    | `raster` | (12, 360, 240) | uint8 | 0, 255 | | picture of `view`, heading up, in the \
+shape of the view and `raster_px` |
+    | `chauffeurnet` | (12, 360, 240) | uint8 | 0, 255 | | picture of this view |
+    | `mtp` | (3, 360, 360) | uint8 | 0, 255 | | picture of this view |
+    | `actions` | (15, 2) | float32 | ±10, ±π/4 | m/s², rad | acceleration and steering, \
+inferred from the motion of the last 3 s, oldest first |
+    | `state` | (9,) | float32 | see below | | motion, place on the route, and size of the ego |
+    | `route` | (30, 2) | float32 | ±1000 | m | points 2, 4, … 60 m ahead on the route, in a \
+straight line beyond its end |
+    | `agents` | (16, 16, 12) | float32 | see below | | the ego and the nearest agents; \
+15 past ticks and the present one |
+    | `agents_valid` | (16, 16) | int8 | 0, 1 | | mask of agents and ticks |
+    | `lines` | (64, 10, 8) | float32 | see below | | nearest pieces of lanes and boundaries as \
+10 points |
+    | `lines_valid` | (64, 10) | int8 | 0, 1 | | mask of lines and points |
+
+    | index of `state` | field | low | high | unit |
+    |---|---|---|---|---|
+    | 0 | speed | -60 | 60 | m/s |
+    | 1 | acceleration | -10 | 10 | m/s² |
+    | 2 | steering | -π/4 | π/4 | rad |
+    | 3 | offset to the left of the route | -50 | 50 | m |
+    | 4 | heading error to the route | -π | π | rad |
+    | 5 | completed share of the route | -1 | 2 | |
+    | 6 | distance to the goal along the route | -200 | 1000 | m |
+    | 7, 8 | length, width | 0 | 30, 10 | m |
+
+    | index of `agents` | field | low | high | unit |
+    |---|---|---|---|---|
+    | 0, 1 | x, y | -1000 | 1000 | m |
+    | 2, 3 | cosine, sine of the heading | -1 | 1 | |
+    | 4 | speed | -60 | 60 | m/s |
+    | 5, 6 | length, width | 0 | 30, 10 | m |
+    | 7 to 11 | class: car, heavy, two-wheeler, pedestrian, other | 0 | 1 | |
+
+    | index of `lines` | field | low | high | unit |
+    |---|---|---|---|---|
+    | 0, 1 | x, y | -1000 | 1000 | m |
+    | 2, 3 | cosine, sine of the direction | -1 | 1 | |
+    | 4 to 7 | kind: lane, curb, solid line, dashed line | 0 | 1 | |
+
+    ## Rewards
+    The sum of four terms, each times its weight in `reward_weights`. `info["reward_terms"]` holds
+    the terms without weights.
+
+    | term | weight | value in each step |
     |---|---|---|
-    | `raster` | `raster`: `Box(0, 255, (12, H, W), uint8)` | the picture that `view` draws, \
-heading up, see `asp_env.views` |
-    | `chauffeurnet`, `mtp`, … | a part of that name | the picture of that view in its usual size, \
-beside or instead of `raster` |
-    | `vectors` | `agents`: `Box(…, (16, 16, 12), float32)` | the ego and its nearest neighbours \
-over the last 3 s, fields as `asp_env.views.vectors.AGENT_FIELDS`, m, rad as cos and sin, m/s, in \
-the ego's frame now |
-    | | `agents_valid`: `Box(0, 1, (16, 16), int8)` | who was there when |
-    | | `lines`: `Box(…, (64, 10, 8), float32)` | the nearest pieces of lanes and boundaries as 10 \
-points, fields as `LINE_FIELDS`, in the ego's frame |
-    | | `lines_valid`: `Box(0, 1, (64, 10), int8)` | which points there are |
-    | `actions` | `actions`: `Box(±[10, π/4], (15, 2), float32)` | acceleration m/s² and steering \
-rad of the last 3 s, oldest first, inferred from the motion |
-    | `state` | `state`: `Box(…, (9,), float32)` | fields and bounds in \
-`asp_env.sim.observation.STATE_FIELDS`: speed m/s, acceleration m/s², steering rad, offset to the \
-left of the route m, heading error rad, share of the route done, way to the goal m, length m, \
-width m |
-    | `route` | `route`: `Box(±1000, (30, 2), float32)` | points 2, 4, … 60 m ahead on the ego's \
-way, in its frame, m; beyond the end of the way straight on |
+    | `progress` | 1 | gained share of the recorded ego's path; sums to 1 at the goal |
+    | `comfort` | 0.01 | minus the mean of the squares of longitudinal and lateral acceleration, \
+each divided by 5 m/s² |
+    | `collision` | 1 | -1 for a collision at the ego's fault |
+    | `off_road` | 1 | -`dt_s` while a corner of the ego is more than 0.3 m off the drivable area |
 
-    ## Reward
-    The weighted sum of the terms in `info["reward_terms"]`: progress along the logged way,
-    comfort, collision at fault, off-road (`asp_env.sim.reward`).
+    ## Starting State
+    `reset` draws one of `scenarios` with the seed. A scenario is a vehicle that covers at least
+    10 m in 4 to 15 s; longer tracks are cut into several. `reset(options=…)` names a start:
 
-    ## Start and end of an episode
-    `reset` draws one of the scenarios (a vehicle that covers at least 10 m in 4 to 15 s), or takes
-    `options={"scenario": number or name}`. With `ego` (the track id of any vehicle, in the
-    recording of the scenario) and `start_tick` it begins anywhere with 3 s of history. Terminated:
-    a collision that the ego answers for (`COLLISION`), over 2 m off the road (`OFF_ROAD`), or the
-    end of the logged way (`GOAL`). Truncated: the recording has no more (`OUT_OF_DATA`).
-    `info["ending"]` names it.
+    | option | meaning |
+    |---|---|
+    | `scenario` | number or name of a scenario |
+    | `ego` | track id of any vehicle in the recording of the scenario |
+    | `start_tick` | tick of the first observation, with 3 s of the ego's track before it |
+
+    ## Episode End
+    `info["ending"]` names the reason.
+
+    | ending | flag | condition |
+    |---|---|---|
+    | `COLLISION` | terminated | the ego is at fault for a collision |
+    | `OFF_ROAD` | terminated | a corner of the ego is more than 2 m off the drivable area |
+    | `GOAL` | terminated | the ego reaches the end of the recorded ego's path |
+    | `OUT_OF_DATA` | truncated | the scenario has run its length |
+
+    Where the recorded ego itself leaves the drivable area, which may be a gap in the map, only the
+    excess counts. Other keys of `info` are `scenario` (name), `tags`, `tick` (steps since the
+    start), `progress` (share of the path), `collision`, `at_fault` and `off_road_m`.
 
     ## Arguments
-    `data`: a folder in the inD/rounD or INTERACTION layout, `sample:intersection`,
-    `sample:roundabout`, `synthetic:…` or `highway:…`, in which highway-env's traffic reacts (the
-    default of `asp_env/HighwayIntersection-v0` and `asp_env/HighwayRoundabout-v0`). Then those of
-    `asp_env.envs.episodes.ReplayOptions`: `observations`, `view` and `raster_px` (height, width;
-    by default the view's own) of the raster, `traffic` (`log`, `log-actions`, `idm`, … or a table
-    of them; by default `log`, or `own` where traffic reacts), `dt_s` (length of a tick),
-    `reward_weights` by name, where they differ from the defaults, and `scenarios` (a set of them,
-    or a filter such as `left,length>=8`).
+    ```python
+    import gymnasium, asp_env
 
-    ## Going back
-    `snapshot()` and `restore()` on `env.unwrapped` bring back the whole state bit for bit, that of
-    `np_random` included, for search and counterfactuals; snapshots can be pickled.
+    env = gymnasium.make("asp_env/Replay-v0", data="sample:intersection", traffic="idm")
+    ```
 
-    ## Rendering
-    `render_mode`: `rgb_array`, a picture from above of 80 m by 80 m, or `human`, a window that
-    keeps up with the episode (extra `render`). `show` adds a forecast and a plan.
+    | argument | default | meaning |
+    |---|---|---|
+    | `data` | `"sample:intersection"` | a folder in the inD/rounD or INTERACTION layout, \
+`sample:intersection`, `sample:roundabout`, `synthetic:…`, or `highway:…` with reacting traffic |
+    | `render_mode` | `None` | `rgb_array`: a picture of 80 m by 80 m from above; `human`: a \
+window that shows every tick (extra `render`) |
+    | `observations` | `("raster", "actions", "state")` | components of the observation |
+    | `view` | `"chauffeurnet"` | view that draws the `raster`, see `asp_env.views` |
+    | `raster_px` | `None` | height and width of the `raster`; the view's own by default |
+    | `traffic` | `None` | driver of the uncontrolled agents: `log`, `log-actions`, `idm`, … or a \
+table of drivers; `log` by default, `own` in a world with reacting traffic |
+    | `dt_s` | `0.2` | length of a tick in seconds |
+    | `reward_weights` | `None` | weights of reward terms that differ from the defaults |
+    | `scenarios` | `""` | a set of scenarios, or a filter such as `left,length>=8` |
 
-    ## Version history
-    v0: first.
+    An unknown argument raises a `TypeError` that names the nearest known one.
+    `asp_env/HighwayIntersection-v0` and `asp_env/HighwayRoundabout-v0` are this environment with
+    `data="highway:intersection"` and `data="highway:roundabout"`.
+
+    Besides Gymnasium's interface there are `scene()` for predictors and planners, `snapshot()` and
+    `restore()` for search and counterfactuals, and `show()`, which draws a forecast and a plan.
+
+    ## Version History
+    - v0: initial version
     """
 
     metadata = METADATA
 
+    @suggest_options
     def __init__(
-        self, data: str = "sample:intersection", *, render_mode: str | None = None, **options: Any
+        self,
+        data: str = "sample:intersection",
+        *,
+        render_mode: str | None = None,
+        observations: Sequence[str] = ("raster", "actions", "state"),
+        view: str = "chauffeurnet",
+        raster_px: tuple[int, int] | None = None,
+        traffic: TrafficSpec | None = None,
+        dt_s: float = DEFAULT_DT_S,
+        reward_weights: Mapping[str, float] | None = None,
+        scenarios: ScenarioSet | ScenarioFilter | str = "",
     ) -> None:
-        """See the class documentation for the arguments.
+        """Makes the environment; the arguments are those of the class documentation.
 
         Raises:
-            AspEnvError: an argument is not understood, or the data hold no scenario.
+            AspEnvError: an argument is invalid, or the data hold no scenario.
+            MissingExtraError: a window is requested and its package is not installed.
         """
+        options = ReplayOptions(
+            observations=observations,
+            view=view,
+            raster_px=raster_px,
+            traffic=traffic,
+            dt_s=dt_s,
+            reward_weights=reward_weights,
+            scenarios=scenarios,
+        )
         self.render_mode = render_mode
         self._episodes = ReplayEpisodes(data, options, 1)
         self.observation_space = self._episodes.observer.space
         self.action_space = self._episodes.action_space
         self._running = False
         self._start: tuple[Scenario, Mapping[str, Any]] | None = None
-        """The scenario, and the state of its generator when it began."""
+        """The scenario, and the state of its generator at the start."""
         self._actions: list[Float[np.ndarray, " 2"]] = []
-        dt_s = self._episodes.simulation.world.dt_s
         self.metadata = {**METADATA, "render_fps": round(1 / dt_s, 6)}
-        self._live = Live(render_mode, title=f"asp-env: {data}", dt_s=dt_s)
+        self._live = LiveRenderer(render_mode, title=f"asp-env: {data}", dt_s=dt_s)
 
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
     ) -> tuple[dict[str, Any], dict[str, Any]]:
-        """Starts the scenario that the options ask for, or one drawn with the seed.
+        """Starts an episode.
 
         Args:
-            seed: of `np_random`; never the number of a scenario.
-            options: `scenario` (number or name), `ego` (track id of any vehicle, in the recording
-                of the scenario) and `start_tick` (of the first observation).
+            seed: seed of `np_random`, which draws the scenario; not the number of a scenario.
+            options: `scenario`, a number or a name; `ego`, the track id of any vehicle in the
+                recording of the scenario; `start_tick`, the tick of the first observation.
 
         Raises:
-            AspEnvError: an option is unknown, or what it asks for does not exist.
+            AspEnvError: an option is unknown, or there is no such scenario.
         """
         super().reset(seed=seed)
         self._begin(*self._episodes.draw(self.np_random, options or {}))
         self._running = True
-        self._live.forget()
-        self._keep_up()
+        self._live.clear_overlay()
+        self._update_window()
         return self._observe(), self._info()
 
     def step(self, action: Any) -> tuple[dict[str, Any], float, bool, bool, dict[str, Any]]:
-        """One tick; the action is moved to the nearest one in the space.
+        """Steps by one tick with an action (2,), which is clipped to [-1, 1].
 
         Raises:
             gymnasium.error.ResetNeeded: the episode is over, or none has begun.
@@ -166,18 +259,38 @@ way, in its frame, m; beyond the end of the way straight on |
         """
         if not self._running:
             raise gymnasium.error.ResetNeeded("the episode is over: call reset before step")
-        outcome = self._act(as_actions(action, (2,)))
-        terminated, truncated = bool(outcome.terminated[0]), bool(outcome.truncated[0])
+        result = self._act(valid_actions(action, (2,)))
+        terminated, truncated = bool(result.terminated[0]), bool(result.truncated[0])
         self._running = not (terminated or truncated)
         info = self._info() | {
-            "reward_terms": {name: float(value[0]) for name, value in outcome.terms.items()},
-            "ending": outcome.ending[0],
+            "reward_terms": {name: float(value[0]) for name, value in result.terms.items()},
+            "ending": result.ending[0],
         }
-        self._keep_up()
-        return self._observe(), float(outcome.reward[0]), terminated, truncated, info
+        self._update_window()
+        return self._observe(), float(result.reward[0]), terminated, truncated, info
+
+    def scene(self) -> Scene:
+        """Returns everything that may be known now, for predictors and planners; the ego is slot 0.
+
+        Raises:
+            gymnasium.error.ResetNeeded: no episode has begun.
+        """
+        return self._world().scene()
+
+    def recorded_future(self, scene: Scene, horizon: int) -> Future:
+        """Returns the recorded future of a scene's targets, for privileged predictors.
+
+        Args:
+            scene: the present scene, possibly with other targets.
+            horizon: number of ticks.
+
+        Raises:
+            gymnasium.error.ResetNeeded: no episode has begun.
+        """
+        return recorded_future(self._world(), scene, horizon)
 
     def snapshot(self) -> EnvSnapshot:
-        """The whole state with that of `np_random`, to be handed to `restore`.
+        """Returns the whole state, including that of `np_random`, for `restore`.
 
         Raises:
             gymnasium.error.ResetNeeded: no episode has begun.
@@ -195,9 +308,9 @@ way, in its frame, m; beyond the end of the way straight on |
         )
 
     def restore(self, snapshot: EnvSnapshot) -> None:
-        """Goes back to a snapshot of this environment or of one made with the same arguments.
+        """Restores a snapshot of this environment or of one made with the same arguments.
 
-        What comes after is the same bit for bit.
+        Everything that follows is the same bit for bit.
         """
         if snapshot.arrays is None:
             rng = np.random.default_rng()
@@ -212,48 +325,30 @@ way, in its frame, m; beyond the end of the way straight on |
         self.np_random.bit_generator.state = snapshot.generator
         self._np_random_seed = snapshot.seed
         self._running = snapshot.running
-        self._live.forget()
-
-    def scene(self) -> Scene:
-        """All that may be known now, for a predictor in anybody's loop; the ego is slot 0.
-
-        Raises:
-            gymnasium.error.ResetNeeded: no episode has begun.
-        """
-        return self._world().scene()
+        self._live.clear_overlay()
 
     def show(
         self, *, forecast: Forecast | None = None, plan: Shaped[np.ndarray, "..."] | None = None
     ) -> None:
-        """Hands over what to draw besides, until the next time; `reset` forgets it.
+        """Sets the overlay of the pictures, until the next call or `reset`.
 
         Args:
-            forecast: of `scene()`. Later pictures show what is still to come of it.
-            plan: the ego's positions at the next ticks, metres, in the first two columns.
+            forecast: a forecast of `scene()`; later pictures show its remaining ticks.
+            plan: (steps, 2 or more) positions of the ego at the next ticks, x and y in metres.
 
         Raises:
             gymnasium.error.ResetNeeded: no episode has begun.
-            AspEnvError: it is not of this scene, or not finite.
+            AspEnvError: the forecast is not of this scene, or a value is not finite.
         """
         self._live.set_overlay(self.scene(), forecast, plan)
         if self.render_mode == "human":
             self.render()
 
-    def recorded_future(self, scene: Scene, horizon: int) -> Future:
-        """What the targets of a scene of now went on to do, for privileged predictors alone.
-
-        Raises:
-            gymnasium.error.ResetNeeded: no episode has begun.
-        """
-        return recorded_future(self._world(), scene, horizon)
-
-    @property
-    def dt_s(self) -> float:
-        """Length of a tick."""
-        return self._episodes.simulation.world.dt_s
-
     def render(self) -> Any:
-        """A picture from above: RGB uint8 (H, W, 3) in mode `rgb_array`, on screen in `human`.
+        """Renders the present tick.
+
+        Returns:
+            uint8 (H, W, 3) RGB in mode `rgb_array`; None in `human`, where the window is updated.
 
         Raises:
             gymnasium.error.ResetNeeded: no episode has begun.
@@ -264,24 +359,22 @@ way, in its frame, m; beyond the end of the way straight on |
         return self._live.render(self.scene(), self._background())
 
     def close(self) -> None:
-        """Closes the window, if there is one."""
+        """Closes the window."""
         self._live.close()
 
-    def _keep_up(self) -> None:
-        if self.render_mode == "human":
-            self._live.update(self.scene(), self._background())
-
-    def _background(self) -> Background | None:
-        return self.recordings[int(self._world().episodes.recording[0])].background
+    @property
+    def dt_s(self) -> float:
+        """Length of a tick in seconds."""
+        return self._episodes.simulation.world.dt_s
 
     @property
     def recordings(self) -> Recordings:
-        """Of DATA."""
+        """The recordings of `data`."""
         return self._episodes.recordings
 
     @property
     def scenarios(self) -> ScenarioSet:
-        """Those that are drawn from."""
+        """The scenarios to draw from."""
         return self._episodes.scenarios
 
     def _begin(self, scenario: Scenario, rng: np.random.Generator) -> None:
@@ -302,3 +395,10 @@ way, in its frame, m; beyond the end of the way straight on |
         if self._start is None:
             raise gymnasium.error.ResetNeeded(NOT_BEGUN)
         return self._episodes.simulation.world
+
+    def _update_window(self) -> None:
+        if self.render_mode == "human":
+            self._live.update(self.scene(), self._background())
+
+    def _background(self) -> Background | None:
+        return self.recordings[int(self._world().episodes.recording[0])].background

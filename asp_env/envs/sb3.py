@@ -1,4 +1,4 @@
-"""Vector environments as stable-baselines3 takes them. Imported only by those who have it."""
+"""Vector environments for stable-baselines3. Importing this module imports stable-baselines3."""
 
 import warnings
 from collections.abc import Sequence
@@ -16,21 +16,24 @@ from asp_env.errors import AspEnvError
 Infos = list[dict[str, Any]]
 Observations = dict[str, np.ndarray]
 
-_OF_EACH = ("np_random", "np_random_seed")
+_PER_ENVIRONMENT = ("np_random", "np_random_seed")
 _SINGLE = ("observation_space", "action_space")
 
 
 class ReplayVecEnv(VecEnv):
-    """A `VecEnv` that hands the arrays of a vector environment straight through.
+    """Adapts a `ReplayVectorEnv` to the `VecEnv` of stable-baselines3 without copying arrays.
 
-    What it returns is what `DummyVecEnv` of as many single environments returns, seed by seed.
+    It returns the same bits as `DummyVecEnv` over single environments with the same seeds.
     """
 
     def __init__(self, envs: VectorEnv) -> None:
-        """Takes over `asp_env/Replay-v0` as made by `gymnasium.make_vec`, possibly in wrappers.
+        """Wraps a vector environment.
+
+        Args:
+            envs: a `ReplayVectorEnv`; in wrappers it needs `autoreset_mode="Disabled"`.
 
         Raises:
-            AspEnvError: it was made with an autoreset mode other than `SameStep` and `Disabled`.
+            AspEnvError: the autoreset mode is neither `SameStep` nor `Disabled`.
         """
         self._mode = envs.metadata.get("autoreset_mode")
         if self._mode not in (AutoresetMode.SAME_STEP, AutoresetMode.DISABLED):
@@ -43,24 +46,24 @@ class ReplayVecEnv(VecEnv):
         super().__init__(envs.num_envs, envs.single_observation_space, envs.single_action_space)
 
     def reset(self) -> Observations:
-        """Starts all episodes with the seeds and options that were set, which are then used up."""
+        """Starts all episodes with the seeds and options that were set, and clears these."""
         names = {name for options in self._options for name in options}
         options = {name: [each.get(name) for each in self._options] for name in names}
         observations, infos = self.envs.reset(seed=self._seeds, options=options)  # pyright: ignore[reportArgumentType]
-        self.reset_infos = _by_member(infos, self.num_envs)
+        self.reset_infos = _unbatch_infos(infos, self.num_envs)
         self._reset_seeds()
         self._reset_options()
         return observations
 
     def step_async(self, actions: np.ndarray) -> None:
-        """Keeps the actions until `step_wait`."""
+        """Stores the actions for `step_wait`."""
         self._actions = actions
 
     def step_wait(self) -> VecEnvStepReturn:
-        """One tick; what is over begins anew and tells its `terminal_observation`."""
-        observations, rewards, terminated, truncated, told = self.envs.step(self._actions)
+        """Steps by one tick; finished episodes restart and report a `terminal_observation`."""
+        observations, rewards, terminated, truncated, batched = self.envs.step(self._actions)
         over = terminated | truncated
-        infos = _by_member(told, self.num_envs)
+        infos = _unbatch_infos(batched, self.num_envs)
         limits = (truncated & ~terminated).tolist()
         if over.any():
             observations = self._restart(observations, over, infos)
@@ -69,7 +72,7 @@ class ReplayVecEnv(VecEnv):
         return observations, rewards.astype(np.float32), over, infos
 
     def _restart(self, observations: Observations, over: np.ndarray, infos: Infos) -> Observations:
-        """Puts last observations and infos where they belong; returns what is seen next."""
+        """Moves last observations to the infos; returns the first ones of the next episodes."""
         rows = np.flatnonzero(over).tolist()
         if self._mode is AutoresetMode.SAME_STEP:
             for b in rows:
@@ -79,10 +82,10 @@ class ReplayVecEnv(VecEnv):
         for b in rows:
             last = {name: value[b].copy() for name, value in observations.items()}
             infos[b]["terminal_observation"] = last
-        observations, begun = self.envs.reset(options={"reset_mask": over})
-        each = _by_member(begun, self.num_envs)
+        observations, batched = self.envs.reset(options={"reset_mask": over})
+        reset_infos = _unbatch_infos(batched, self.num_envs)
         for b in rows:
-            self.reset_infos[b] = each[b]
+            self.reset_infos[b] = reset_infos[b]
         return observations
 
     def close(self) -> None:
@@ -90,7 +93,7 @@ class ReplayVecEnv(VecEnv):
         self.envs.close()
 
     def get_images(self) -> Sequence[np.ndarray | None]:
-        """A picture of each environment in mode `rgb_array`."""
+        """Returns a picture of each environment in mode `rgb_array`."""
         if self.render_mode != "rgb_array":
             warnings.warn(
                 f"render mode {self.render_mode}: make the environment with "
@@ -102,28 +105,30 @@ class ReplayVecEnv(VecEnv):
         return list(pictures)
 
     def get_attr(self, attr_name: str, indices: VecEnvIndices = None) -> list[Any]:
-        """An attribute of each environment; what is one for all is shared.
+        """Returns an attribute of each environment; all share one object for most attributes.
 
         Raises:
-            AttributeError: they have none of that name, or it is a method.
+            AttributeError: there is no such attribute, or it is a method.
         """
-        chosen = self._get_indices(indices)
-        if attr_name in _OF_EACH:
-            of_each = self._of_all(attr_name)
-            return [of_each[b] for b in chosen]
-        found = self._of_all(f"single_{attr_name}" if attr_name in _SINGLE else attr_name)
-        if callable(found):
-            raise AttributeError(f"{attr_name} is a method: call it by env_method")
-        return [found for _ in chosen]
+        rows = self._get_indices(indices)
+        if attr_name in _PER_ENVIRONMENT:
+            values = self._find_attribute(attr_name)
+            return [values[b] for b in rows]
+        value = self._find_attribute(f"single_{attr_name}" if attr_name in _SINGLE else attr_name)
+        if callable(value):
+            raise AttributeError(f"{attr_name} is a method: call it with env_method")
+        return [value for _ in rows]
 
     def set_attr(self, attr_name: str, value: Any, indices: VecEnvIndices = None) -> None:
-        """Sets an attribute of all environments, which share it.
+        """Sets an attribute that all environments share.
 
         Raises:
-            AspEnvError: only some environments are named.
+            AspEnvError: `indices` leaves environments out.
         """
         if len(list(self._get_indices(indices))) < self.num_envs:
-            raise AspEnvError(f"attribute {attr_name}: is one for all environments, not for some")
+            raise AspEnvError(
+                f"attribute {attr_name}: all environments share it; it cannot be set for some"
+            )
         setattr(self.envs.unwrapped, attr_name, value)
 
     def env_method(
@@ -133,45 +138,43 @@ class ReplayVecEnv(VecEnv):
         indices: VecEnvIndices = None,
         **method_kwargs: Any,
     ) -> list[Any]:
-        """What `scene` or `render` returns of each environment.
+        """Returns the scene or the picture of each environment.
 
         Raises:
-            AttributeError: one environment alone has no such method.
+            AttributeError: the method is neither `scene` nor `render`, or has arguments.
         """
         if method_name not in ("scene", "render") or method_args or method_kwargs:
-            raise AttributeError(
-                f"method {method_name}: one environment alone has scene() and render()"
-            )
-        chosen = list(self._get_indices(indices))
+            raise AttributeError(f"method {method_name}: expected scene() or render()")
+        rows = list(self._get_indices(indices))
         if method_name == "scene":
-            scene: Scene = self._of_all("scene")()
-            return [scene.situation(b) for b in chosen]
+            scene: Scene = self._find_attribute("scene")()
+            return [scene.situation(b) for b in rows]
         pictures: Any = self.envs.render()
-        return [None if pictures is None else pictures[b] for b in chosen]
+        return [None if pictures is None else pictures[b] for b in rows]
 
     def env_is_wrapped(
         self, wrapper_class: type[gymnasium.Wrapper], indices: VecEnvIndices = None
     ) -> list[bool]:
-        """Wrappers of single environments are around none."""
+        """Returns False for each environment: wrappers of single environments do not apply."""
         del wrapper_class
         return [False for _ in self._get_indices(indices)]
 
-    def _of_all(self, name: str) -> Any:
-        """An attribute of the vector environment or of what its wrappers wrap."""
+    def _find_attribute(self, name: str) -> Any:
+        """Returns an attribute of the outermost layer of wrappers that has it."""
         layer: Any = self.envs
         while not hasattr(layer, name) and layer is not layer.unwrapped:
             layer = layer.env
         return getattr(layer, name)
 
 
-def _by_member(infos: dict[str, Any], count: int) -> Infos:
-    """Infos of Gymnasium's vector environments as one dictionary of plain values for each."""
-    each: Infos = [{} for _ in range(count)]
+def _unbatch_infos(infos: dict[str, Any], count: int) -> Infos:
+    """Converts infos of Gymnasium's vector environments to a dictionary for each environment."""
+    unbatched: Infos = [{} for _ in range(count)]
     for name, mask in infos.items():
         if not name.startswith("_"):
             continue
         values = infos[name[1:]]
-        plain = _by_member(values, count) if isinstance(values, dict) else values.tolist()
+        plain = _unbatch_infos(values, count) if isinstance(values, dict) else values.tolist()
         for b in np.flatnonzero(mask).tolist():
-            each[b][name[1:]] = plain[b]
-    return each
+            unbatched[b][name[1:]] = plain[b]
+    return unbatched

@@ -1,4 +1,4 @@
-"""Many episodes of `asp_env/Replay-v0` side by side, on arrays all the way."""
+"""Many episodes of `asp_env/Replay-v0` side by side, batched in arrays."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -11,14 +11,17 @@ from gymnasium.vector import AutoresetMode, VectorEnv
 from gymnasium.vector.utils import batch_space
 from jaxtyping import Bool, Shaped
 
-from asp_env.data.scenarios.scenario import ScenarioSet
+from asp_env.data.recording import DEFAULT_DT_S
+from asp_env.data.scenarios.scenario import ScenarioFilter, ScenarioSet
 from asp_env.data.scene import Scene
 from asp_env.data.snippets import Future
 from asp_env.data.source import Recordings
-from asp_env.envs.episodes import Buffers, ReplayEpisodes, StepResult, as_actions
+from asp_env.envs.episodes import ObservationBuffers, ReplayEpisodes, StepResult, valid_actions
+from asp_env.envs.options import ReplayOptions, suggest_options
 from asp_env.errors import AspEnvError
 from asp_env.render.frames import draw_frame
 from asp_env.sim.observation import Observation
+from asp_env.sim.traffic.assignment import TrafficSpec
 from asp_env.sim.world import recorded_future
 
 Infos = dict[str, Any]
@@ -26,7 +29,7 @@ Infos = dict[str, Any]
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class VectorSnapshot:
-    """The whole state of a vector environment: picklable, without recordings and pictures."""
+    """The whole state of a vector environment; a pickle holds no recordings and no pictures."""
 
     episodes: Any
     generators: tuple[Mapping[str, Any], ...]
@@ -36,15 +39,50 @@ class VectorSnapshot:
 
 
 class ReplayVectorEnv(VectorEnv[Observation, Any, np.ndarray]):
-    """What `SyncVectorEnv` of as many `ReplayEnv`s does, bit for bit, in one world of arrays.
+    """`asp_env/Replay-v0` as a vector environment: one world of arrays for all episodes.
 
-    Made by `gymnasium.make_vec("asp_env/Replay-v0", num_envs=64,
-    vectorization_mode="vector_entry_point", …)` with the arguments of `ReplayEnv` and
-    `autoreset_mode`: `NextStep`, `SameStep` or `Disabled`.
+    ## Description
+    The environment returns the same bits as Gymnasium's `SyncVectorEnv` over `num_envs` single
+    `ReplayEnv`s, in every autoreset mode. Its id is that of the single environment:
 
-    Returned arrays are the caller's: they are written again only when nobody holds them.
+    ```python
+    import gymnasium, asp_env
+
+    envs = gymnasium.make_vec(
+        "asp_env/Replay-v0", num_envs=64, vectorization_mode="vector_entry_point"
+    )
+    ```
+
+    Returned arrays are never overwritten while they, views of them or tensors on them are
+    referenced.
+
+    ## Action Space
+    `Box(-1, 1, (num_envs, 2), float32)`: the action of `ReplayEnv` for each environment.
+
+    ## Observation Space
+    The `Dict` of `ReplayEnv` with `num_envs` as the first axis of each shape.
+
+    ## Rewards
+    Those of `ReplayEnv`, (num_envs,).
+
+    ## Starting State
+    As in `ReplayEnv`. Environment i of `reset(seed=s)` has the seed s + i. Options are the same for
+    all environments, or lists with a value for each.
+
+    ## Episode End
+    As in `ReplayEnv`. `autoreset_mode` decides what happens next, as in Gymnasium: `NextStep`
+    resets in the next step, `SameStep` at once, with `final_obs` and `final_info` in the infos, and
+    `Disabled` waits for `reset(options={"reset_mask": mask})` with a mask (num_envs,) bool.
+
+    ## Arguments
+    `num_envs`, the arguments of `ReplayEnv` (as `render_mode` only `rgb_array`), and
+    `autoreset_mode`, by default `NextStep`.
+
+    ## Version History
+    - v0: initial version
     """
 
+    @suggest_options
     def __init__(
         self,
         num_envs: int,
@@ -52,19 +90,34 @@ class ReplayVectorEnv(VectorEnv[Observation, Any, np.ndarray]):
         *,
         autoreset_mode: AutoresetMode | str = AutoresetMode.NEXT_STEP,
         render_mode: str | None = None,
-        **options: Any,
+        observations: Sequence[str] = ("raster", "actions", "state"),
+        view: str = "chauffeurnet",
+        raster_px: tuple[int, int] | None = None,
+        traffic: TrafficSpec | None = None,
+        dt_s: float = DEFAULT_DT_S,
+        reward_weights: Mapping[str, float] | None = None,
+        scenarios: ScenarioSet | ScenarioFilter | str = "",
     ) -> None:
-        """See the class documentation for the arguments.
+        """Makes the environment; the arguments are those of the class documentation.
 
         Raises:
-            AspEnvError: an argument is not understood, or the data hold no scenario.
+            AspEnvError: an argument is invalid, or the data hold no scenario.
         """
         if num_envs < 1:
             raise AspEnvError(f"num_envs {num_envs}: expected at least 1")
         if render_mode not in (None, "rgb_array"):
             raise AspEnvError(f"render mode {render_mode!r}: expected rgb_array or None")
+        options = ReplayOptions(
+            observations=observations,
+            view=view,
+            raster_px=raster_px,
+            traffic=traffic,
+            dt_s=dt_s,
+            reward_weights=reward_weights,
+            scenarios=scenarios,
+        )
         self.num_envs = num_envs
-        self._mode = _autoreset_mode(autoreset_mode)
+        self._mode = _parse_autoreset_mode(autoreset_mode)
         self.metadata = {**self.metadata, "autoreset_mode": self._mode}
         self.render_mode = render_mode
         self._episodes = ReplayEpisodes(data, options, num_envs)
@@ -72,7 +125,7 @@ class ReplayVectorEnv(VectorEnv[Observation, Any, np.ndarray]):
         self.single_action_space = self._episodes.action_space
         self.observation_space = batch_space(self.single_observation_space, num_envs)
         self.action_space = batch_space(self.single_action_space, num_envs)
-        self._buffers = Buffers(self._episodes.observer, num_envs)
+        self._buffers = ObservationBuffers(self._episodes.observer, num_envs)
         self._generators: list[np.random.Generator | None] = [None] * num_envs
         self._seeds: list[int | None] = [None] * num_envs
         self._begun = np.zeros(num_envs, dtype=bool)
@@ -87,26 +140,25 @@ class ReplayVectorEnv(VectorEnv[Observation, Any, np.ndarray]):
         """Starts all episodes, or those of `options["reset_mask"]`.
 
         Args:
-            seed: of the first environment, the next has the next one; or one for each.
-            options: `reset_mask` (num_envs,) bool; the others are those of `ReplayEnv.reset`, for
+            seed: the seed of the first environment, which the following ones count up from; or one
+                seed for each.
+            options: `reset_mask`, (num_envs,) bool; the others are those of `ReplayEnv.reset`, for
                 all environments or in a list for each.
 
         Raises:
-            AspEnvError: a seed, mask or option does not fit.
-            gymnasium.error.ResetNeeded: the mask leaves out an episode that has never begun.
+            AspEnvError: a seed, the mask or an option is invalid.
+            gymnasium.error.ResetNeeded: the mask leaves out an episode that has not begun.
         """
-        given = dict(options or {})
-        where = self._mask(given.pop("reset_mask", None))
-        for b, each in enumerate(self._seeds_of(seed)):
-            if where[b] and each is not None:
-                self._generators[b], self._seeds[b] = seeding.np_random(each)
-        self._begin(where, [_of_env(given, b, self.num_envs) for b in range(self.num_envs)])
-        return self._observe(), _masked(self._episodes.info(), where)
+        options = dict(options or {})
+        reset_mask = self._parse_mask(options.pop("reset_mask", None))
+        for b, env_seed in enumerate(self._seeds_of(seed)):
+            if reset_mask[b] and env_seed is not None:
+                self._generators[b], self._seeds[b] = seeding.np_random(env_seed)
+        self._begin(reset_mask, [_options_of(options, b, self.num_envs) for b in self._rows])
+        return self._observe(), _mask_infos(self._episodes.info(), reset_mask)
 
     def step(self, actions: Any) -> tuple[Observation, np.ndarray, np.ndarray, np.ndarray, Infos]:
-        """One tick of all episodes; actions are moved to the nearest ones in the space.
-
-        What happens to an episode that is over depends on the autoreset mode, as in Gymnasium.
+        """Steps all episodes by one tick with actions (num_envs, 2), which are clipped to [-1, 1].
 
         Raises:
             gymnasium.error.ResetNeeded: an episode has not begun, or is over and not reset.
@@ -120,69 +172,65 @@ class ReplayVectorEnv(VectorEnv[Observation, Any, np.ndarray]):
             raise gymnasium.error.ResetNeeded(
                 f"the episodes {over} are over: reset them with options={{'reset_mask': mask}}"
             )
-        given = as_actions(actions, (self.num_envs, 2), restart)
-        outcome = self._episodes.step(given)
+        result = self._episodes.step(valid_actions(actions, (self.num_envs, 2), restart))
         if self._mode is AutoresetMode.SAME_STEP:
-            return self._finish_same_step(outcome)
+            return self._finish_same_step(result)
         if restart.any():
             self._begin(restart, [{}] * self.num_envs)
         stepped = ~restart
-        infos = _masked(self._episodes.info(), np.ones_like(restart))
-        infos |= _masked(_told(outcome), stepped)
-        terminated, truncated = outcome.terminated & stepped, outcome.truncated & stepped
+        infos = _mask_infos(self._episodes.info(), np.ones_like(restart))
+        infos |= _mask_infos(_step_infos(result), stepped)
+        terminated, truncated = result.terminated & stepped, result.truncated & stepped
         self._over = terminated | truncated
-        reward = np.where(stepped, outcome.reward, 0.0)
+        reward = np.where(stepped, result.reward, 0.0)
         return self._observe(), reward, terminated, truncated, infos
 
     def _finish_same_step(
-        self, outcome: StepResult
+        self, result: StepResult
     ) -> tuple[Observation, np.ndarray, np.ndarray, np.ndarray, Infos]:
-        """Resets what is over at once; what it ended with goes into the infos."""
-        over = outcome.terminated | outcome.truncated
-        observation, infos = self._observe(), self._episodes.info()
+        """Resets the finished episodes and moves their last observations to the infos."""
+        over = result.terminated | result.truncated
+        observation, ended = self._observe(), self._episodes.info() | _step_infos(result)
         if not over.any():
-            everyone = ~over
-            told = _masked(infos, everyone) | _masked(_told(outcome), everyone)
-            return observation, outcome.reward, outcome.terminated, outcome.truncated, told
+            infos = _mask_infos(ended, ~over)
+            return observation, result.reward, result.terminated, result.truncated, infos
         rows = np.flatnonzero(over)
         last = np.full(self.num_envs, None, dtype=object)
         for b in rows.tolist():
             last[b] = {name: value[b].copy() for name, value in observation.items()}
-        final = {"final_obs": last, "final_info": infos | _told(outcome)}
         self._begin(over, [{}] * self.num_envs)
         for name, value in self._episodes.observe(rows).items():
             observation[name][rows] = value
-        told = _masked(final, over)
-        told |= _masked(self._episodes.info(), np.ones_like(over))
-        told |= _masked(_told(outcome), ~over)
+        infos = _mask_infos({"final_obs": last, "final_info": ended}, over)
+        infos |= _mask_infos(self._episodes.info(), np.ones_like(over))
+        infos |= _mask_infos(_step_infos(result), ~over)
         self._over = np.zeros_like(over)
-        return observation, outcome.reward, outcome.terminated, outcome.truncated, told
+        return observation, result.reward, result.terminated, result.truncated, infos
 
     def scene(self) -> Scene:
-        """All that may be known now; situation i is environment i, its ego slot 0.
+        """Returns everything that may be known now; situation i is environment i, its ego slot 0.
 
         Raises:
             gymnasium.error.ResetNeeded: an episode has not begun.
         """
-        self._need_begun()
+        self._check_begun()
         return self._episodes.simulation.world.scene()
 
     def recorded_future(self, scene: Scene, horizon: int) -> Future:
-        """What the targets of a scene of now went on to do, for privileged predictors alone.
+        """Returns the recorded future of a scene's targets, for privileged predictors.
+
+        Args:
+            scene: the present scene, possibly with other targets.
+            horizon: number of ticks.
 
         Raises:
-            gymnasium.error.ResetNeeded: no episode has begun.
+            gymnasium.error.ResetNeeded: an episode has not begun.
         """
-        self._need_begun()
+        self._check_begun()
         return recorded_future(self._episodes.simulation.world, scene, horizon)
 
-    @property
-    def dt_s(self) -> float:
-        """Length of a tick."""
-        return self._episodes.simulation.world.dt_s
-
     def render(self) -> tuple[Any, ...] | None:
-        """What `ReplayEnv.render` returns, of each environment; None without a render mode.
+        """Returns the picture of each environment, see `ReplayEnv.render`; None without a mode.
 
         Raises:
             gymnasium.error.ResetNeeded: an episode has not begun.
@@ -192,16 +240,16 @@ class ReplayVectorEnv(VectorEnv[Observation, Any, np.ndarray]):
         scene, recording = self.scene(), self._episodes.simulation.world.episodes.recording
         return tuple(
             draw_frame(scene, situation=b, background=self.recordings[int(recording[b])].background)
-            for b in range(self.num_envs)
+            for b in self._rows
         )
 
     def snapshot(self) -> VectorSnapshot:
-        """The whole state with those of `np_random`, to be handed to `restore`.
+        """Returns the whole state, including those of `np_random`, for `restore`.
 
         Raises:
             gymnasium.error.ResetNeeded: an episode has not begun.
         """
-        self._need_begun()
+        self._check_begun()
         return VectorSnapshot(
             episodes=self._episodes.snapshot(),
             generators=tuple(each.bit_generator.state for each in self.np_random),
@@ -210,7 +258,7 @@ class ReplayVectorEnv(VectorEnv[Observation, Any, np.ndarray]):
         )
 
     def restore(self, snapshot: VectorSnapshot) -> None:
-        """Goes back to a snapshot of this environment or of one made with the same arguments."""
+        """Restores a snapshot of this environment or of one made with the same arguments."""
         self._episodes.restore(snapshot.episodes)
         for generator, state in zip(self.np_random, snapshot.generators, strict=True):
             generator.bit_generator.state = state
@@ -219,26 +267,35 @@ class ReplayVectorEnv(VectorEnv[Observation, Any, np.ndarray]):
         self._over = snapshot.over.copy()
 
     @property
+    def dt_s(self) -> float:
+        """Length of a tick in seconds."""
+        return self._episodes.simulation.world.dt_s
+
+    @property
     def recordings(self) -> Recordings:
-        """Of DATA."""
+        """The recordings of `data`."""
         return self._episodes.recordings
 
     @property
     def scenarios(self) -> ScenarioSet:
-        """Those that are drawn from."""
+        """The scenarios to draw from."""
         return self._episodes.scenarios
 
     @property
     def np_random(self) -> tuple[np.random.Generator, ...]:  # pyright: ignore[reportIncompatibleMethodOverride]
-        """The generator of each environment, as of `SyncVectorEnv`."""
-        return tuple(self._generator(b) for b in range(self.num_envs))
+        """The generator of each environment, as in `SyncVectorEnv`."""
+        return tuple(self._generator(b) for b in self._rows)
 
     @property
     def np_random_seed(self) -> tuple[int | None, ...]:  # pyright: ignore[reportIncompatibleMethodOverride]
-        """The seed of each environment's generator, as of `SyncVectorEnv`."""
-        for b in range(self.num_envs):
+        """The seed of each environment's generator, as in `SyncVectorEnv`."""
+        for b in self._rows:
             self._generator(b)
         return tuple(self._seeds)
+
+    @property
+    def _rows(self) -> range:
+        return range(self.num_envs)
 
     def _generator(self, b: int) -> np.random.Generator:
         generator = self._generators[b]
@@ -247,19 +304,19 @@ class ReplayVectorEnv(VectorEnv[Observation, Any, np.ndarray]):
             self._generators[b] = generator
         return generator
 
-    def _begin(self, where: Bool[np.ndarray, " n"], options: Sequence[dict[str, Any]]) -> None:
+    def _begin(self, reset_mask: Bool[np.ndarray, " n"], options: Sequence[dict[str, Any]]) -> None:
         world = self._episodes.simulation.world
         scenarios, rngs = [self.scenarios[0]] * self.num_envs, list(world.rngs)
-        for b in np.flatnonzero(where).tolist():
+        for b in np.flatnonzero(reset_mask).tolist():
             scenarios[b], rngs[b] = self._episodes.draw(self._generator(b), options[b])
-        self._episodes.begin(scenarios, rngs, where)
-        self._begun |= where
-        self._over &= ~where
+        self._episodes.begin(scenarios, rngs, reset_mask)
+        self._begun |= reset_mask
+        self._over &= ~reset_mask
 
     def _observe(self) -> Observation:
         return self._episodes.observe(out=self._buffers.take())
 
-    def _need_begun(self) -> None:
+    def _check_begun(self) -> None:
         if not self._begun.all():
             raise gymnasium.error.ResetNeeded("call reset first")
 
@@ -267,34 +324,34 @@ class ReplayVectorEnv(VectorEnv[Observation, Any, np.ndarray]):
         if seed is None:
             return [None] * self.num_envs
         if isinstance(seed, int | np.integer):
-            return [int(seed) + b for b in range(self.num_envs)]
+            return [int(seed) + b for b in self._rows]
         if len(seed) != self.num_envs:
             raise AspEnvError(f"{len(seed)} seeds: expected {self.num_envs}, one per environment")
         return list(seed)
 
-    def _mask(self, given: Any) -> Bool[np.ndarray, " n"]:
-        if given is None:
+    def _parse_mask(self, mask: Any) -> Bool[np.ndarray, " n"]:
+        if mask is None:
             return np.ones(self.num_envs, dtype=bool)
-        fits = isinstance(given, np.ndarray) and given.dtype == np.bool_
-        if not (fits and given.shape == (self.num_envs,) and given.any()):
+        is_mask = isinstance(mask, np.ndarray) and mask.dtype == np.bool_
+        if not (is_mask and mask.shape == (self.num_envs,) and mask.any()):
             raise AspEnvError(
-                f"reset_mask {given!r}: expected a bool array ({self.num_envs},) with a true entry"
+                f"reset_mask {mask!r}: expected a bool array ({self.num_envs},) with a true entry"
             )
-        if not (self._begun | given).all():
+        if not (self._begun | mask).all():
             raise gymnasium.error.ResetNeeded("reset all environments before some of them")
-        return given.copy()
+        return mask.copy()
 
 
-def _autoreset_mode(given: AutoresetMode | str) -> AutoresetMode:
+def _parse_autoreset_mode(mode: AutoresetMode | str) -> AutoresetMode:
     try:
-        return AutoresetMode(given)
+        return AutoresetMode(mode)
     except ValueError:
-        names = ", ".join(mode.value for mode in AutoresetMode)
-        raise AspEnvError(f"autoreset_mode {given!r}: expected one of {names}") from None
+        names = ", ".join(each.value for each in AutoresetMode)
+        raise AspEnvError(f"autoreset_mode {mode!r}: expected one of {names}") from None
 
 
-def _of_env(options: dict[str, Any], b: int, num_envs: int) -> dict[str, Any]:
-    """The options of one environment; lists hold one value for each."""
+def _options_of(options: dict[str, Any], b: int, num_envs: int) -> dict[str, Any]:
+    """Returns the reset options of environment `b`; a list holds one value for each."""
     chosen: dict[str, Any] = {}
     for name, value in options.items():
         if not isinstance(value, list | tuple | np.ndarray):
@@ -308,27 +365,28 @@ def _of_env(options: dict[str, Any], b: int, num_envs: int) -> dict[str, Any]:
     return chosen
 
 
-def _told(outcome: StepResult) -> Infos:
-    return {"reward_terms": dict(outcome.terms), "ending": outcome.ending}
+def _step_infos(result: StepResult) -> Infos:
+    return {"reward_terms": dict(result.terms), "ending": result.ending}
 
 
-def _masked(infos: Infos, where: Bool[np.ndarray, " n"]) -> Infos:
-    """Infos as Gymnasium's vector environments give them: each with a mask `_key`.
+def _mask_infos(infos: Infos, mask: Bool[np.ndarray, " n"]) -> Infos:
+    """Adds the mask of each key as `_key`, as Gymnasium's vector environments do.
 
-    Where the mask is false there are zeros, or None among objects; what nobody has is left out.
+    Values outside the mask are zeros, or None for objects. An empty mask gives no infos.
     """
-    if not where.any():
+    if not mask.any():
         return {}
-    out: Infos = {}
+    masked: Infos = {}
     for name, value in infos.items():
-        out[name] = _masked(value, where) if isinstance(value, dict) else _only(value, where)
-        out[f"_{name}"] = where.copy()
-    return out
+        is_group = isinstance(value, dict)
+        masked[name] = _mask_infos(value, mask) if is_group else _mask_values(value, mask)
+        masked[f"_{name}"] = mask.copy()
+    return masked
 
 
-def _only(value: Shaped[np.ndarray, " n"], where: Bool[np.ndarray, " n"]) -> np.ndarray:
-    if where.all():
-        return value
-    out = np.full(len(value), None if value.dtype == object else 0, dtype=value.dtype)
-    out[where] = value[where]
+def _mask_values(values: Shaped[np.ndarray, " n"], mask: Bool[np.ndarray, " n"]) -> np.ndarray:
+    if mask.all():
+        return values
+    out = np.full(len(values), None if values.dtype == object else 0, dtype=values.dtype)
+    out[mask] = values[mask]
     return out

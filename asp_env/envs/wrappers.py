@@ -1,7 +1,4 @@
-"""Observations as stable-baselines3 likes them.
-
-MERGED: Forecasts of the agents nearby as parts of the observation.
-"""
+"""Observation wrappers: forecasts as part of the observation, and flat tables."""
 
 from collections.abc import Sequence
 from typing import Any, Protocol, runtime_checkable
@@ -21,29 +18,43 @@ from asp_env.data.snippets import Future
 from asp_env.errors import AspEnvError
 from asp_env.geometry import to_frame
 
+MAX_POSITION_M = 100.0
+"""Forecast positions are clipped to this distance along each axis of the ego's frame. Chosen by
+hand."""
+
+FORECAST_TIMES_S = (1.0, 2.0, 3.0)
+"""Default times ahead of the forecast positions."""
+
+FORECAST_KEYS = ("forecast", "forecast_probabilities", "forecast_valid")
+"""Keys that `PredictionFeatures` adds to the observation."""
+
 
 class FlatParts(gymnasium.ObservationWrapper[dict[str, Any], Any, dict[str, Any]]):
-    """Makes a vector of every table among the parts of a Dict; images and vectors stay.
+    """Flattens the tables of a Dict observation to vectors; images and vectors stay unchanged.
 
-    stable-baselines3's `check_env` warns of tables such as the action history, (15, 2); behind this
-    wrapper it is a vector, (30,), time by time. Agents, lines, their masks and the route likewise.
+    stable-baselines3's `check_env` warns of tables such as the action history, (15, 2), which
+    becomes (30,), tick by tick. Agents, lines, their masks and the route are flattened as well.
     """
 
     def __init__(self, env: gymnasium.Env[dict[str, Any], Any]) -> None:
-        """Wraps an environment whose observations are a Dict of boxes."""
+        """Wraps an environment.
+
+        Args:
+            env: an environment whose observation space is a Dict of boxes.
+        """
         super().__init__(env)
-        parts = env.observation_space
-        assert isinstance(parts, spaces.Dict)
-        self.observation_space = spaces.Dict({name: _flat(box) for name, box in parts.items()})
+        space = env.observation_space
+        assert isinstance(space, spaces.Dict)
+        self.observation_space = spaces.Dict({name: _flatten(box) for name, box in space.items()})
 
     def observation(self, observation: dict[str, Any]) -> dict[str, Any]:
-        """The same numbers in the shapes of this wrapper's space."""
-        parts = self.observation_space
-        assert isinstance(parts, spaces.Dict)
-        return {name: value.reshape(parts[name].shape) for name, value in observation.items()}
+        """Returns the observation in the shapes of this wrapper's space."""
+        space = self.observation_space
+        assert isinstance(space, spaces.Dict)
+        return {name: value.reshape(space[name].shape) for name, value in observation.items()}
 
 
-def _flat(box: spaces.Space[Any]) -> spaces.Space[Any]:
+def _flatten(box: spaces.Space[Any]) -> spaces.Space[Any]:
     if not isinstance(box, spaces.Box) or len(box.shape) < 2:
         return box
     if len(box.shape) == 3 and box.dtype == np.uint8:
@@ -51,31 +62,130 @@ def _flat(box: spaces.Space[Any]) -> spaces.Space[Any]:
     return spaces.Box(np.ravel(box.low), np.ravel(box.high), dtype=box.low.dtype.type)
 
 
-MAX_AWAY_M = 100.0
-"""Forecast positions further ahead, behind or aside than this are shown as this."""
+class PredictionFeatures(
+    gymnasium.ObservationWrapper[dict[str, Any], Any, dict[str, Any]], RecordConstructorArgs
+):
+    """Adds a predictor's forecasts of the nearest agents to the observation.
 
-AT_S = (1.0, 2.0, 3.0)
+    | key | space | content |
+    |---|---|---|
+    | `forecast` | `Box(±100, (agents · modes · times · 2,))` | positions in m, x ahead and y to \
+the left in the present frame of the ego |
+    | `forecast_probabilities` | `Box(0, 1, (agents · modes,))` | probabilities of the modes, in \
+descending order |
+    | `forecast_valid` | `Box(0, 1, (agents,))` | 1 where there is an agent |
 
-PARTS = ("forecast", "forecast_probabilities", "forecast_valid")
+    All entries are flat float32 arrays. The nearest agent comes first; entries without an agent or
+    a mode are zero. Agents without a forecast get constant velocity, as for planners. For a
+    privileged predictor the keys start with `oracle_`. The predictor is called once in every
+    `reset` and `step`.
+    """
+
+    def __init__(
+        self,
+        env: gymnasium.Env[dict[str, Any], Any],
+        predictor: str | Predictor,
+        *,
+        agents: int = 8,
+        modes: int = 3,
+        at_s: Sequence[float] = FORECAST_TIMES_S,
+        privileged: bool = False,
+    ) -> None:
+        """Wraps an environment.
+
+        Args:
+            env: an environment of this package, possibly in wrappers, with a Dict observation.
+            predictor: a predictor or its name, such as `constant-velocity` or `ssp-asp:RUN_DIR`.
+            agents: number of nearest agents.
+            modes: number of most probable modes.
+            at_s: times ahead of the positions in seconds, whole ticks.
+            privileged: allows a predictor that uses the recorded future.
+
+        Raises:
+            AspEnvError: the environment, the predictor or an argument is invalid.
+        """
+        RecordConstructorArgs.__init__(
+            self, predictor=predictor, agents=agents, modes=modes, at_s=at_s, privileged=privileged
+        )
+        super().__init__(env)
+        self._forecasts = ForecastObservations(
+            predictor,
+            agents=agents,
+            modes=modes,
+            at_s=at_s,
+            dt_s=_scene_provider(env.unwrapped).dt_s,
+            privileged=privileged,
+        )
+        self.observation_space = _extend(env.observation_space, self._forecasts.spaces)
+
+    def observation(self, observation: dict[str, Any]) -> dict[str, Any]:
+        """Returns the observation with the present forecasts."""
+        forecasts = self._forecasts.observe(_scene_provider(self.env.unwrapped))
+        return observation | {name: value[0] for name, value in forecasts.items()}
+
+
+class VectorPredictionFeatures(VectorObservationWrapper):
+    """`PredictionFeatures` for a vector environment, with one predictor call for all episodes."""
+
+    def __init__(
+        self,
+        env: VectorEnv,
+        predictor: str | Predictor,
+        *,
+        agents: int = 8,
+        modes: int = 3,
+        at_s: Sequence[float] = FORECAST_TIMES_S,
+        privileged: bool = False,
+    ) -> None:
+        """Wraps a `ReplayVectorEnv`, possibly in wrappers.
+
+        Args:
+            env: the vector environment.
+            predictor: see `PredictionFeatures`, as for the following arguments.
+            agents: number of nearest agents.
+            modes: number of most probable modes.
+            at_s: times ahead of the positions in seconds, whole ticks.
+            privileged: allows a predictor that uses the recorded future.
+
+        Raises:
+            AspEnvError: the environment, the predictor or an argument is invalid.
+        """
+        super().__init__(env)
+        self._forecasts = ForecastObservations(
+            predictor,
+            agents=agents,
+            modes=modes,
+            at_s=at_s,
+            dt_s=_scene_provider(env.unwrapped).dt_s,
+            privileged=privileged,
+        )
+        self.single_observation_space = _extend(
+            env.single_observation_space, self._forecasts.spaces
+        )
+        self.observation_space = batch_space(self.single_observation_space, env.num_envs)
+
+    def observations(self, observations: dict[str, Any]) -> dict[str, Any]:
+        """Returns the observations with the present forecasts."""
+        return observations | self._forecasts.observe(_scene_provider(self.env.unwrapped))
 
 
 @runtime_checkable
 class SceneProvider(Protocol):
-    """What an environment offers to those who forecast in its loop."""
+    """An environment whose agents can be forecast."""
 
     dt_s: float
 
     def scene(self) -> Scene:
-        """All that may be known now."""
+        """Returns everything that may be known now."""
         ...
 
     def recorded_future(self, scene: Scene, horizon: int) -> Future:
-        """What the scene's targets went on to do, for privileged predictors."""
+        """Returns the recorded future of the scene's targets, for privileged predictors."""
         ...
 
 
 class ForecastObservations:
-    """Turns scenes into the parts of an observation that show a predictor's forecasts."""
+    """Converts scenes to the observation entries that show a predictor's forecasts."""
 
     def __init__(
         self,
@@ -87,34 +197,42 @@ class ForecastObservations:
         dt_s: float,
         privileged: bool,
     ) -> None:
-        """See `PredictionFeatures` for the arguments; `dt_s` is the environment's.
+        """Loads the predictor and defines the spaces.
+
+        Args:
+            predictor: see `PredictionFeatures`, as for the following arguments.
+            agents: number of nearest agents.
+            modes: number of most probable modes.
+            at_s: times ahead of the positions in seconds, whole ticks.
+            dt_s: length of a tick of the environment in seconds.
+            privileged: allows a predictor that uses the recorded future.
 
         Raises:
-            AspEnvError: an argument is out of range, or the predictor does not fit.
+            AspEnvError: an argument is out of range, or the predictor is invalid.
         """
-        for what, count in (("agents", agents), ("modes", modes), ("at_s: times", len(at_s))):
+        for name, count in (("agents", agents), ("modes", modes), ("at_s: times", len(at_s))):
             if count < 1:
-                raise AspEnvError(f"{what} {count}: expected at least 1")
-        at = np.array([ticks(time_s, dt_s) for time_s in at_s])
-        horizon = int(at.max())
+                raise AspEnvError(f"{name} {count}: expected at least 1")
+        ticks_ahead = np.array([ticks(time_s, dt_s) for time_s in at_s])
+        horizon = int(ticks_ahead.max())
         if isinstance(predictor, str):
             predictor = load_predictor(predictor, horizon=horizon, dt_s=dt_s)
-        _check(predictor, horizon, dt_s, privileged)
+        _check_predictor(predictor, horizon, dt_s, privileged)
         self.predictor = predictor
-        self._shape = agents, modes, len(at)
-        self._at = at - 1
+        self._shape = agents, modes, len(ticks_ahead)
+        self._steps = ticks_ahead - 1
         prefix = "oracle_" if predictor.privileged else ""
-        self._names = tuple(prefix + name for name in PARTS)
-        sizes = (agents * modes * len(at) * 2, agents * modes, agents)
-        lows = (-MAX_AWAY_M, 0.0, 0.0)
-        highs = (MAX_AWAY_M, 1.0, 1.0)
+        self._keys = tuple(prefix + key for key in FORECAST_KEYS)
+        sizes = (agents * modes * len(ticks_ahead) * 2, agents * modes, agents)
+        lows = (-MAX_POSITION_M, 0.0, 0.0)
+        highs = (MAX_POSITION_M, 1.0, 1.0)
         self.spaces: dict[str, spaces.Space[Any]] = {
-            name: spaces.Box(low, high, (size,), dtype=np.float32)
-            for name, low, high, size in zip(self._names, lows, highs, sizes, strict=True)
+            key: spaces.Box(low, high, (size,), dtype=np.float32)
+            for key, low, high, size in zip(self._keys, lows, highs, sizes, strict=True)
         }
 
     def observe(self, env: SceneProvider) -> dict[str, np.ndarray]:
-        """One array (B, …) per part; one call of the predictor for all situations."""
+        """Returns an array (B, size) for each key, with one call of the predictor."""
         scene = env.scene()
         agents, modes, _ = self._shape
         targets, rank = nearest_agents(scene, agents)
@@ -122,144 +240,59 @@ class ForecastObservations:
         count = len(scene.tick)
         positions = np.zeros((count, *self._shape, 2), dtype=np.float32)
         probabilities = np.zeros((count, agents, modes), dtype=np.float32)
-        there = np.zeros((count, agents), dtype=np.float32)
+        valid = np.zeros((count, agents), dtype=np.float32)
         if len(targets):
             predictor = self.predictor
             future = env.recorded_future(scene, predictor.horizon) if predictor.privileged else None
             forecast = fill_missing(predictor.predict(scene, future), scene)
-            # a stable order, so that equally probable modes stay as the predictor has them
+            # A stable sort keeps the predictor's order of equally probable modes.
             order = np.argsort(-forecast.log_probs, axis=1, kind="stable")[:, :modes]
             rows, situation = np.arange(len(targets))[:, None], targets[:, 0]
-            points = forecast.states[rows, order][:, :, self._at, :2]
+            points = forecast.states[rows, order][:, :, self._steps, :2]
             egos = scene.states[situation, EGO, -1][:, None, None]
-            shown = order.shape[1]
-            positions[situation, rank, :shown] = to_frame(points, egos)
-            probabilities[situation, rank, :shown] = forecast.probabilities[rows, order]
-            there[situation, rank] = 1.0
-        parts = np.clip(positions, -MAX_AWAY_M, MAX_AWAY_M), np.clip(probabilities, 0, 1), there
+            num_modes = order.shape[1]
+            positions[situation, rank, :num_modes] = to_frame(points, egos)
+            probabilities[situation, rank, :num_modes] = forecast.probabilities[rows, order]
+            valid[situation, rank] = 1.0
+        values = (
+            np.clip(positions, -MAX_POSITION_M, MAX_POSITION_M),
+            np.clip(probabilities, 0, 1),
+            valid,
+        )
         return {
-            name: part.reshape(count, -1) for name, part in zip(self._names, parts, strict=True)
+            key: value.reshape(count, -1) for key, value in zip(self._keys, values, strict=True)
         }
 
 
 def nearest_agents(
     scene: Scene, count: int
 ) -> tuple[Int[np.ndarray, "t 2"], Int[np.ndarray, " t"]]:
-    """Targets: the agents nearest to each ego; and the how-manieth nearest each of them is."""
-    others = scene.valid[:, :, -1].copy()
-    others[:, EGO] = False
-    offset_m = scene.states[:, :, -1, :2] - scene.states[:, EGO, None, -1, :2]
-    away_m = np.where(others, np.hypot(offset_m[..., 0], offset_m[..., 1]), np.inf)
-    # of those equally far the id decides: a slot must mean nothing
-    nearest = np.lexsort((scene.ids, away_m), axis=-1)[:, :count]
-    there = np.isfinite(np.take_along_axis(away_m, nearest, axis=1))
-    situation, rank = np.nonzero(there)
-    return np.stack([situation, nearest[there]], axis=-1), rank
+    """Finds the agents nearest to the ego of each situation.
 
+    Args:
+        scene: B situations.
+        count: the largest number of agents per situation.
 
-class PredictionFeatures(
-    gymnasium.ObservationWrapper[dict[str, Any], Any, dict[str, Any]], RecordConstructorArgs
-):
-    """Adds a predictor's forecasts of the nearest agents to the observation.
-
-    | part | space | what it is |
-    |---|---|---|
-    | `forecast` | `Box(±100, (agents · modes · times · 2,))` | positions, x ahead and y left in \
-the ego's present frame, m |
-    | `forecast_probabilities` | `Box(0, 1, (agents · modes,))` | of the modes, which are sorted \
-by it, the most probable first |
-    | `forecast_valid` | `Box(0, 1, (agents,))` | 1 where there is such an agent |
-
-    All are flat, float32, the nearest agent first, and zero where there is no such agent or mode.
-    As planners do, the parts have constant velocity for agents that the predictor leaves out. The
-    parts of a predictor that is told the future have `oracle_` before their names.
-
-    The observation is asked for at every `reset` and `step`: one call of the predictor each.
+    Returns:
+        (T, 2) situation and slot of the agents, and (T,) their rank in the situation, 0 for the
+        nearest. Agents at the same distance are ordered by id, since the order of slots is
+        arbitrary.
     """
-
-    def __init__(
-        self,
-        env: gymnasium.Env[dict[str, Any], Any],
-        predictor: str | Predictor,
-        *,
-        agents: int = 8,
-        modes: int = 3,
-        at_s: Sequence[float] = AT_S,
-        privileged: bool = False,
-    ) -> None:
-        """Wraps an environment of this package whose observations are a Dict.
-
-        Args:
-            env: the environment, possibly in wrappers already.
-            predictor: its name, `constant-velocity` or `ssp-asp:RUN_DIR`, or a predictor.
-            agents: how many of the nearest agents are shown.
-            modes: how many of the most probable modes are shown.
-            at_s: the times ahead whose positions are shown, whole ticks.
-            privileged: allows a predictor that is told the recorded future.
-
-        Raises:
-            AspEnvError: the environment, the predictor or an argument does not fit.
-        """
-        RecordConstructorArgs.__init__(
-            self, predictor=predictor, agents=agents, modes=modes, at_s=at_s, privileged=privileged
-        )
-        super().__init__(env)
-        self._parts = ForecastObservations(
-            predictor,
-            agents=agents,
-            modes=modes,
-            at_s=at_s,
-            dt_s=_scenic(env.unwrapped).dt_s,
-            privileged=privileged,
-        )
-        self.observation_space = _joined(env.observation_space, self._parts.spaces)
-
-    def observation(self, observation: dict[str, Any]) -> dict[str, Any]:
-        """The observation and what is forecast now."""
-        parts = self._parts.observe(_scenic(self.env.unwrapped))
-        return observation | {name: part[0] for name, part in parts.items()}
+    present = scene.valid[:, :, -1].copy()
+    present[:, EGO] = False
+    offset_m = scene.states[:, :, -1, :2] - scene.states[:, EGO, None, -1, :2]
+    distance_m = np.where(present, np.hypot(offset_m[..., 0], offset_m[..., 1]), np.inf)
+    nearest = np.lexsort((scene.ids, distance_m), axis=-1)[:, :count]
+    exists = np.isfinite(np.take_along_axis(distance_m, nearest, axis=1))
+    situation, rank = np.nonzero(exists)
+    return np.stack([situation, nearest[exists]], axis=-1), rank
 
 
-class VectorPredictionFeatures(VectorObservationWrapper):
-    """`PredictionFeatures` over a vector environment: one call of the predictor for all of it."""
-
-    def __init__(
-        self,
-        env: VectorEnv,
-        predictor: str | Predictor,
-        *,
-        agents: int = 8,
-        modes: int = 3,
-        at_s: Sequence[float] = AT_S,
-        privileged: bool = False,
-    ) -> None:
-        """Wraps `asp_env/Replay-v0` as made by `gymnasium.make_vec`; see `PredictionFeatures`.
-
-        Raises:
-            AspEnvError: the environment, the predictor or an argument does not fit.
-        """
-        super().__init__(env)
-        self._parts = ForecastObservations(
-            predictor,
-            agents=agents,
-            modes=modes,
-            at_s=at_s,
-            dt_s=_scenic(env.unwrapped).dt_s,
-            privileged=privileged,
-        )
-        self.single_observation_space = _joined(env.single_observation_space, self._parts.spaces)
-        self.observation_space = batch_space(self.single_observation_space, env.num_envs)
-
-    def observations(self, observations: dict[str, Any]) -> dict[str, Any]:
-        """The observations and what is forecast now."""
-        return observations | self._parts.observe(_scenic(self.env.unwrapped))
-
-
-def _check(predictor: Predictor, horizon: int, dt_s: float, privileged: bool) -> None:
+def _check_predictor(predictor: Predictor, horizon: int, dt_s: float, privileged: bool) -> None:
     if predictor.privileged and not privileged:
         raise AspEnvError(
-            f"predictor {predictor.name} is told the recorded future, which no driver knows: "
-            "give privileged=True if that is what you want"
+            f"predictor {predictor.name} uses the recorded future, which is not known while "
+            "driving: allow it with privileged=True"
         )
     if abs(predictor.dt_s - dt_s) > 1e-6:
         raise AspEnvError(
@@ -268,12 +301,12 @@ def _check(predictor: Predictor, horizon: int, dt_s: float, privileged: bool) ->
         )
     if predictor.horizon < horizon:
         raise AspEnvError(
-            f"predictor {predictor.name} forecasts {predictor.horizon * dt_s:g} s: at_s asks for "
-            f"{horizon * dt_s:g} s"
+            f"predictor {predictor.name} forecasts {predictor.horizon * dt_s:g} s: at_s has times "
+            f"up to {horizon * dt_s:g} s"
         )
 
 
-def _scenic(env: Any) -> SceneProvider:
+def _scene_provider(env: Any) -> SceneProvider:
     if not isinstance(env, SceneProvider):
         raise AspEnvError(
             f"{type(env).__name__} has no scenes to forecast: expected an environment of asp_env"
@@ -281,9 +314,9 @@ def _scenic(env: Any) -> SceneProvider:
     return env
 
 
-def _joined(space: spaces.Space[Any], more: dict[str, spaces.Space[Any]]) -> spaces.Space[Any]:
+def _extend(space: spaces.Space[Any], added: dict[str, spaces.Space[Any]]) -> spaces.Space[Any]:
     if not isinstance(space, spaces.Dict):
         raise AspEnvError(f"observation space {space}: expected a Dict")
-    if taken := sorted(set(space.keys()) & set(more)):
-        raise AspEnvError(f"the observation has a part {taken[0]!r} already")
-    return spaces.Dict({**space.spaces, **more})
+    if taken := sorted(set(space.keys()) & set(added)):
+        raise AspEnvError(f"the observation has an entry {taken[0]!r} already")
+    return spaces.Dict({**space.spaces, **added})

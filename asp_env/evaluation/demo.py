@@ -16,8 +16,9 @@ from asp_env.errors import AspEnvError
 from asp_env.evaluation.closed_loop.drive import Drive, drive, save_rollouts
 from asp_env.evaluation.open_loop.evaluate import Evaluate, evaluate
 from asp_env.evaluation.report import check_report_possible, write_report
-from asp_env.evaluation.results import output_folder, write_manifest, write_metrics
+from asp_env.evaluation.results import write_manifest, write_metrics
 from asp_env.evaluation.tables import driving_table, open_loop_tables
+from asp_env.files import atomic_folder
 from asp_env.metrics.driving.rules import DEFAULT_PRESET, RULES
 
 SITE = "intersection"
@@ -147,7 +148,7 @@ def _replacing(out: Path) -> Iterator[Path]:
     """A new folder whose files and folders then replace those of the same names in `out`."""
     fresh = out / "fresh"
     shutil.rmtree(fresh, ignore_errors=True)
-    with output_folder(fresh) as folder:
+    with atomic_folder(fresh) as folder:
         yield folder
     for new in fresh.iterdir():
         old = out / new.name

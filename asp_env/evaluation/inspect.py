@@ -17,7 +17,7 @@ from asp_env.data.road_map import RoadMap
 from asp_env.data.scenarios.scenario import ScenarioSet, find_scenarios
 from asp_env.data.scenarios.tags import COLUMNS, TAGS
 from asp_env.data.scene import infer_actions
-from asp_env.data.snippets import EVERY_S, HISTORY_S, find_snippets
+from asp_env.data.snippets import HISTORY_S, SNIPPET_INTERVAL_S, find_snippets
 from asp_env.data.source import Recordings, open_data
 from asp_env.dynamics import rollout
 from asp_env.errors import DataError
@@ -172,8 +172,8 @@ def _drifts(recording: Recording, dt_s: float) -> Drifts:
             recording,
             dt_s=dt_s,
             history=ticks(HISTORY_S, dt_s),
-            horizon=horizon,
-            every=ticks(EVERY_S, dt_s),
+            horizon_ticks=horizon,
+            interval_ticks=ticks(SNIPPET_INTERVAL_S, dt_s),
         )
         metres[horizon_s], moves[horizon_s] = drift_m(recording, *index, dt_s=dt_s, horizon=horizon)
     return Drifts(metres=metres, moving=moves)

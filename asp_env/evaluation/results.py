@@ -1,18 +1,15 @@
-"""Files of an output folder: `metrics.csv`, `manifest.json`, and the folder itself."""
+"""Files of an output folder: `metrics.csv` and `manifest.json`."""
 
 import csv
 import json
-import os
 import platform
-import shutil
-from collections.abc import Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, fields
 from importlib import metadata
 from pathlib import Path
 from typing import Any
 
-from asp_env.errors import AspEnvError
+from asp_env.files import atomic_file
 
 PACKAGES = ("asp-env", "numpy", "numba", "torch", "gymnasium", "eclipse-sumo")
 """Packages whose versions the manifest states, as far as they are installed."""
@@ -60,33 +57,6 @@ class Row:
     """Driving rules and their version, such as `nuplan 1`; empty in open loop."""
 
 
-@contextmanager
-def output_folder(out: Path) -> Iterator[Path]:
-    """A folder to write into that becomes `out` when all has gone well, and else disappears.
-
-    Raises:
-        AspEnvError: `out` exists and is not an empty folder, or cannot be written.
-    """
-    if out.exists() and not (out.is_dir() and not any(out.iterdir())):
-        raise AspEnvError(f"{out}: exists already; choose another --out or remove it")
-    home = next(folder for folder in out.absolute().parents if folder.exists())
-    aside = home / f".{out.name}.{os.getpid()}.partial"
-    try:
-        aside.mkdir()
-    except OSError as error:
-        raise AspEnvError(
-            f"{out}: cannot be written ({error.strerror}); choose another --out"
-        ) from error
-    try:
-        yield aside
-        out.parent.mkdir(parents=True, exist_ok=True)
-        if out.exists():
-            out.rmdir()
-        aside.replace(out)
-    finally:
-        shutil.rmtree(aside, ignore_errors=True)
-
-
 def write_metrics(folder: Path, rows: Sequence[Row]) -> None:
     """Writes `metrics.csv`; numbers have six significant digits.
 
@@ -94,7 +64,10 @@ def write_metrics(folder: Path, rows: Sequence[Row]) -> None:
         folder: an existing folder.
         rows: the lines of the file, in order.
     """
-    with (folder / "metrics.csv").open("w", newline="") as file:
+    with (
+        atomic_file(folder / "metrics.csv") as partial,
+        partial.open("w", newline="") as file,
+    ):
         writer = csv.DictWriter(file, [field.name for field in fields(Row)])
         writer.writeheader()
         for row in rows:
@@ -122,4 +95,5 @@ def write_manifest(folder: Path, command: str, **content: Any) -> None:
         except metadata.PackageNotFoundError:
             continue
     manifest: Mapping[str, Any] = {"command": command, **content, "versions": versions}
-    (folder / "manifest.json").write_text(json.dumps(manifest, indent=2, default=str) + "\n")
+    with atomic_file(folder / "manifest.json") as partial:
+        partial.write_text(json.dumps(manifest, indent=2, default=str) + "\n")

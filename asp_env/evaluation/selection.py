@@ -130,8 +130,8 @@ def snippets_within(index: SnippetIndex, allowed: Sequence[Bool[np.ndarray, " _"
         total = np.concatenate([[0], np.cumsum(ticks)])
         rows = np.flatnonzero(index.recording == number)
         first = index.tick[rows] - index.history
-        after = np.minimum(index.tick[rows] + index.horizon + 1, len(ticks))
-        keep[rows] = total[after] - total[first] == index.history + index.horizon + 1
+        after = np.minimum(index.tick[rows] + index.horizon_ticks + 1, len(ticks))
+        keep[rows] = total[after] - total[first] == index.history + index.horizon_ticks + 1
     if not keep.any():
         raise no_data_error("snippet")
     return index.select(keep)

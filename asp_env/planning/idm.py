@@ -1,7 +1,9 @@
-"""The intelligent driver model along the ego's route: reacts to what is there now."""
+"""The planner `idm`: the intelligent driver model along the ego's route, without forecasts."""
+
+from typing import NamedTuple
 
 import numpy as np
-from jaxtyping import Float, Int
+from jaxtyping import Float
 
 from asp_env.data.predictor import Forecast
 from asp_env.data.scene import EGO, Scene
@@ -12,21 +14,38 @@ from asp_env.geometry import route_coordinates
 from asp_env.planning.planner import Plan
 
 DESIRED_MPS = 50 / 3.6
-"""The speed limit in towns."""
+"""Desired speed: the German speed limit in towns."""
 
 
-class RouteLimits:
-    """Wanted speeds along routes, remembered while the routes stay the same."""
+class Routes(NamedTuple):
+    """The routes of B egos, with points 1 m apart."""
+
+    points: np.ndarray
+    """(B, P, 2) x m, y m."""
+    counts: np.ndarray
+    """(B,) number of valid points."""
+    speed_limits: np.ndarray
+    """(B, P) desired speed at each point, m/s."""
+
+
+class RouteCache:
+    """Computes the desired speeds along routes, and stores them while the routes stay the same."""
 
     def __init__(self, idm: IDM) -> None:
-        """Limits under the given parameters."""
-        self._idm = idm
-        self._routes = np.zeros((0, 0, 2), dtype=np.float32)
-        self._counts = np.zeros(0, dtype=np.int64)
-        self._limits = np.zeros((0, 0), dtype=np.float32)
+        """Creates an empty cache.
 
-    def of(self, scene: Scene) -> tuple[Float[np.ndarray, "b p"], Int[np.ndarray, " b"]]:
-        """(wanted speed m/s at each route point, number of points) of each situation.
+        Args:
+            idm: limits the speeds before and in bends.
+        """
+        self._idm = idm
+        self._routes = Routes(
+            points=np.zeros((0, 0, 2), dtype=np.float32),
+            counts=np.zeros(0, dtype=np.int64),
+            speed_limits=np.zeros((0, 0), dtype=np.float32),
+        )
+
+    def routes(self, scene: Scene) -> Routes:
+        """The routes of a scene.
 
         Raises:
             AspEnvError: a situation has no route.
@@ -34,46 +53,49 @@ class RouteLimits:
         counts = scene.route_valid.sum(axis=1)
         if (counts < 2).any():
             raise AspEnvError("a planner needs the ego's route: take the scene from a world")
-        same = np.array_equal(self._routes, scene.route) and np.array_equal(self._counts, counts)
-        if not same:
+        known = self._routes
+        if not (np.array_equal(known.points, scene.route) and np.array_equal(known.counts, counts)):
             limits = np.zeros(scene.route.shape[:2], dtype=np.float32)
             for b, count in enumerate(counts):
-                path = scene.route[b, :count]
-                limits[b, :count] = speed_limits(path, DESIRED_MPS, self._idm)
-            self._routes, self._counts, self._limits = scene.route, counts, limits
-        return self._limits, self._counts
+                limits[b, :count] = speed_limits(scene.route[b, :count], DESIRED_MPS, self._idm)
+            self._routes = Routes(points=scene.route, counts=counts, speed_limits=limits)
+        return self._routes
 
 
 class IDMPlanner:
-    """Follows the route at the wanted speed behind whoever stands or drives on it now."""
+    """Follows the route at the desired speed, and what is on the route at present."""
 
     name = "idm"
     privileged = False
     uses_forecasts = False
 
     def __init__(self, idm: IDM | None = None) -> None:
-        """A planner with the given parameters, or the default ones."""
+        """Creates the planner.
+
+        Args:
+            idm: parameters of the model, by default `IDM()`.
+        """
         self._idm = idm or IDM()
-        self._limits = RouteLimits(self._idm)
+        self._cache = RouteCache(self._idm)
 
     def plan(self, scene: Scene, forecast: Forecast) -> Plan:
-        """One action held for the forecast's horizon."""
-        limits, counts = self._limits.of(scene)
+        """One action, held for the horizon of the forecast."""
+        routes = self._cache.routes(scene)
         valid = np.ascontiguousarray(scene.valid[..., -1])
         states = np.ascontiguousarray(scene.states[..., -1, :])
         egos = np.zeros_like(valid)
         egos[:, EGO] = True
         shape = (*valid.shape, scene.route.shape[1])
         arcs = np.zeros(valid.shape)
-        arcs[:, EGO] = _arc(scene)
+        arcs[:, EGO] = _route_arcs(scene)
         actions = follow_paths(
             states,
             scene.sizes,
             valid,
             egos,
             np.broadcast_to(scene.route[:, None], (*shape, 2)),
-            np.broadcast_to(counts[:, None], valid.shape),
-            np.broadcast_to(limits[:, None], shape),
+            np.broadcast_to(routes.counts[:, None], valid.shape),
+            np.broadcast_to(routes.speed_limits[:, None], shape),
             arcs,
             self._idm,
         )[:, EGO]
@@ -82,8 +104,8 @@ class IDMPlanner:
         return Plan(actions=held, states=rollout(states[:, EGO], held, lengths, scene.dt_s))
 
 
-def _arc(scene: Scene) -> Float[np.ndarray, " b"]:
-    """How far along its route each ego is; looked for everywhere."""
-    everywhere = np.full(len(scene.tick), -1.0)
+def _route_arcs(scene: Scene) -> Float[np.ndarray, " b"]:
+    """Arc length of each ego along its route, m."""
+    search_everywhere = np.full(len(scene.tick), -1.0)
     egos = np.ascontiguousarray(scene.states[:, EGO, -1])
-    return route_coordinates(scene.route, scene.route_valid, egos, everywhere)[:, 0]
+    return route_coordinates(scene.route, scene.route_valid, egos, search_everywhere)[:, 0]

@@ -1,7 +1,4 @@
-"""The socket for planners.
-
-MERGED: The logged driver itself: what every planner is measured against.
-"""
+"""The socket for planners, and `expert`: the recorded ego, the reference for every planner."""
 
 from dataclasses import dataclass
 from typing import NoReturn, Protocol, runtime_checkable
@@ -17,24 +14,39 @@ from asp_env.errors import AspEnvError
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Plan:
-    """What the ego of each of B situations means to do over T ticks; the first action is done."""
+    """The coming T ticks of the ego in each of B situations; the first action is executed."""
 
     actions: Float[np.ndarray, "b t 2"]
+    """[acceleration m/s², steering rad]."""
     states: Float[np.ndarray, "b t 4"]
+    """[x m, y m, heading rad, speed m/s] after each action."""
 
 
 @runtime_checkable
 class Planner(Protocol):
-    """Decides for the egos (slot 0) of a scene."""
+    """Decides what the egos (slot 0) of a scene do.
+
+    A planner is registered in the entry point group `asp_env.planners`, as a callable without
+    arguments that returns it.
+    """
 
     name: str
+    """The name it is registered under."""
     privileged: bool
-    """Whether it follows the recorded future; tables name such a planner."""
+    """Whether it follows the recorded future; tables mark such planners."""
     uses_forecasts: bool
-    """Whether a predictor makes a difference to it."""
+    """Whether its plans depend on the forecast."""
 
     def plan(self, scene: Scene, forecast: Forecast) -> Plan:
-        """A plan for every situation; the forecast speaks of everybody else who is there now."""
+        """Plans for all B situations of a scene.
+
+        Args:
+            scene: the present scene, with the routes of the egos.
+            forecast: of all other agents that are present, over T ticks.
+
+        Raises:
+            AspEnvError: the scene has no routes.
+        """
         ...
 
 
@@ -48,10 +60,10 @@ def load_planner(name: str) -> Planner:
 
 
 class Expert:
-    """Replays the logged ego, position by position; it plans nothing.
+    """The recorded ego, which is replayed position by position; it plans nothing.
 
-    Its score is the noise floor of data and metrics. Whoever runs planners looks at `privileged`
-    and lets the world replay the ego, so that `plan` is never asked.
+    Its score is the noise floor of data and metrics. Code that runs planners checks `privileged`
+    and lets the world replay the ego instead of calling `plan`.
     """
 
     name = "expert"
@@ -59,7 +71,7 @@ class Expert:
     uses_forecasts = False
 
     def plan(self, scene: Scene, forecast: Forecast) -> NoReturn:
-        """Refuses: the log is not in the scene.
+        """Fails, since a scene does not contain the recorded future.
 
         Raises:
             AspEnvError: always.

@@ -1,4 +1,4 @@
-"""What an environment shows of its episode while it runs."""
+"""Rendering of an environment's episode while it runs."""
 
 import numpy as np
 from jaxtyping import Shaped, UInt8
@@ -14,20 +14,20 @@ MODES = ("human", "rgb_array")
 SIZE_PX = (720, 720)
 
 
-class Live:
-    """Pictures when they are asked for, or a window that keeps up with the episode."""
+class LiveRenderer:
+    """Frames on request, or a window that shows every tick of the episode."""
 
     def __init__(self, mode: str | None, *, title: str, dt_s: float) -> None:
-        """Opens no window before there is something to show.
+        """The window opens with the first frame.
 
         Args:
-            mode: `human`, `rgb_array`, or None, which shows nothing.
-            title: of the window.
-            dt_s: length of a tick; the window shows so many a second as time passes.
+            mode: `human`, `rgb_array`, or None, which renders nothing.
+            title: Title of the window.
+            dt_s: Length of a tick, and the time for which the window shows it.
 
         Raises:
-            AspEnvError: no such mode.
-            MissingExtraError: the package that opens windows is not installed.
+            AspEnvError: The mode is unknown.
+            MissingExtraError: The package that opens windows is not installed.
         """
         if mode is not None and mode not in MODES:
             raise AspEnvError(f"render mode {mode!r}: expected {', '.join(MODES)} or None")
@@ -35,10 +35,10 @@ class Live:
         self._window = Window(title, SIZE_PX) if mode == "human" else None
         self._forecast: Forecast | None = None
         self._plan: Shaped[np.ndarray, "steps n"] | None = None
-        self._told_tick = 0
+        self._overlay_tick = 0
 
-    def forget(self) -> None:
-        """Shows no more of what was told."""
+    def clear_overlay(self) -> None:
+        """Removes the forecast and the plan."""
         self._forecast = self._plan = None
 
     def set_overlay(
@@ -47,15 +47,21 @@ class Live:
         forecast: Forecast | None,
         plan: Shaped[np.ndarray, "..."] | None,
     ) -> None:
-        """Takes what is forecast and planned; what is still to come of it is shown from now on.
+        """Replaces the forecast and the plan whose remaining steps later frames show.
+
+        Args:
+            scene: The present scene.
+            forecast: A forecast of the scene.
+            plan: (steps, 2 or more) Planned positions of the ego, metres, in the first two columns.
 
         Raises:
-            AspEnvError: it is not of this scene, or not finite.
+            AspEnvError: The forecast is of another scene, the plan has another shape, or a position
+                is not finite.
         """
         if forecast is not None:
-            at = (forecast.targets[:, 0], forecast.targets[:, 1])
-            inside = (at[0] == 0) & (at[1] < scene.ids.shape[1])
-            if not (inside.all() and (scene.ids[at] == forecast.ids).all()):
+            index = (forecast.targets[:, 0], forecast.targets[:, 1])
+            inside = (index[0] == 0) & (index[1] < scene.ids.shape[1])
+            if not (inside.all() and (scene.ids[index] == forecast.ids).all()):
                 raise AspEnvError("forecast: expected one of this environment's scene()")
             if not np.isfinite(forecast.states).all():
                 raise AspEnvError("forecast: expected finite states")
@@ -63,10 +69,10 @@ class Live:
             plan.ndim == 2 and plan.shape[1] >= 2 and np.isfinite(plan[:, :2]).all()
         ):
             raise AspEnvError(f"plan of shape {plan.shape}: expected finite (steps, 2 or more)")
-        self._forecast, self._plan, self._told_tick = forecast, plan, int(scene.tick[0])
+        self._forecast, self._plan, self._overlay_tick = forecast, plan, int(scene.tick[0])
 
     def update(self, scene: Scene, background: Background | None) -> None:
-        """After a tick, in mode `human`: the window shows it for as long as it takes."""
+        """Shows a tick in the window, if there is one, and waits for the length of a tick."""
         if self._window is not None and not self._window.closed:
             self.render(scene, background)
             self._window.wait_s(self._fps)
@@ -74,17 +80,17 @@ class Live:
     def render(
         self, scene: Scene, background: Background | None
     ) -> UInt8[np.ndarray, "height width 3"] | None:
-        """The picture; in mode `human` the window shows it instead.
+        """Returns a frame of a scene, or shows it in the window and returns None.
 
         Raises:
-            AspEnvError: there is no screen.
-            DataError: the background picture cannot be read.
+            AspEnvError: There is no screen.
+            DataError: The background image cannot be read.
         """
         if self._window is not None and self._window.closed:
             return None
         size_px = SIZE_PX if self._window is None else self._window.size_px
-        gone = max(int(scene.tick[0]) - self._told_tick, 0)
-        plan = None if self._plan is None else self._plan[gone:]
+        elapsed = max(int(scene.tick[0]) - self._overlay_tick, 0)
+        plan = None if self._plan is None else self._plan[elapsed:]
         image = draw_frame(
             scene, size_px=size_px, forecast=self._forecast, plan=plan, background=background
         )

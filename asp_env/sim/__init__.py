@@ -1,1 +1,47 @@
-"""The closed loop: worlds that step many episodes at once, drivers, observations, rewards."""
+"""The closed loop: worlds of episodes, drivers of their traffic, observations and rewards."""
+
+from asp_env.sim.episodes import EpisodeInit, Episodes
+from asp_env.sim.observation import (
+    OBSERVATION_NAMES,
+    STATE_FIELDS,
+    Observation,
+    ObservationComponent,
+    ObservationContext,
+    Observer,
+    ego_context,
+)
+from asp_env.sim.reward import RewardWeights, reward_terms, weighted_sum
+from asp_env.sim.simulation import Simulation, ending
+from asp_env.sim.traffic.assignment import make_traffic
+from asp_env.sim.world import (
+    Ending,
+    Events,
+    ReplayWorld,
+    World,
+    recorded_future,
+    world_class,
+)
+
+__all__ = [
+    "OBSERVATION_NAMES",
+    "STATE_FIELDS",
+    "Ending",
+    "EpisodeInit",
+    "Episodes",
+    "Events",
+    "Observation",
+    "ObservationComponent",
+    "ObservationContext",
+    "Observer",
+    "ReplayWorld",
+    "RewardWeights",
+    "Simulation",
+    "World",
+    "ego_context",
+    "ending",
+    "make_traffic",
+    "recorded_future",
+    "reward_terms",
+    "weighted_sum",
+    "world_class",
+]

@@ -1,9 +1,8 @@
-"""What the egos of a world see now: its last ticks, without what an observation does not need.
+"""Observations: pictures, vectors, action history, state and route, in any combination.
 
-MERGED: The kinds of observation, each with its spaces and the writing of its arrays.
-
-Every value is finite and lies within the bounds of its space; what would lie beyond is moved there.
-MERGED: What an agent is shown: pictures, vectors, action history, state and route, in any choice.
+An `Observer` consists of one `ObservationComponent` per name; each writes one or several arrays.
+They read an `ObservationContext`: the last ticks of some episodes from the view of their egos.
+Every value is finite and within the bounds of its space; values beyond the bounds are clipped.
 """
 
 import math
@@ -26,74 +25,23 @@ from asp_env.sim.world import Events, World
 from asp_env.views import VIEWS, PictureView, make_picture_view
 from asp_env.views.vectors import AGENT_FIELDS, LINE_FIELDS, VectorBounds, Vectors, VectorView
 
+PICTURE_VIEWS = tuple(name for name in VIEWS if not name.startswith("vectors"))
+"""Views that are observations of their own, besides `raster`."""
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class ObservationContext:
-    """B situations, each seen by its targets: a `Scene` without actions, whose fields views read.
+OBSERVATION_NAMES = ("raster", "vectors", "actions", "state", "route", *PICTURE_VIEWS)
 
-    Of agents that were not there at any tick, sizes, classes and ids mean nothing.
-    """
+MAX_OBSERVED_POSITION_M = 1000.0
+"""Bound of coordinates in the ego's frame. Chosen by hand."""
 
-    states: Float[np.ndarray, "b a ticks 4"]
-    """Zeros where not valid."""
-    valid: Bool[np.ndarray, "b a ticks"]
-    sizes: Float[np.ndarray, "b a 2"]
-    classes: Int[np.ndarray, "b a"]
-    ids: Int[np.ndarray, "b a"]
-    targets: Int[np.ndarray, "t 2"]
-    """(situation, slot) of those who see."""
-    routes: Float[np.ndarray, "t p 2"]
-    """The way of each target, points 1 m apart."""
-    route_valid: Bool[np.ndarray, "t p"]
-    maps: tuple[RoadMap, ...]
-    map_index: Int[np.ndarray, " b"]
-    dt_s: float
+MAX_OBSERVED_SPEED_MPS = 60.0
+"""Bound of speeds. Chosen by hand."""
 
-    @property
-    def history(self) -> int:
-        """Past ticks."""
-        return self.states.shape[2] - 1
-
-
-def ego_context(world: World, rows: Int[np.ndarray, " n"] | None = None) -> ObservationContext:
-    """What the egos of some episodes see, by default of all; situation i is episode `rows[i]`."""
-    data = world.episodes
-    maps, map_index = world.maps()
-    everyone = rows is None
-    rows = np.arange(len(world)) if rows is None else rows
-    targets = np.full((len(rows), 2), EGO)
-    targets[:, 0] = np.arange(len(rows))
-    states, valid = last_ticks(data, world.now, rows, world.history)
-    sizes, classes, ids, routes, route_valid = (
-        column if everyone else column[rows]
-        for column in (data.sizes, data.classes, data.ids, data.route, data.route_valid)
-    )
-    return ObservationContext(
-        states=states,
-        valid=valid,
-        sizes=sizes,
-        classes=classes,
-        ids=ids,
-        targets=targets,
-        routes=routes,
-        route_valid=route_valid,
-        maps=maps,
-        map_index=map_index if everyone else map_index[rows],
-        dt_s=world.dt_s,
-    )
-
-
-FARTHEST_M = 1000.0
-"""Positions in an ego's frame are shown up to here."""
-
-FASTEST_MPS = 60.0
-
-MAX_SEEN_ACCELERATION_MPS2 = 10.0
-"""Inferred accelerations beyond this are shown as this, so that the space is bounded."""
+MAX_OBSERVED_ACCELERATION_MPS2 = 10.0
+"""Bound of inferred accelerations, which may exceed the limit of actions. Chosen by hand."""
 
 STATE_FIELDS: dict[str, tuple[float, float]] = {
-    "speed_mps": (-FASTEST_MPS, FASTEST_MPS),
-    "acceleration_mps2": (-MAX_SEEN_ACCELERATION_MPS2, MAX_SEEN_ACCELERATION_MPS2),
+    "speed_mps": (-MAX_OBSERVED_SPEED_MPS, MAX_OBSERVED_SPEED_MPS),
+    "acceleration_mps2": (-MAX_OBSERVED_ACCELERATION_MPS2, MAX_OBSERVED_ACCELERATION_MPS2),
     "steering_rad": (-MAX_STEERING_RAD, MAX_STEERING_RAD),
     "route_offset_m": (-50.0, 50.0),
     "route_heading_error_rad": (-float(np.pi), float(np.pi)),
@@ -105,39 +53,137 @@ STATE_FIELDS: dict[str, tuple[float, float]] = {
 """Fields of the `state` observation in their order, with their bounds."""
 
 ROUTE_POINTS = 30
+"""Number of points of the `route` observation."""
 
 ROUTE_STEP_M = 2.0
-"""Between the points of the `route` observation; the first lies this far ahead of the ego."""
+"""Distance between the points of the `route` observation, and from the ego to the first."""
 
-Arrays = dict[str, np.ndarray]
+Observation = dict[str, Shaped[np.ndarray, "t ..."]]
+"""One array per part; the first axis is the targets."""
+
 Spaces = dict[str, spaces.Box[Any]]
+"""The space of each part, for one target."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class ObservationContext:
+    """B situations as seen by T targets: the fields of a `Scene` that views read, and routes.
+
+    It has no actions: the components that need them infer those of the targets only. Sizes,
+    classes and ids of agents that are valid at no tick are undefined.
+    """
+
+    states: Float[np.ndarray, "b a ticks 4"]
+    """[x m, y m, heading rad, speed m/s]; zero where not valid. The last tick is now."""
+    valid: Bool[np.ndarray, "b a ticks"]
+    sizes: Float[np.ndarray, "b a 2"]
+    """Length and width, m."""
+    classes: Int[np.ndarray, "b a"]
+    ids: Int[np.ndarray, "b a"]
+    targets: Int[np.ndarray, "t 2"]
+    """(situation, slot) of the agents that observe."""
+    routes: Float[np.ndarray, "t p 2"]
+    """The route of each target: x m, y m of points 1 m apart."""
+    route_valid: Bool[np.ndarray, "t p"]
+    maps: tuple[RoadMap, ...]
+    map_index: Int[np.ndarray, " b"]
+    """Index of each situation's map in `maps`."""
+    dt_s: float
+
+    @property
+    def history(self) -> int:
+        """The number of past ticks."""
+        return self.states.shape[2] - 1
+
+
+def ego_context(world: World, rows: Int[np.ndarray, " n"] | None = None) -> ObservationContext:
+    """The context of the egos of some episodes.
+
+    Args:
+        world: the world with the episodes.
+        rows: indices of the episodes, by default all; situation i is episode `rows[i]`.
+    """
+    episodes = world.episodes
+    maps, map_index = world.maps()
+    every_row = rows is None
+    rows = np.arange(len(world)) if rows is None else rows
+    targets = np.full((len(rows), 2), EGO)
+    targets[:, 0] = np.arange(len(rows))
+    states, valid = last_ticks(episodes, world.now, rows, world.history)
+    sizes, classes, ids, routes, route_valid = (
+        column if every_row else column[rows]
+        for column in (
+            episodes.sizes,
+            episodes.classes,
+            episodes.ids,
+            episodes.route,
+            episodes.route_valid,
+        )
+    )
+    return ObservationContext(
+        states=states,
+        valid=valid,
+        sizes=sizes,
+        classes=classes,
+        ids=ids,
+        targets=targets,
+        routes=routes,
+        route_valid=route_valid,
+        maps=maps,
+        map_index=map_index if every_row else map_index[rows],
+        dt_s=world.dt_s,
+    )
+
+
+@runtime_checkable
+class ObservationComponent(Protocol):
+    """One kind of observation, which consists of one or several parts."""
+
+    @property
+    def history(self) -> int:
+        """The number of past ticks that it needs."""
+        ...
+
+    @property
+    def spaces(self) -> Spaces:
+        """The space of each part, for one target."""
+        ...
+
+    def write(self, context: ObservationContext, events: Events, out: Observation) -> None:
+        """Writes its parts.
+
+        Args:
+            context: what the T targets see.
+            events: the events of the same targets, row by row.
+            out: arrays of all parts; those of this component are overwritten.
+        """
+        ...
 
 
 @final
 class RasterComponent:
-    """The picture that a view draws: uint8 (channels, height, width)."""
+    """The picture of a view: uint8 (channels, height, width)."""
 
     def __init__(self, name: str, view: PictureView) -> None:
-        """A part of that name."""
         self._name, self._view = name, view
         self.history = view.history
         self.spaces: Spaces = {name: spaces.Box(0, 255, view.shape, dtype=np.uint8)}
 
-    def write(self, sight: ObservationContext, events: Events, out: Arrays) -> None:
-        """Draws into the memory itself."""
+    def write(self, context: ObservationContext, events: Events, out: Observation) -> None:
+        """Draws the pictures."""
         del events
-        self._view.draw(sight, out[self._name])
+        self._view.draw(context, out[self._name])
 
 
 @final
 class VectorsComponent:
-    """The agents and the lines around the ego, as `asp_env.views.vectors` tells them.
+    """The agents and lines around the ego as tables, described in `asp_env.views.vectors`.
 
-    Tables of agents (time by time) and of lines (point by point), each with a mask of 0 and 1.
+    Parts: `agents` (agents, ticks, fields) and `lines` (lines, points, fields), each with an int8
+    mask of 0 and 1 without the last axis.
     """
 
     def __init__(self, view: VectorView) -> None:
-        """Of that many agents and lines."""
         self._view = view
         self.history = view.history
         shape = view.shape
@@ -149,50 +195,49 @@ class VectorsComponent:
             "lines_valid": spaces.Box(0, 1, lines, dtype=np.int8),
         }
         bounds = (self.spaces["agents"], self.spaces["lines"])
-        self._within = VectorBounds(
+        self._bounds = VectorBounds(
             *(bound.reshape(-1) for box in bounds for bound in (box.low, box.high))
         )
 
-    def write(self, sight: ObservationContext, events: Events, out: Arrays) -> None:
-        """Writes into the memory itself."""
+    def write(self, context: ObservationContext, events: Events, out: Observation) -> None:
+        """Writes the tables and their masks."""
         del events
         masks = out["agents_valid"].view(np.bool_), out["lines_valid"].view(np.bool_)
-        memory = Vectors(out["agents"], masks[0], out["lines"], masks[1])
-        self._view.draw(sight, memory, self._within)
+        vectors = Vectors(out["agents"], masks[0], out["lines"], masks[1])
+        self._view.draw(context, vectors, self._bounds)
 
 
 @final
 class ActionsComponent:
-    """The inferred actions of the last ticks, oldest first: (ticks, 2) of m/s² and rad."""
+    """The inferred actions [m/s², rad] of the last ticks, oldest first: float32 (ticks, 2)."""
 
     def __init__(self, history: int) -> None:
-        """Of that many ticks."""
         self.history = history
-        limit = np.array([MAX_SEEN_ACCELERATION_MPS2, MAX_STEERING_RAD])
+        limit = np.array([MAX_OBSERVED_ACCELERATION_MPS2, MAX_STEERING_RAD])
         self.spaces: Spaces = {"actions": _box(-limit, limit, (history,))}
 
-    def write(self, sight: ObservationContext, events: Events, out: Arrays) -> None:
-        """Infers those of the targets alone."""
+    def write(self, context: ObservationContext, events: Events, out: Observation) -> None:
+        """Infers the actions of the targets."""
         del events
-        out["actions"][:] = _actions(sight, self.history)
+        out["actions"][:] = _infer_target_actions(context, self.history)
         _clip_to(self.spaces["actions"], out["actions"])
 
 
 @final
 class StateComponent:
-    """How the ego moves and where it is on its route: `STATE_FIELDS`."""
+    """The ego's motion and its place on its route: float32, the fields of `STATE_FIELDS`."""
 
     history = 1
 
     def __init__(self) -> None:
-        """The bounds are those of the fields."""
         low, high = np.array(list(STATE_FIELDS.values())).T
         self.spaces: Spaces = {"state": _box(low, high, ())}
 
-    def write(self, sight: ObservationContext, events: Events, out: Arrays) -> None:
-        """The fields in their order."""
-        at = sight.targets[:, 0], sight.targets[:, 1]
-        ego, action, size = sight.states[at][:, -1], _actions(sight, 1)[:, 0], sight.sizes[at]
+    def write(self, context: ObservationContext, events: Events, out: Observation) -> None:
+        """Writes the fields in their order."""
+        index = context.targets[:, 0], context.targets[:, 1]
+        ego, size = context.states[index][:, -1], context.sizes[index]
+        action = _infer_target_actions(context, 1)[:, 0]
         columns = (
             ego[:, 3],
             action[:, 0],
@@ -211,173 +256,84 @@ class StateComponent:
 
 @final
 class RouteComponent:
-    """The way ahead from where the ego is on its route, as far as it is seen in its frame.
+    """Points of the route ahead of the ego in its frame: float32 (points, 2), x ahead, y left, m.
 
-    (points, 2): x ahead and y to the left, m. Beyond the route's ends it goes on straight.
+    Beyond its ends the route continues straight.
     """
 
     history = 0
 
     def __init__(self) -> None:
-        """Of `ROUTE_POINTS` points."""
-        high = np.full(2, FARTHEST_M)
+        high = np.full(2, MAX_OBSERVED_POSITION_M)
         self.spaces: Spaces = {"route": _box(-high, high, (ROUTE_POINTS,))}
 
-    def write(self, sight: ObservationContext, events: Events, out: Arrays) -> None:
-        """Writes into the memory itself."""
-        egos = sight.states[sight.targets[:, 0], sight.targets[:, 1], -1]
-        counts = sight.route_valid.sum(axis=1)
-        _way_ahead(sight.routes, counts, events.route_m, egos, ROUTE_STEP_M, out["route"])
+    def write(self, context: ObservationContext, events: Events, out: Observation) -> None:
+        """Writes the points."""
+        egos = context.states[context.targets[:, 0], context.targets[:, 1], -1]
+        counts = context.route_valid.sum(axis=1)
+        _route_ahead(context.routes, counts, events.route_m, egos, ROUTE_STEP_M, out["route"])
         _clip_to(self.spaces["route"], out["route"])
 
 
-def _field_bounds(names: tuple[str, ...]) -> tuple[np.ndarray, np.ndarray]:
-    """Of the fields of agents or lines; all but some lie between 0 and 1."""
-    wide = {"x": FARTHEST_M, "y": FARTHEST_M, "cos": 1.0, "sin": 1.0, "speed": FASTEST_MPS}
-    sizes = {"length": STATE_FIELDS["length_m"][1], "width": STATE_FIELDS["width_m"][1]}
-    low = [-wide[name] if name in wide else 0.0 for name in names]
-    return np.array(low), np.array([wide.get(name, sizes.get(name, 1.0)) for name in names])
-
-
-def _box(low: np.ndarray, high: np.ndarray, leading: tuple[int, ...]) -> spaces.Box[Any]:
-    """A table of float32 whose last axis has these bounds."""
-    shape = (*leading, len(low))
-    return spaces.Box(
-        np.broadcast_to(low, shape).astype(np.float32),
-        np.broadcast_to(high, shape).astype(np.float32),
-        dtype=np.float32,
-    )
-
-
-def _clip_to(box: spaces.Box[Any], values: np.ndarray) -> None:
-    """Moves what lies outside a space into it."""
-    _clip(values.reshape(len(values), -1), box.low.reshape(-1), box.high.reshape(-1))
-
-
-def _actions(sight: ObservationContext, ticks: int) -> np.ndarray:
-    """The last inferred actions of the targets, (targets, ticks, 2)."""
-    at = sight.targets[:, 0], sight.targets[:, 1]
-    states, valid = sight.states[at][:, -ticks - 1 :], sight.valid[at][:, -ticks - 1 :]
-    return infer_actions(states, valid, sight.sizes[at][:, 0], sight.dt_s)
-
-
-@njit(cache=True)
-@no_type_check
-def _clip(rows, low, high):
-    """Moves every number of every row into the bounds of its column, NaN to the lower one."""
-    # In this form the compiler makes vectors of it: a fifth of the time of `np.clip`.
-    for t in range(len(rows)):
-        row = rows[t]
-        for i in range(len(low)):
-            value, least, most = row[i], low[i], high[i]
-            value = value if value >= least else least
-            row[i] = value if value <= most else most
-
-
-@njit(cache=True)
-@no_type_check
-def _way_ahead(routes, counts, arcs, egos, step_m, out):
-    """Points of each route ahead of an arc length, in the frame of each ego."""
-    for t in range(len(out)):
-        route, last = routes[t], counts[t] - 2
-        cos, sin = math.cos(egos[t, 2]), math.sin(egos[t, 2])
-        for k in range(out.shape[1]):
-            arc = arcs[t] + (k + 1) * step_m
-            i = min(max(math.floor(arc), 0), last)
-            dx = route[i, 0] + (arc - i) * (route[i + 1, 0] - route[i, 0]) - egos[t, 0]
-            dy = route[i, 1] + (arc - i) * (route[i + 1, 1] - route[i, 1]) - egos[t, 1]
-            out[t, k, 0] = cos * dx + sin * dy
-            out[t, k, 1] = cos * dy - sin * dx
-
-
-PICTURES = tuple(name for name in VIEWS if not name.startswith("vectors"))
-"""Views that can be asked for by name, beside the raster."""
-
-KNOWN = ("raster", "vectors", "actions", "state", "route", *PICTURES)
-
-Observation = dict[str, Shaped[np.ndarray, "t ..."]]
-"""One array per part, with those who see first."""
-
-
-@runtime_checkable
-class ObservationComponent(Protocol):
-    """One kind of observation, which fills one or several parts of the whole."""
-
-    @property
-    def history(self) -> int:
-        """Past ticks that it needs."""
-        ...
-
-    @property
-    def spaces(self) -> Spaces:
-        """The space of each part, for one target."""
-        ...
-
-    def write(self, sight: ObservationContext, events: Events, out: Observation) -> None:
-        """What each target sees, into the parts' arrays of `out`."""
-        ...
-
-
 class Observer:
-    """Turns what is seen into observations; draws nothing that is not asked for."""
+    """Writes the observations of the chosen components, and computes nothing else."""
 
     def __init__(self, names: Sequence[str], raster: PictureView, history: int) -> None:
-        """An observer of the named kinds of observation.
+        """Creates the components.
 
         Args:
-            names: some of `KNOWN`.
-            raster: what draws the part `raster`.
-            history: past ticks of what will be seen.
+            names: some of `OBSERVATION_NAMES`.
+            raster: the view of the component `raster`.
+            history: past ticks of the contexts to come.
 
         Raises:
-            AspEnvError: a name is unknown or given twice, there is none, or the history is shorter
-                than one of them needs.
+            AspEnvError: a name is unknown or repeated, there is none, or a component needs a
+                longer history.
         """
         if isinstance(names, str) or not len(names):
             given = f"observations {names!r}" if names else "no observation given"
-            raise AspEnvError(f"{given}: expected some of {', '.join(KNOWN)}")
-        self._parts: list[ObservationComponent] = []
+            raise AspEnvError(f"{given}: expected some of {', '.join(OBSERVATION_NAMES)}")
+        self._components: list[ObservationComponent] = []
         for name in names:
-            if name not in KNOWN:
-                raise unknown_name("observation", name, KNOWN)
-            part = _make(name, raster, history)
-            if part.history > history:
+            if name not in OBSERVATION_NAMES:
+                raise unknown_name("observation", name, OBSERVATION_NAMES)
+            component = _make_component(name, raster, history)
+            if component.history > history:
                 raise AspEnvError(
-                    f"observation {name!r} needs {part.history} past ticks, there are {history}: "
-                    "choose a shorter time step"
+                    f"observation {name!r} needs {component.history} past ticks, there are "
+                    f"{history}: choose a shorter time step"
                 )
-            self._parts.append(part)
+            self._components.append(component)
         if len(set(names)) < len(names):
             raise AspEnvError(f"observations {', '.join(names)}: name each once")
-        boxes = {name: box for part in self._parts for name, box in part.spaces.items()}
+        boxes = {name: box for each in self._components for name, box in each.spaces.items()}
         self.space = spaces.Dict(list(boxes.items()))
         self._shapes = {name: (box.shape, box.dtype) for name, box in boxes.items()}
 
-    def memory(self, count: int) -> Observation:
-        """Fresh memory for what `count` targets see."""
+    def allocate(self, count: int) -> Observation:
+        """Uninitialized arrays for the observations of `count` targets."""
         return {
             name: np.empty((count, *shape), dtype=dtype)
             for name, (shape, dtype) in self._shapes.items()
         }
 
     def observe(
-        self, sight: ObservationContext, events: Events, out: Observation | None = None
+        self, context: ObservationContext, events: Events, out: Observation | None = None
     ) -> Observation:
-        """What each target sees.
+        """The observations of all targets.
 
         Args:
-            sight: of all targets.
-            events: of the same targets, row by row.
-            out: from `memory`, to write into; its former content does not matter. Fresh memory
-                where it is not given.
+            context: what the T targets see.
+            events: the events of the same targets, row by row.
+            out: arrays of `allocate` to overwrite; new ones by default.
         """
-        out = self.memory(len(sight.targets)) if out is None else out
-        for part in self._parts:
-            part.write(sight, events, out)
+        out = self.allocate(len(context.targets)) if out is None else out
+        for component in self._components:
+            component.write(context, events, out)
         return out
 
 
-def _make(name: str, raster: PictureView, history: int) -> ObservationComponent:
+def _make_component(name: str, raster: PictureView, history: int) -> ObservationComponent:
     if name == "raster":
         return RasterComponent(name, raster)
     if name == "vectors":
@@ -389,3 +345,77 @@ def _make(name: str, raster: PictureView, history: int) -> ObservationComponent:
     if name == "route":
         return RouteComponent()
     return RasterComponent(name, make_picture_view(name))
+
+
+def _field_bounds(names: tuple[str, ...]) -> tuple[np.ndarray, np.ndarray]:
+    """Bounds of the fields of agents or lines; those without a unit are between 0 and 1."""
+    signed = {
+        "x": MAX_OBSERVED_POSITION_M,
+        "y": MAX_OBSERVED_POSITION_M,
+        "cos": 1.0,
+        "sin": 1.0,
+        "speed": MAX_OBSERVED_SPEED_MPS,
+    }
+    sizes = {"length": STATE_FIELDS["length_m"][1], "width": STATE_FIELDS["width_m"][1]}
+    low = [-signed[name] if name in signed else 0.0 for name in names]
+    return np.array(low), np.array([signed.get(name, sizes.get(name, 1.0)) for name in names])
+
+
+def _box(low: np.ndarray, high: np.ndarray, leading: tuple[int, ...]) -> spaces.Box[Any]:
+    """A float32 space of shape (*leading, fields) with the given bounds of the fields."""
+    shape = (*leading, len(low))
+    return spaces.Box(
+        np.broadcast_to(low, shape).astype(np.float32),
+        np.broadcast_to(high, shape).astype(np.float32),
+        dtype=np.float32,
+    )
+
+
+def _clip_to(box: spaces.Box[Any], values: np.ndarray) -> None:
+    _clip(values.reshape(len(values), -1), box.low.reshape(-1), box.high.reshape(-1))
+
+
+def _infer_target_actions(context: ObservationContext, ticks: int) -> np.ndarray:
+    """The last inferred actions [m/s², rad] of the targets: (targets, ticks, 2)."""
+    index = context.targets[:, 0], context.targets[:, 1]
+    states = context.states[index][:, -ticks - 1 :]
+    valid = context.valid[index][:, -ticks - 1 :]
+    return infer_actions(states, valid, context.sizes[index][:, 0], context.dt_s)
+
+
+@njit(cache=True)
+@no_type_check
+def _clip(rows, low, high):
+    """Clips rows (N, M) to bounds (M,) in place; NaN becomes the lower bound."""
+    # The compiler vectorizes this form: a fifth of the time of `np.clip`.
+    for t in range(len(rows)):
+        row = rows[t]
+        for i in range(len(low)):
+            value, least, most = row[i], low[i], high[i]
+            value = value if value >= least else least
+            row[i] = value if value <= most else most
+
+
+@njit(cache=True)
+@no_type_check
+def _route_ahead(routes, counts, arcs, egos, step_m, out):
+    """Writes points of each route ahead of an arc length, in the frame of each ego.
+
+    Args:
+        routes: (T, P, 2) x m, y m of points 1 m apart.
+        counts: (T,) number of valid points of each route, at least 2.
+        arcs: (T,) arc length of each ego along its route, m.
+        egos: (T, 4) states [x m, y m, heading rad, speed m/s].
+        step_m: distance between the points to write.
+        out: (T, N, 2) x ahead and y to the left, m, written.
+    """
+    for t in range(len(out)):
+        route, last = routes[t], counts[t] - 2
+        cos, sin = math.cos(egos[t, 2]), math.sin(egos[t, 2])
+        for k in range(out.shape[1]):
+            arc = arcs[t] + (k + 1) * step_m
+            i = min(max(math.floor(arc), 0), last)
+            dx = route[i, 0] + (arc - i) * (route[i + 1, 0] - route[i, 0]) - egos[t, 0]
+            dy = route[i, 1] + (arc - i) * (route[i + 1, 1] - route[i, 1]) - egos[t, 1]
+            out[t, k, 0] = cos * dx + sin * dy
+            out[t, k, 1] = cos * dy - sin * dx

@@ -1,4 +1,4 @@
-"""Reward as named terms, weighted and summed."""
+"""The reward: a weighted sum of named terms."""
 
 import math
 from collections.abc import Mapping
@@ -15,27 +15,31 @@ from asp_env.metrics.drivable import OFF_ROAD_M
 from asp_env.sim.world import Events
 
 MIN_GOAL_M = 1.0
+"""Progress is relative to at least this distance, so that it stays finite. Chosen by hand."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class RewardWeights:
-    """Weight of each term in the sum."""
+    """Weight of each term in the sum. Defaults are chosen by hand."""
 
     progress: float = 1.0
-    """Share of the logged ego's way gained in this step; sums to 1 at the goal."""
+    """Share of the logged ego's distance gained in this step; sums to 1 at the goal."""
     comfort: float = 0.01
     """Minus the mean square of acceleration and lateral acceleration, over the limit of 5 m/s²."""
     collision: float = 1.0
-    """-1 when the ego touches anybody in a way that it answers for."""
+    """-1 when the ego touches an agent and is at fault."""
     off_road: float = 1.0
     """-1 for every second in which a corner of the ego is over 0.3 m outside the drivable area."""
 
 
 def weights_from(given: Mapping[str, float]) -> RewardWeights:
-    """The default weights with some replaced.
+    """The default weights, some of them replaced.
+
+    Args:
+        given: weights by name of their term.
 
     Raises:
-        AspEnvError: a name is unknown, or a value is no finite number.
+        AspEnvError: a name is unknown, or a value is not a finite number.
     """
     known = [field.name for field in fields(RewardWeights)]
     for name, value in given.items():
@@ -53,10 +57,18 @@ def reward_terms(
     states_after: Float[np.ndarray, "b 4"],
     dt_s: float,
 ) -> dict[str, Float[np.ndarray, " b"]]:
-    """Unweighted terms of one step, each (B,)."""
+    """The unweighted terms of one step, by the names of `RewardWeights`.
+
+    Args:
+        before: events before the step.
+        after: events after it.
+        states_before: the egos' states [x m, y m, heading rad, speed m/s] before the step.
+        states_after: the same after it.
+        dt_s: length of the step.
+    """
     progress, comfort = np.empty(len(after.goal_m)), np.empty(len(after.goal_m))
-    _gains(before.route_m, after.route_m, after.goal_m, progress)
-    _strains(states_before, states_after, dt_s, comfort)
+    _write_progress(before.route_m, after.route_m, after.goal_m, progress)
+    _write_comfort(states_before, states_after, dt_s, comfort)
     return {
         "progress": progress,
         "comfort": comfort,
@@ -67,8 +79,8 @@ def reward_terms(
 
 @njit(cache=True)
 @no_type_check
-def _gains(before, after, goals, out):
-    """Shares of the ways to the goals that were gained; only what lies on a way counts."""
+def _write_progress(before, after, goals, out):
+    """Gained arc lengths, clipped to 0 and the goal, as shares of the goals; all (B,), in m."""
     for b in range(len(out)):
         goal = max(goals[b], MIN_GOAL_M)
         out[b] = (min(max(after[b], 0.0), goal) - min(max(before[b], 0.0), goal)) / goal
@@ -76,8 +88,8 @@ def _gains(before, after, goals, out):
 
 @njit(cache=True)
 @no_type_check
-def _strains(before, after, dt_s, out):
-    """Minus the mean squares of both accelerations, as shares of the limit."""
+def _write_comfort(before, after, dt_s, out):
+    """Minus the mean square of both accelerations over their limit (B,), from states (B, 4)."""
     for b in range(len(out)):
         turned = np.float64(after[b, 2]) - before[b, 2]
         turned -= 2.0 * math.pi * np.rint(turned / (2.0 * math.pi))
@@ -89,7 +101,7 @@ def _strains(before, after, dt_s, out):
 def weighted_sum(
     terms: dict[str, Float[np.ndarray, " b"]], weights: RewardWeights
 ) -> Float[np.ndarray, " b"]:
-    """The reward, (B,)."""
+    """The reward: the sum of all terms, each times its weight."""
     total = np.zeros(len(terms["progress"]))
     for name, value in terms.items():
         total += getattr(weights, name) * value

@@ -1,4 +1,4 @@
-"""A world and the drivers of its traffic, stepped together by what the egos do."""
+"""A world and the drivers of its traffic, stepped together."""
 
 import copy
 from collections.abc import Sequence
@@ -10,17 +10,19 @@ from jaxtyping import Bool, Float, Int
 from asp_env.data.recording import Recording
 from asp_env.data.scenarios.scenario import Scenario
 from asp_env.data.scene import EGO
-from asp_env.sim.traffic import Driver
+from asp_env.sim.traffic.driver import Driver
 from asp_env.sim.world import Ending, Events, ReplayWorld, World
 
 OFF_ROAD_END_M = 2.0
-"""An episode ends this far outside the drivable area; less may be a gap in the map."""
+"""An episode ends this far outside the drivable area. Chosen by hand: smaller distances may be a
+gap in the map."""
 
 GOAL_TOLERANCE_M = 0.01
+"""The goal counts as reached this far before it: allows for rounding."""
 
 
 class Simulation:
-    """B episodes in which slot 0 is the caller's and everybody else has the same driver."""
+    """B episodes in which the caller controls the egos and a driver controls the other agents."""
 
     def __init__(
         self,
@@ -30,19 +32,20 @@ class Simulation:
         num_episodes: int,
         dt_s: float,
         history: int,
-        kind: type[World] = ReplayWorld,
+        world_class: type[World] = ReplayWorld,
     ) -> None:
-        """Episodes begin with `reset`.
+        """Creates a simulation without episodes; `reset` starts them.
 
         Args:
-            recordings: of the scenarios to come.
-            driver: of the traffic.
+            recordings: the recordings that scenarios refer to by index.
+            driver: controls the agents other than the egos.
             num_episodes: B.
             dt_s: length of a tick.
             history: past ticks that scenes show.
-            kind: of the world, see `asp_env.sim.world.world_of`.
+            world_class: the world to create; `asp_env.sim.world.world_class` finds the one for
+                DATA.
         """
-        self.world = kind(recordings, num_episodes=num_episodes, dt_s=dt_s, history=history)
+        self.world = world_class(recordings, num_episodes=num_episodes, dt_s=dt_s, history=history)
         self.driver = driver
 
     def reset(
@@ -51,56 +54,74 @@ class Simulation:
         rngs: Sequence[np.random.Generator],
         reset_mask: Bool[np.ndarray, " b"] | None = None,
     ) -> None:
-        """Starts the episodes at `reset_mask`, by default all."""
-        chosen = np.ones(len(self.world), dtype=bool) if reset_mask is None else reset_mask
-        self.world.reset(scenarios, rngs, chosen)
-        self.driver.reset(self.world, chosen)
+        """Starts episodes.
+
+        Args:
+            scenarios: the scenario of each episode; entries outside `reset_mask` are not read.
+            rngs: the random generator of each episode, likewise.
+            reset_mask: mask of the episodes to start, all by default.
+
+        Raises:
+            AspEnvError: a scenario does not fit its recording, or the driver does not fit the
+                world.
+        """
+        started = np.ones(len(self.world), dtype=bool) if reset_mask is None else reset_mask
+        self.world.reset(scenarios, rngs, started)
+        self.driver.reset(self.world, started)
 
     def step(
-        self, ego_actions: Float[np.ndarray, "b 2"], ego_driven: Bool[np.ndarray, " b"]
+        self, ego_actions: Float[np.ndarray, "b 2"], ego_controlled: Bool[np.ndarray, " b"]
     ) -> None:
-        """One tick. Egos that are not driven are the world's: they replay, or drive themselves."""
-        control = self.driver.control(self.world)
-        actions, driven = control.actions.copy(), control.driven.copy()
-        actions[:, EGO], driven[:, EGO] = ego_actions, ego_driven
-        self.world.step(actions, driven, control.leaving)
+        """Advances all episodes by one tick.
 
-    def step_agents(
-        self, actions: Float[np.ndarray, "b a 2"], driven: Bool[np.ndarray, "b a"]
-    ) -> None:
-        """One tick in which the caller drives any agents; the traffic's driver moves the others.
-
-        The ego is never the traffic's: one that is not driven is the world's.
+        Args:
+            ego_actions: [acceleration m/s², steering rad] of the egos.
+            ego_controlled: mask of the egos that execute their action; the world moves the others.
         """
         control = self.driver.control(self.world)
-        theirs = control.driven & ~driven
-        theirs[:, EGO] = False
+        actions, controlled = control.actions.copy(), control.controlled.copy()
+        actions[:, EGO], controlled[:, EGO] = ego_actions, ego_controlled
+        self.world.step(actions, controlled, control.leaving)
+
+    def step_agents(
+        self, actions: Float[np.ndarray, "b a 2"], controlled: Bool[np.ndarray, "b a"]
+    ) -> None:
+        """Advances all episodes by one tick in which the caller controls any agents.
+
+        Args:
+            actions: [acceleration m/s², steering rad] of all agents.
+            controlled: mask of the agents that execute their action in `actions`. The driver
+                controls the others, except egos, which the world moves.
+        """
+        control = self.driver.control(self.world)
+        by_driver = control.controlled & ~controlled
+        by_driver[:, EGO] = False
         self.world.step(
-            np.where(driven[..., None], actions, control.actions),
-            driven | theirs,
-            control.leaving & ~driven,
+            np.where(controlled[..., None], actions, control.actions),
+            controlled | by_driver,
+            control.leaving & ~controlled,
         )
 
     def snapshot(self) -> tuple[Any, Driver]:
-        """The whole state, the driver's memory included, to be handed to `restore`."""
+        """A copy of the whole state, the driver's memory included, for `restore`."""
         return self.world.snapshot(), copy.deepcopy(self.driver)
 
     def restore(self, snapshot: tuple[Any, Driver]) -> None:
-        """Goes back to a snapshot, bit for bit."""
+        """Returns to the state of a snapshot, bit for bit."""
         world, driver = snapshot
         self.world.restore(world)
         self.driver = copy.deepcopy(driver)
 
 
 def ending(events: Events) -> Int[np.ndarray, " b"]:
-    """`Ending` of each episode; of several that hold, the first in the enumeration's order."""
-    out = np.full(len(events.elapsed), int(Ending.RUNNING), dtype=np.int64)
-    holds = (
+    """`Ending` of each episode; of several that apply, the first in the order of `Ending`."""
+    endings = np.full(len(events.elapsed), int(Ending.RUNNING), dtype=np.int64)
+    masks = (
         (Ending.OUT_OF_DATA, events.elapsed >= events.length),
         (Ending.GOAL, events.route_m >= events.goal_m - GOAL_TOLERANCE_M),
         (Ending.OFF_ROAD, events.off_road_m > OFF_ROAD_END_M),
         (Ending.COLLISION, events.at_fault),
     )
-    for kind, mask in holds:
-        out[mask] = int(kind)
-    return out
+    for kind, mask in masks:
+        endings[mask] = int(kind)
+    return endings

@@ -1,11 +1,4 @@
-"""What holds at one tick of B episodes, and how it is found.
-
-MERGED: The socket for worlds: B episodes at once, on arrays.
-MERGED: What a world's recordings hold of the time to come, for privileged predictors alone.
-MERGED: What worlds whose episodes are scenarios of recordings have in common.
-MERGED: Worlds that replay recordings: logged agents move as recorded, driven ones by the bicycle.
-MERGED: Which world DATA is driven in.
-"""
+"""Worlds: a batch of episodes on arrays, and the recorded traffic as the simplest of them."""
 
 import copy
 from abc import ABC, abstractmethod
@@ -29,69 +22,16 @@ from asp_env.geometry import route_coordinates
 from asp_env.metrics.boxes import AT_FAULT, Contact, ego_contacts
 from asp_env.metrics.drivable import beyond_log_m, drivable_field
 from asp_env.sim.episodes import (
+    empty_episodes,
     gather_controlled,
     initialize,
     last_ticks,
-    no_episodes,
-    place,
+    write_inits,
     write_tick,
 )
 
 _AT_FAULT = np.array([kind in AT_FAULT for kind in Contact])
-"""By the number of the contact."""
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Events:
-    """What holds now in each of B episodes."""
-
-    contacts: Int[np.ndarray, "b a"]
-    """`Contact` of the ego with each agent; one that lasts keeps the class of its first tick.
-
-    With a trailer that touches the ego at the first tick, its own, there is none.
-    """
-    off_road_m: Float[np.ndarray, " b"]
-    """How far the ego's outermost corner lies outside the drivable area.
-
-    Less what the logged ego lies outside there, if it is off the road itself: maps have gaps.
-    """
-    route_m: Float[np.ndarray, " b"]
-    """The ego's arc length along its route, which starts at its first position."""
-    route_offset_m: Float[np.ndarray, " b"]
-    """How far left of its route the ego is."""
-    route_heading_rad: Float[np.ndarray, " b"]
-    """The route's heading there."""
-    goal_m: Float[np.ndarray, " b"]
-    """The arc length that the logged ego reached at the end of the scenario."""
-    elapsed: Int[np.ndarray, " b"]
-    """Ticks since the first observation."""
-    length: Int[np.ndarray, " b"]
-    """Ticks that the recording provides."""
-
-    @property
-    def collision(self) -> Bool[np.ndarray, " b"]:
-        """Whether the ego touches anybody."""
-        return np.asarray((self.contacts > 0).any(axis=1))
-
-    @property
-    def at_fault(self) -> Bool[np.ndarray, " b"]:
-        """Whether the ego touches somebody in a way that it answers for."""
-        return np.asarray(_AT_FAULT[self.contacts].any(axis=1))
-
-
-def outside_now_m(
-    maps: Sequence[RoadMap],
-    map_index: Int[np.ndarray, " b"],
-    egos: Float[np.ndarray, "b 4"],
-    sizes: Float[np.ndarray, "b 2"],
-    on_route: Float[np.ndarray, "b 3"],
-    log_off_road_m: Float[np.ndarray, "b p"],
-) -> Float[np.ndarray, " b"]:
-    """How far each ego's outermost corner lies outside its map's drivable area, beyond its log."""
-    outside = np.zeros(len(egos), dtype=np.float32)
-    for number, road_map in enumerate(maps):
-        drivable_field(road_map).corners_m(egos, sizes, map_index == number, outside)
-    return beyond_log_m(outside, on_route, log_off_road_m)
+"""Whether the ego is at fault, by value of `Contact`."""
 
 
 class Ending(IntEnum):
@@ -104,31 +44,82 @@ class Ending(IntEnum):
     OUT_OF_DATA = 4
 
 
-class World(ABC):
-    """B episodes in recordings. One generator per episode is the drivers', not the world's.
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Events:
+    """The present situation of the ego in each of B episodes, for rewards and endings."""
 
-    Worlds differ in what moves those whom nobody drives.
+    contacts: Int[np.ndarray, "b a"]
+    """`Contact` of the ego with each agent; a contact keeps the class of its first tick.
+
+    The ego's own trailer, which touches it at the first tick, is no contact.
+    """
+    off_road_m: Float[np.ndarray, " b"]
+    """How far the ego's outermost corner is outside the drivable area.
+
+    Where the logged ego is outside as well, that distance is subtracted: maps have gaps.
+    """
+    route_m: Float[np.ndarray, " b"]
+    """The ego's arc length along its route, which starts at its first position."""
+    route_offset_m: Float[np.ndarray, " b"]
+    """The ego's distance from its route, left positive."""
+    route_heading_rad: Float[np.ndarray, " b"]
+    """Heading of the route at the ego."""
+    goal_m: Float[np.ndarray, " b"]
+    """Arc length that the logged ego reaches at the end of the scenario."""
+    elapsed: Int[np.ndarray, " b"]
+    """Ticks since the first observation."""
+    length: Int[np.ndarray, " b"]
+    """Ticks that the recording provides."""
+
+    @property
+    def collision(self) -> Bool[np.ndarray, " b"]:
+        """Whether the ego touches any agent."""
+        return np.asarray((self.contacts > 0).any(axis=1))
+
+    @property
+    def at_fault(self) -> Bool[np.ndarray, " b"]:
+        """Whether the ego touches an agent and is at fault."""
+        return np.asarray(_AT_FAULT[self.contacts].any(axis=1))
+
+
+class World(ABC):
+    """B episodes of scenarios that are stepped together on arrays: the socket for worlds.
+
+    A step executes the actions of the *controlled* agents through the bicycle model; the world
+    itself moves the *uncontrolled* ones. Worlds differ only in how uncontrolled agents move. A
+    subclass sets `traffic` and implements `_move`; one with a state beyond `episodes` extends
+    `reset`, `snapshot` and `restore` as well. Its constructor takes the arguments of this one. It
+    is registered under the scheme of its DATA, in the entry point group `asp_env.worlds`.
+
+    Every episode has its own random generator, which drivers draw from; the world draws nothing.
     """
 
     traffic: ClassVar[str]
-    """The name of the driver that leaves everybody to the world."""
+    """Name of the driver that leaves all agents uncontrolled, such as `log`."""
 
     def __init__(
         self, recordings: Sequence[Recording], *, num_episodes: int, dt_s: float, history: int
     ) -> None:
-        """A world without episodes yet; `reset` starts them."""
+        """Creates a world without episodes; `reset` starts them.
+
+        Args:
+            recordings: the recordings that scenarios refer to by index.
+            num_episodes: B.
+            dt_s: length of a tick.
+            history: past ticks that scenes show.
+        """
         self.recordings = recordings
         self.dt_s = dt_s
         self.history = history
         self.rngs: list[np.random.Generator] = [np.random.default_rng(0)] * num_episodes
         self.scenarios: list[Scenario | None] = [None] * num_episodes
-        self.episodes = no_episodes(num_episodes, ticks=history + 2, agents=1, points=2)
+        self.episodes = empty_episodes(num_episodes, ticks=history + 2, agents=1, points=2)
         self._maps: tuple[RoadMap, ...] = ()
         self._map_index = np.zeros(num_episodes, dtype=np.int64)
         self._rows = np.arange(num_episodes)
 
     def __len__(self) -> int:
-        """How many episodes run side by side."""
+        """The number of episodes."""
         return len(self.scenarios)
 
     @property
@@ -142,32 +133,37 @@ class World(ABC):
         rngs: Sequence[np.random.Generator],
         reset_mask: Bool[np.ndarray, " b"] | None = None,
     ) -> None:
-        """Starts the episodes at `reset_mask` (all by default); the others' entries are not read.
+        """Starts episodes.
+
+        Args:
+            scenarios: the scenario of each episode; entries outside `reset_mask` are not read.
+            rngs: the random generator of each episode, likewise.
+            reset_mask: mask of the episodes to start, all by default.
 
         Raises:
             AspEnvError: a scenario does not fit its recording.
         """
-        chosen = np.flatnonzero(
+        started = np.flatnonzero(
             np.ones(len(self), dtype=bool) if reset_mask is None else reset_mask
         )
-        if not len(chosen):
+        if not len(started):
             return
-        casts = [
+        inits = [
             initialize(
                 self.recordings[scenarios[b].recording],
                 scenarios[b],
                 dt_s=self.dt_s,
                 history=self.history,
             )
-            for b in chosen.tolist()
+            for b in started.tolist()
         ]
         self.episodes = self.episodes.with_room(
-            ticks=max(each.ticks for each in casts),
-            agents=max(len(each.tracks) for each in casts),
-            points=max(len(each.route) for each in casts),
+            ticks=max(init.ticks for init in inits),
+            agents=max(len(init.tracks) for init in inits),
+            points=max(len(init.route) for init in inits),
         )
-        place(self.episodes, chosen, casts, self.history)
-        for b in chosen.tolist():
+        write_inits(self.episodes, started, inits, self.history)
+        for b in started.tolist():
             self.scenarios[b], self.rngs[b] = scenarios[b], rngs[b]
         self._find_maps()
 
@@ -179,28 +175,32 @@ class World(ABC):
     def step(
         self,
         actions: Float[np.ndarray, "b a 2"],
-        driven: Bool[np.ndarray, "b a"],
+        controlled: Bool[np.ndarray, "b a"],
         leaving: Bool[np.ndarray, "b a"] | None = None,
     ) -> None:
-        """One tick: `driven` agents obey, `leaving` ones vanish, the rest is the world's.
+        """Advances all episodes by one tick; an episode at the end of its scenario stays unchanged.
 
-        Only agents that are present can be driven. An episode whose scenario has run its length
-        stays as it is, whatever the others do.
+        Args:
+            actions: [acceleration m/s², steering rad] of all agents; only those of controlled
+                agents are read.
+            controlled: mask of the agents that execute their action. The others are moved by the
+                world. An agent that is controlled before it appears stays absent.
+            leaving: mask of the agents that depart for good, none by default.
         """
-        data = self.episodes
-        rows = np.flatnonzero(data.elapsed < data.length)
+        episodes = self.episodes
+        rows = np.flatnonzero(episodes.elapsed < episodes.length)
         now = self.now[rows]
         if leaving is not None:
-            data.gone[rows] |= leaving[rows]
-        driven = driven[rows]
-        obeys = driven & data.valid[rows, now]
-        self._move(rows, now, actions, driven, obeys)
-        data.elapsed[rows] += 1
-        # a negative arc length would make the search begin anew everywhere
-        near = np.maximum(data.on_route[:, 0], 0.0)
-        on_route = route_coordinates(data.route, data.route_valid, self.ego_states(), near)
-        data.on_route[rows] = on_route[rows]
-        self._judge_contacts()
+            episodes.departed[rows] |= leaving[rows]
+        controlled = controlled[rows]
+        acting = controlled & episodes.valid[rows, now]
+        self._move(rows, now, actions, controlled, acting)
+        episodes.elapsed[rows] += 1
+        # a negative arc length would make the search global
+        near = np.maximum(episodes.on_route[:, 0], 0.0)
+        on_route = route_coordinates(episodes.route, episodes.route_valid, self.ego_states(), near)
+        episodes.on_route[rows] = on_route[rows]
+        self._update_contacts()
 
     @abstractmethod
     def _move(
@@ -208,98 +208,102 @@ class World(ABC):
         rows: Int[np.ndarray, " r"],
         now: Int[np.ndarray, " r"],
         actions: Float[np.ndarray, "b a 2"],
-        driven: Bool[np.ndarray, "r a"],
-        obeys: Bool[np.ndarray, "r a"],
+        controlled: Bool[np.ndarray, "r a"],
+        acting: Bool[np.ndarray, "r a"],
     ) -> None:
-        """Writes the tick after `now` of the episodes `rows`.
+        """Writes `states` and `valid` of `episodes` at tick `now + 1`.
+
+        Agents that have `departed` must not be valid.
 
         Args:
-            rows: which episodes.
-            now: the present tick of each.
-            actions: of all episodes.
-            driven: who is not moved by the world.
-            obeys: which of those are there to be moved.
+            rows: indices of the R episodes that are not over.
+            now: present tick of each of these episodes.
+            actions: [acceleration m/s², steering rad] for all B episodes.
+            controlled: mask of agents that the world must not move.
+            acting: mask of controlled agents that are present: they execute their action.
         """
 
-    def _judge_contacts(self) -> None:
-        """Brings contacts up to now."""
-        data, now = self.episodes, self.now
-        states, valid = data.states[self._rows, now], data.valid[self._rows, now]
-        data.contacts = ego_contacts(states, data.sizes, valid & ~data.own_trailer, data.contacts)
+    def _update_contacts(self) -> None:
+        episodes, now = self.episodes, self.now
+        states, valid = episodes.states[self._rows, now], episodes.valid[self._rows, now]
+        episodes.contacts = ego_contacts(
+            states, episodes.sizes, valid & ~episodes.own_trailer, episodes.contacts
+        )
 
     def scene(self) -> Scene:
-        """All that may be known now; targets are all present agents but the ego."""
-        data = self.episodes
+        """All that may be known now, in fresh arrays. Targets: all present agents but the ego."""
+        episodes = self.episodes
         self._infer_actions()
-        states, valid = last_ticks(data, self.now, self._rows, self.history)
+        states, valid = last_ticks(episodes, self.now, self._rows, self.history)
         past = self.now[:, None] + np.arange(-self.history, 0)
-        actions = np.ascontiguousarray(data.actions[self._rows[:, None], past].swapaxes(1, 2))
-        others = valid[..., -1].copy()
-        others[:, EGO] = False
-        seen = np.asarray(valid.any(axis=-1))  # of who comes later, nothing is known yet
+        actions = np.ascontiguousarray(episodes.actions[self._rows[:, None], past].swapaxes(1, 2))
+        targets = valid[..., -1].copy()
+        targets[:, EGO] = False
+        seen = np.asarray(valid.any(axis=-1))  # agents that appear later are not known yet
         return Scene(
             states=states,
             actions=actions,
             valid=valid,
-            sizes=np.where(seen[..., None], data.sizes, 0).astype(np.float32),
-            classes=np.where(seen, data.classes, 0).astype(np.int32),
-            ids=np.where(seen, data.ids, -1),
-            tick=data.start_tick + data.elapsed,
-            targets=np.argwhere(others),
-            route=data.route.copy(),
-            route_valid=data.route_valid.copy(),
+            sizes=np.where(seen[..., None], episodes.sizes, 0).astype(np.float32),
+            classes=np.where(seen, episodes.classes, 0).astype(np.int32),
+            ids=np.where(seen, episodes.ids, -1),
+            tick=episodes.start_tick + episodes.elapsed,
+            targets=np.argwhere(targets),
+            route=episodes.route.copy(),
+            route_valid=episodes.route_valid.copy(),
             maps=self._maps,
             map_index=self._map_index,
             dt_s=self.dt_s,
         )
 
     def _infer_actions(self) -> None:
-        """Brings the inferred actions up to now."""
-        data = self.episodes
-        behind = self.now - data.inferred
+        """Brings `episodes.actions` up to date."""
+        episodes = self.episodes
+        behind = self.now - episodes.num_actions
         for missing in np.unique(behind[behind > 0]).tolist():
             rows = np.flatnonzero(behind == missing)
-            at = data.inferred[rows, None] + np.arange(missing + 1)
-            states = data.states[rows[:, None], at].swapaxes(1, 2)
-            valid = data.valid[rows[:, None], at].swapaxes(1, 2)
-            found = infer_actions(states, valid, data.sizes[rows, :, 0], self.dt_s)
-            data.actions[rows[:, None], at[:, :-1]] = found.swapaxes(1, 2)
-            data.inferred[rows] += missing
+            ticks = episodes.num_actions[rows, None] + np.arange(missing + 1)
+            states = episodes.states[rows[:, None], ticks].swapaxes(1, 2)
+            valid = episodes.valid[rows[:, None], ticks].swapaxes(1, 2)
+            actions = infer_actions(states, valid, episodes.sizes[rows, :, 0], self.dt_s)
+            episodes.actions[rows[:, None], ticks[:, :-1]] = actions.swapaxes(1, 2)
+            episodes.num_actions[rows] += missing
 
     def maps(self) -> tuple[tuple[RoadMap, ...], Int[np.ndarray, " b"]]:
-        """The maps of the episodes' recordings, and which of them each episode lies on."""
+        """The maps of the episodes' recordings, and the index of each episode's map in them."""
         return self._maps, self._map_index
 
     def ego_states(self) -> Float[np.ndarray, "b 4"]:
-        """The egos' states now."""
+        """The egos' present states [x m, y m, heading rad, speed m/s]."""
         return self.episodes.states[self._rows, self.now, EGO]
 
     def events(self) -> Events:
-        """What holds now."""
-        data = self.episodes
+        """The egos' present situation, in fresh arrays."""
+        episodes = self.episodes
         return Events(
-            contacts=data.contacts.copy(),
-            off_road_m=outside_now_m(
-                *self.maps(),
-                self.ego_states(),
-                data.sizes[:, EGO],
-                data.on_route,
-                data.log_off_road_m,
-            ),
-            route_m=data.on_route[:, 0].copy(),
-            route_offset_m=data.on_route[:, 1].copy(),
-            route_heading_rad=data.on_route[:, 2].copy(),
-            goal_m=data.goal_m.copy(),
-            elapsed=data.elapsed.copy(),
-            length=data.length.copy(),
+            contacts=episodes.contacts.copy(),
+            off_road_m=self._off_road_m(),
+            route_m=episodes.on_route[:, 0].copy(),
+            route_offset_m=episodes.on_route[:, 1].copy(),
+            route_heading_rad=episodes.on_route[:, 2].copy(),
+            goal_m=episodes.goal_m.copy(),
+            elapsed=episodes.elapsed.copy(),
+            length=episodes.length.copy(),
         )
 
+    def _off_road_m(self) -> Float[np.ndarray, " b"]:
+        egos, sizes = self.ego_states(), self.episodes.sizes[:, EGO]
+        off_road_m = np.zeros(len(egos), dtype=np.float32)
+        for index, road_map in enumerate(self._maps):
+            drivable_field(road_map).corners_m(egos, sizes, self._map_index == index, off_road_m)
+        return beyond_log_m(off_road_m, self.episodes.on_route, self.episodes.log_off_road_m)
+
     def snapshot(self) -> Any:
-        """The whole state, to be handed to `restore`."""
+        """A copy of the whole state, for `restore`."""
         return self.episodes.copy(), list(self.scenarios), copy.deepcopy(self.rngs)
 
     def restore(self, snapshot: Any) -> None:
-        """Goes back to a snapshot, bit for bit."""
+        """Returns to the state of a snapshot, bit for bit."""
         episodes, scenarios, rngs = snapshot
         self.episodes, self.scenarios = episodes.copy(), list(scenarios)
         self.rngs = copy.deepcopy(rngs)
@@ -307,7 +311,7 @@ class World(ABC):
 
 
 class ReplayWorld(World):
-    """Whom nobody drives moves as recorded."""
+    """A world of recordings: uncontrolled agents replay their recorded tracks."""
 
     traffic = "log"
 
@@ -316,18 +320,22 @@ class ReplayWorld(World):
         rows: Int[np.ndarray, " r"],
         now: Int[np.ndarray, " r"],
         actions: Float[np.ndarray, "b a 2"],
-        driven: Bool[np.ndarray, "r a"],
-        obeys: Bool[np.ndarray, "r a"],
+        controlled: Bool[np.ndarray, "r a"],
+        acting: Bool[np.ndarray, "r a"],
     ) -> None:
-        moved = forward(*gather_controlled(self.episodes, rows, now, actions, obeys), self.dt_s)
-        write_tick(self.episodes, rows, now, driven, obeys, moved)
+        states, held, lengths = gather_controlled(self.episodes, rows, now, actions, acting)
+        next_states = forward(states, held, lengths, self.dt_s)
+        write_tick(self.episodes, rows, now, controlled, acting, next_states)
 
 
-def world_of(source: str) -> type[World]:
-    """The world that a package registers for the scheme of DATA; else recordings are replayed.
+def world_class(source: str) -> type[World]:
+    """The world for DATA: the one registered for its scheme, else `ReplayWorld`.
+
+    Args:
+        source: DATA as given on the command line: a folder or `scheme:argument`.
 
     Raises:
-        AspEnvError: a package that this world needs is missing.
+        AspEnvError: a package that the registered world needs is missing.
     """
     scheme = scheme_of(source)
     if scheme is None or scheme not in registry.names("worlds"):
@@ -336,7 +344,16 @@ def world_of(source: str) -> type[World]:
 
 
 def recorded_future(world: World, scene: Scene, horizon: int) -> Future:
-    """What the recordings say of the coming ticks of the scene's targets, whatever drives them."""
+    """The recorded states of a scene's targets, for privileged predictors only.
+
+    Args:
+        world: the world that the scene was taken from.
+        scene: the present scene, with N targets.
+        horizon: number of ticks.
+
+    Returns:
+        States (N, horizon, 4) from the next tick on, however the targets really move.
+    """
     episodes, b, a = world.episodes, scene.targets[:, 0], scene.targets[:, 1]
     index = SnippetIndex(
         recording=episodes.recording[b],
@@ -344,7 +361,7 @@ def recorded_future(world: World, scene: Scene, horizon: int) -> Future:
         tick=scene.tick[b],
         dt_s=world.dt_s,
         history=0,
-        horizon=horizon,
+        horizon_ticks=horizon,
     )
     states, valid = gather_ticks(world.recordings, index, 1 + np.arange(horizon))
     return Future(states=states, valid=valid)

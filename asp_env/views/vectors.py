@@ -32,6 +32,7 @@ from numba import njit
 from asp_env.data.classes import AgentClass
 from asp_env.data.road_map import LineType, MapCache, RoadMap
 from asp_env.errors import AspEnvError
+from asp_env.geometry import arc_lengths, points_at
 from asp_env.views.view import Drawable
 
 KINDS = ("lane", "curb", "solid", "dashed")
@@ -89,20 +90,16 @@ def _cut(
     """Middles and points of the pieces of one line."""
     steps = np.hypot(*np.diff(line, axis=0).T)
     keep = np.concatenate([[True], steps > 0])
-    line, arc = line[keep], np.concatenate([[0.0], np.cumsum(steps)])[keep]
+    line, arc = line[keep], arc_lengths(line)[keep]
     length = float(arc[-1])
     count = math.ceil(length / PIECE_M - 1e-9)
     share = np.arange(count)[:, None] + np.linspace(0, 1, POINTS)
     at = share * (length / max(count, 1))
     before, behind = np.maximum(at - TANGENT_M, 0), np.minimum(at + TANGENT_M, length)
-    along = _at(line, arc, behind) - _at(line, arc, before)
+    along = points_at(line, arc, behind) - points_at(line, arc, before)
     along /= np.maximum(np.hypot(along[..., 0], along[..., 1]), 1e-9)[..., None]
-    middles = _at(line, arc, 0.5 * (at[:, 0] + at[:, -1]))
-    return middles, np.concatenate([_at(line, arc, at), along], axis=-1)
-
-
-def _at(line: np.ndarray, arc: np.ndarray, at: np.ndarray) -> np.ndarray:
-    return np.stack([np.interp(at, arc, line[:, axis]) for axis in (0, 1)], axis=-1)
+    middles = points_at(line, arc, 0.5 * (at[:, 0] + at[:, -1]))
+    return middles, np.concatenate([points_at(line, arc, at), along], axis=-1)
 
 
 AHEAD_M = 20.0

@@ -13,6 +13,7 @@ from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
 from asp_env.errors import AspEnvError
+from asp_env.files import atomic_file
 from asp_env.workers import WorkerExitError, WorkerPool
 from predictors.experiments.cells import Cell
 from predictors.experiments.job import Job, run_job
@@ -50,9 +51,8 @@ class Costs:
         cell["wall_s"] = round(cell["wall_s"] + wall_s, 1)
         cell["processes"] += 1
         content = {"total_cpu_s": round(self.total_cpu_s, 1), "cells": self._cells}
-        aside = self._path.with_name(f".{self._path.name}.part")
-        aside.write_text(json.dumps(content, indent=1) + "\n")
-        os.replace(aside, self._path)
+        with atomic_file(self._path) as partial:
+            partial.write_text(json.dumps(content, indent=1) + "\n")
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -1,6 +1,5 @@
 """Errors of forecasts on every snippet of the test recordings, stored in one file per predictor."""
 
-import os
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -22,6 +21,7 @@ from asp_env.data.source import Recordings
 from asp_env.data.split import snippet_parts
 from asp_env.errors import AspEnvError
 from asp_env.evaluation.open_loop.scoring import BATCH, complete_forecast
+from asp_env.files import atomic_file
 from asp_env.metrics.forecast.errors import SELECTIONS, moving, open_loop_errors
 
 METRICS = ("MAE", "MSE", "ADE", "FDE")
@@ -42,10 +42,8 @@ class Errors:
     """Hash of all that the errors depend on."""
 
     def save(self, path: Path) -> None:
-        """Writes an `.npz` file under another name, then renames it."""
-        path.parent.mkdir(parents=True, exist_ok=True)
-        aside = path.with_name(f".{path.name}.part")
-        with aside.open("wb") as file:
+        """Writes a compressed `.npz` file atomically."""
+        with atomic_file(path) as partial, partial.open("wb") as file:
             np.savez_compressed(
                 file,
                 values=self.values,
@@ -55,7 +53,6 @@ class Errors:
                 tick=self.tick,
                 stamp=np.array(self.stamp),
             )
-        os.replace(aside, path)
 
     @classmethod
     def load(cls, path: Path) -> "Errors":
@@ -158,8 +155,8 @@ def compute_errors(
         origin = now[:, None, :2]
         truth = future.states[..., :2] - origin
         for name, predictor in predictors.items():
-            forecast = complete_forecast(predictor, scene, future, index.horizon)
-            local = forecast.states[:, :, : index.horizon, :2] - origin[:, None]
+            forecast = complete_forecast(predictor, scene, future, index.horizon_ticks)
+            local = forecast.states[:, :, : index.horizon_ticks, :2] - origin[:, None]
             for which, selection in enumerate(SELECTIONS):
                 errors = open_loop_errors(local, forecast.log_probs, truth, future.valid, selection)
                 values[name][which, :, rows] = [errors[metric].value for metric in METRICS]

@@ -2,7 +2,6 @@
 
 import fcntl
 import json
-import os
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import MISSING, asdict, dataclass, fields, is_dataclass
@@ -14,6 +13,7 @@ from rich.console import Console
 
 from asp_env.data.recording import DEFAULT_DT_S, ticks
 from asp_env.errors import AspEnvError, MissingExtraError, unknown_name
+from asp_env.files import atomic_file, leftovers
 from asp_env.metrics.forecast.errors import MODE_RULES
 from asp_env.views import VIEWS
 from predictors.experiments.campaign import COST, Campaign
@@ -251,7 +251,8 @@ def _claimed(out: Path, fixed: dict[str, Any], *, exclusive: bool) -> Iterator[N
         AspEnvError: it contains something else, or another command has locked it.
     """
     path = out / PLAN
-    begun = {LOCK, f".{PLAN}.part"}  # may be all that a killed command has left
+    # A killed command may have left only these.
+    begun = {LOCK, *(each.name for each in leftovers(path))}
     foreign = out.exists() and (not out.is_dir() or {each.name for each in out.iterdir()} - begun)
     if foreign and not path.exists():
         raise AspEnvError(f"{out}: contains something that is no table; choose another --out")
@@ -266,9 +267,8 @@ def _claimed(out: Path, fixed: dict[str, Any], *, exclusive: bool) -> Iterator[N
             ) from error
         expected = json.loads(json.dumps(fixed))
         if not path.exists():
-            aside = path.with_name(f".{PLAN}.part")
-            aside.write_text(json.dumps(fixed, indent=1) + "\n")
-            os.replace(aside, path)
+            with atomic_file(path) as partial:
+                partial.write_text(json.dumps(fixed, indent=1) + "\n")
         elif (plan := _read_plan(path)) != expected:
             names = ", ".join(name for name in expected if plan.get(name) != expected[name])
             raise AspEnvError(

@@ -7,8 +7,6 @@ for each site and horizon. The first site is compared with inD, the second one w
 """
 
 import io
-import os
-import tempfile
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
 from types import MappingProxyType
@@ -22,6 +20,7 @@ from rich.text import Text
 
 from asp_env.evaluation.results import Row, write_manifest, write_metrics
 from asp_env.evaluation.statistics import Estimate
+from asp_env.files import atomic_file
 from predictors.experiments.cells import Cell, Site
 from predictors.experiments.errors import Errors
 from predictors.experiments.job import EvaluationJob, errors_path
@@ -464,16 +463,13 @@ def export(
         shown: tables of `report.html` and `table.txt`.
         manifest: content of `manifest.json`.
     """
-    with tempfile.TemporaryDirectory(dir=out, prefix=".fresh") as aside:
-        folder = Path(aside)
-        write_metrics(folder, lines)
-        write_manifest(folder, "table", **manifest)
-        page = Console(record=True, width=PAGE_WIDTH, file=io.StringIO())
-        for table in shown:
-            page.print(table, "")
-        text = page.export_text(clear=False)
-        (folder / TEXT).write_text(text, encoding="utf-8")
-        html = page.export_html(theme=DEFAULT_TERMINAL_THEME, code_format=PAGE)
-        (folder / REPORT).write_text(html, encoding="utf-8")
-        for path in list(folder.iterdir()):
-            os.replace(path, out / path.name)
+    page = Console(record=True, width=PAGE_WIDTH, file=io.StringIO())
+    for table in shown:
+        page.print(table, "")
+    text = page.export_text(clear=False)
+    html = page.export_html(theme=DEFAULT_TERMINAL_THEME, code_format=PAGE)
+    write_metrics(out, lines)
+    write_manifest(out, "table", **manifest)
+    for name, content in ((TEXT, text), (REPORT, html)):
+        with atomic_file(out / name) as partial:
+            partial.write_text(content, encoding="utf-8")

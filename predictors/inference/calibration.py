@@ -1,64 +1,61 @@
-"""Calibrating the probabilities of modes by temperatures (Guo et al. 2017)."""
+"""Calibration of the modes' probabilities by temperatures (Guo et al. 2017)."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 
 import numpy as np
 import torch
 from jaxtyping import Float, Int
 from lightning.fabric.utilities import move_data_to_device
 
-from predictors.models.batch import Batch
+from predictors.models.batch import Batch, Labels
 from predictors.models.losses import best_mode
 from predictors.models.network import AbstractNetwork, Modes
-from predictors.models.ssp_asp import SSPASPNetwork
-from predictors.training.data import Batches
 
 LIMITS = (0.05, 20.0)
+"""Lowest and highest temperature. Chosen by hand."""
+
 STEPS = 60
+"""Steps of the search; each reduces the interval to 0.62 of it, so the last is 2e-12 wide."""
+
 _GOLDEN = (np.sqrt(5.0) - 1) / 2
 
 
-def calibrate(network: AbstractNetwork, batches: Batches) -> float:
-    """Calibrates a network on validation data; leaves it evaluating, on the CPU.
+def calibrate(network: AbstractNetwork, batches: Iterable[tuple[Batch, Labels]]) -> float:
+    """Fits the temperatures of a network on validation data.
 
-    Worked out on a GPU where there is one: at full size a CPU would take longer than the training.
+    First the merging temperature, if the network merges chains, which it stores; then the
+    temperature of its forecasts. The network ends in evaluation, on the CPU. A GPU is used if there
+    is one: at full size a CPU would take longer than the training.
+
+    Args:
+        network: The trained network.
+        batches: Inputs and labels, iterated once for each temperature.
 
     Returns:
-        What the logits of its forecasts are to be divided by. What those of chains are divided by
-        before they are merged, where any are, the network keeps.
+        The divisor of the logits of its forecasts.
     """
     device = torch.device("cuda" if torch.cuda.is_available() else "cpu")
     network.eval().to(device)
-    if isinstance(network, SSPASPNetwork) and network.merging_temperature is not None:
-        found = _temperature(lambda batch: network.chain(batch, "full"), batches, device)
-        network.merging_temperature.fill_(found)
+    if network.merging_temperature is not None:
+        merging = _temperature(lambda batch: network.chain(batch, "full"), batches, device)
+        network.merging_temperature.fill_(merging)
     temperature = _temperature(network, batches, device)
     network.cpu()
     return temperature
 
 
-def _temperature(
-    forecast: Callable[[Batch], Modes], batches: Batches, device: torch.device
-) -> float:
-    logits, best = [], []
-    with torch.inference_mode():
-        for each in batches:
-            batch, labels = move_data_to_device(each, device)
-            modes = forecast(batch)
-            logits.append(modes.logits.cpu().numpy())
-            nearest = best_mode(modes.states[..., :2], labels.states[..., :2], "distance")
-            best.append(nearest.cpu().numpy())
-    return fit_temperature(np.concatenate(logits), np.concatenate(best))
-
-
 def fit_temperature(logits: Float[np.ndarray, "n m"], best: Int[np.ndarray, " n"]) -> float:
-    """What logits are to be divided by so that the best modes are the least improbable.
+    """Finds the divisor of logits that minimises the cross-entropy of the best modes.
 
-    Golden-section search on the logarithm: in 1/temperature the mean cross-entropy is convex.
+    Golden-section search on the logarithm of the temperature; the mean cross-entropy is convex in
+    its inverse.
 
     Args:
-        logits: of the modes.
-        best: the mode that each label is nearest to.
+        logits: Logits of the modes.
+        best: Index of the mode that is nearest to each label.
+
+    Returns:
+        A temperature within `LIMITS`; 1 if there is no sample or only one mode.
     """
     if len(logits) == 0 or logits.shape[1] == 1:
         return 1.0
@@ -75,8 +72,24 @@ def fit_temperature(logits: Float[np.ndarray, "n m"], best: Int[np.ndarray, " n"
 def cross_entropy(
     logits: Float[np.ndarray, "n m"], best: Int[np.ndarray, " n"], temperature: float
 ) -> float:
-    """Mean of minus the logarithm of the best modes' probabilities."""
+    """Mean negative logarithm of the best modes' probabilities at a temperature."""
     scaled = logits.astype(np.float64) / temperature
     scaled -= scaled.max(axis=1, keepdims=True)
     total = np.log(np.exp(scaled).sum(axis=1))
     return float((total - scaled[np.arange(len(best)), best]).mean())
+
+
+def _temperature(
+    forecast: Callable[[Batch], Modes],
+    batches: Iterable[tuple[Batch, Labels]],
+    device: torch.device,
+) -> float:
+    logits, best = [], []
+    with torch.inference_mode():
+        for sample in batches:
+            batch, labels = move_data_to_device(sample, device)
+            modes = forecast(batch)
+            logits.append(modes.logits.cpu().numpy())
+            nearest = best_mode(modes.states[..., :2], labels.states[..., :2], "distance")
+            best.append(nearest.cpu().numpy())
+    return fit_temperature(np.concatenate(logits), np.concatenate(best))

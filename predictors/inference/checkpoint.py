@@ -1,10 +1,13 @@
-"""A trained predictor's folder: configuration, weights and model card. Nothing is unpickled."""
+"""A trained predictor on disk: a folder with its configuration, weights and model card.
+
+Nothing in the folder is unpickled when it is loaded.
+"""
 
 import dataclasses
 import hashlib
 import json
 import math
-import os
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -13,28 +16,62 @@ from safetensors import SafetensorError
 from safetensors.torch import load_file, save
 from torch import Tensor
 
+from asp_env.data.predictor import Predictor
 from asp_env.data.split import TrainedOn
 from asp_env.errors import AspEnvError, CheckpointError, unknown_name
+from asp_env.files import atomic_file, remove_stale
 from asp_env.views import BinaryView, SceneView, view_from_config
 from predictors.inference.model_card import model_card
 from predictors.inference.trained import TrainedPredictor
 from predictors.models.chaining import CHAININGS, Chaining
-from predictors.models.network import AbstractNetwork, LearnedPlug, NetworkShape
-from predictors.models.ssp_asp import SSPASPNetwork
+from predictors.models.network import AbstractNetwork, NetworkConfig, NetworkShape
 
 CONFIG = "config.json"
 WEIGHTS = "weights.safetensors"
 CARD = "README.md"
 FORMAT = 1
+"""Version of the format of `config.json`."""
 
 HASH_DIGITS = 16
-"""Hexadecimal digits of the weights' SHA-256 that tables show."""
+"""Hexadecimal digits of the weights' SHA-256 in tables."""
 
 
-def save_learned(
+@dataclass(frozen=True, slots=True, kw_only=True)
+class PredictorSpec:
+    """A kind of trained predictor: its name and the classes that a run of it is made of.
+
+    The registry holds one for each trained predictor, see `predictors.plugs`.
+    """
+
+    name: str
+    """Name in the registry."""
+    config: type[NetworkConfig]
+    """Configuration of the network, with values that JSON can store."""
+    network: type[AbstractNetwork]
+    """Network, constructed from (config, shape). The docstring of its module describes the
+    predictor in model cards."""
+
+    def from_name(self, argument: str, *, horizon: int, dt_s: float) -> Predictor:
+        """Loads the predictor from the folder of a finished run.
+
+        Args:
+            argument: The folder, and optionally an @ and a chaining, for a run of several segments:
+                `RUN@beam` (the default), `RUN@top1`, `RUN@full`, or the privileged `RUN@oracle`.
+            horizon: Ignored; a trained predictor keeps its own.
+            dt_s: Time step of the scenes to forecast.
+
+        Raises:
+            CheckpointError: The folder holds no finished run of this predictor.
+            AspEnvError: It was trained for another time step, or the chaining does not apply.
+        """
+        del horizon
+        return load_trained(self, argument, dt_s=dt_s)
+
+
+def save_trained(
     folder: Path,
     *,
-    plug: LearnedPlug,
+    spec: PredictorSpec,
     network_config: Any,
     shape: NetworkShape,
     view: SceneView,
@@ -42,22 +79,22 @@ def save_learned(
     temperature: float,
     provenance: dict[str, Any],
 ) -> None:
-    """Writes a predictor that `load_learned` loads, and its card; the configuration last.
+    """Writes a predictor, which `load_trained` loads, and its model card; the configuration last.
 
     Args:
-        folder: an existing folder.
-        plug: of which predictor this is.
-        network_config: an instance of the plug's configuration.
-        shape: what the network was made for, with the normaliser.
-        view: what it looks at.
-        weights: the network's state.
-        temperature: what its logits are to be divided by.
-        provenance: what it was trained on (`trained_on`) and how (`config`, with its `preset`
-            if it has one); no times of day.
+        folder: An existing folder.
+        spec: The kind of predictor.
+        network_config: An instance of `spec.config`.
+        shape: The network's shape, with the normaliser.
+        view: The view that it was trained on.
+        weights: The network's state.
+        temperature: Divisor of the logits.
+        provenance: What it was trained on (`trained_on`) and how (`config`, with its `preset` if it
+            has one); no times of day.
     """
     config = {
         "format": FORMAT,
-        "predictor": plug.name,
+        "predictor": spec.name,
         "network": dataclasses.asdict(network_config),
         "view": view.config(),
         "dt_s": shape.dt_s,
@@ -68,108 +105,105 @@ def save_learned(
         "provenance": provenance,
     }
     save_weights(weights, folder / WEIGHTS)
-    config = json.loads(json.dumps(config))  # as whoever reads it will find it
-    card = model_card(config, plug, weights=weights_hash(folder))
-    _write(card.encode(), folder / CARD)
+    config = json.loads(json.dumps(config))  # tuples become lists, as in the file
+    card = model_card(config, spec.network, weights=weights_hash(folder))
+    write_file(card.encode(), folder / CARD)
     write_json(config, folder / CONFIG)
 
 
-def load_learned(
-    plug: LearnedPlug, argument: str, *, dt_s: float | None = None
+def load_trained(
+    spec: PredictorSpec, argument: str, *, dt_s: float | None = None
 ) -> TrainedPredictor:
-    """The predictor in a finished run's folder.
+    """Loads the predictor in the folder of a finished run.
 
     Args:
-        plug: of which predictor it must be.
-        argument: the folder, and behind an @ how segments are chained, if not by beam.
-        dt_s: the time step of the scenes to come; None takes the run's own.
+        spec: The expected kind of predictor.
+        argument: The folder, and optionally an @ and a chaining.
+        dt_s: Time step of the scenes to forecast; None for the run's own.
 
     Raises:
-        CheckpointError: it is missing, damaged, or of another predictor.
-        AspEnvError: it was trained for another time step, or does not chain as is asked.
+        CheckpointError: The folder is missing, damaged, or of another predictor.
+        AspEnvError: It was trained for another time step, or the chaining does not apply.
     """
     if not argument:
         raise CheckpointError(
-            f"predictor {plug.name} is trained: name its run as {plug.name}:RUN_DIR"
+            f"predictor {spec.name} is trained: name its run as {spec.name}:RUN_DIR"
         )
     folder, chaining = folder_and_chaining(argument)
     config = read_config(folder)
-    if config["predictor"] != plug.name:
+    if config["predictor"] != spec.name:
         raise CheckpointError(
-            f"{folder} holds the predictor {config['predictor']!r}, not {plug.name!r}: "
+            f"{folder} holds the predictor {config['predictor']!r}, not {spec.name!r}: "
             f"name it as {config['predictor']}:{folder}"
         )
     try:
-        view, network, trained_on = _build(plug, config)
+        view, network, trained_on = _build(spec, config)
         temperature = _positive("temperature", config["temperature"])
         training = config["provenance"].get("config", {})
         _check_training(training, network.shape, view)
-        about = {
+        metadata = {
             "trained_on": trained_on.source,
             "view": view.name,
             **{key: str(training[key]) for key in ("preset", "history") if key in training},
         }
     except (AttributeError, KeyError, OverflowError, RuntimeError, TypeError, ValueError) as error:
         raise CheckpointError(
-            f"{folder / CONFIG} does not describe a {plug.name}: {_brief(error)}"
+            f"{folder / CONFIG} does not describe a {spec.name}: {_brief(error)}"
         ) from error
     shape = network.shape
     if dt_s is not None and abs(shape.dt_s - dt_s) > 1e-6:
         raise AspEnvError(
-            f"{plug.name} in {folder} was trained for a time step of {shape.dt_s:g} s, "
+            f"{spec.name} in {folder} was trained for a time step of {shape.dt_s:g} s, "
             f"the scenes have {dt_s:g} s"
         )
     if len(network.later_ticks) > 1:
-        about["chaining"] = chaining or "beam"
+        metadata["chaining"] = chaining or "beam"
     elif chaining is not None:
         raise AspEnvError(
-            f"{plug.name} in {folder} forecasts {shape.horizon * shape.dt_s:g} s at once, there is "
-            f"nothing to chain: name it without @{chaining}, as {plug.name}:{folder}"
+            f"{spec.name} in {folder} forecasts {shape.horizon * shape.dt_s:g} s at once, there is "
+            f"nothing to chain: name it without @{chaining}, as {spec.name}:{folder}"
         )
     _load_weights(network, folder / WEIGHTS)
-    calm = network.merging_temperature if isinstance(network, SSPASPNetwork) else None
-    if chaining == "full" and calm is not None:  # the other temperature is that of merged chains
-        temperature = float(calm)
     return TrainedPredictor(
-        name=plug.name,
+        name=spec.name,
         network=network,
         view=view,
         trained_on=trained_on,
-        about={**about, "weights": weights_hash(folder)},
+        metadata={**metadata, "weights": weights_hash(folder)},
         temperature=temperature,
         chaining=chaining or "beam",
     )
 
 
 def folder_and_chaining(argument: str) -> tuple[Path, Chaining | None]:
-    """What stands before and behind the last @ of `RUN@chaining`.
+    """Splits `RUN@chaining` at the last @.
 
-    A folder may have an @ in its own name: one that exists is taken as a whole.
+    The name of a folder may contain an @: an existing folder is taken as a whole.
 
     Raises:
-        AspEnvError: there is no such chaining.
+        AspEnvError: The chaining is unknown.
     """
-    before, at, behind = argument.rpartition("@")
-    if not at or Path(argument).is_dir():
+    before, separator, after = argument.rpartition("@")
+    if not separator or Path(argument).is_dir():
         return Path(argument), None
     for chaining in CHAININGS:
-        if behind == chaining:
+        if after == chaining:
             return Path(before), chaining
     if Path(before).is_dir():
-        raise unknown_name("chaining", behind, CHAININGS)
+        raise unknown_name("chaining", after, CHAININGS)
     return Path(argument), None
 
 
 def weights_hash(folder: Path) -> str:
-    """The first digits of the hash of a run's weights, as tables show them."""
+    """The first digits of the hash of a run's weights."""
     return hashlib.sha256((folder / WEIGHTS).read_bytes()).hexdigest()[:HASH_DIGITS]
 
 
 def read_config(folder: Path) -> dict[str, Any]:
-    """What `config.json` of a finished run says.
+    """Reads `config.json` of a finished run.
 
     Raises:
-        CheckpointError: it is missing or damaged.
+        CheckpointError: The file is missing or damaged.
     """
     path = folder / CONFIG
     try:
@@ -189,13 +223,18 @@ def read_config(folder: Path) -> dict[str, Any]:
 
 
 def shape_for(view: SceneView, **numbers: Any) -> NetworkShape:
-    """The shape of a network that looks at a view; the other fields by name."""
+    """The shape of a network for a view.
+
+    Args:
+        view: The view.
+        **numbers: The other fields of `NetworkShape`.
+    """
     packed = isinstance(view, BinaryView)
-    return NetworkShape(seen=view.shape, packed=packed, **numbers)
+    return NetworkShape(observation=view.shape, packed=packed, **numbers)
 
 
 def _build(
-    plug: LearnedPlug, config: dict[str, Any]
+    spec: PredictorSpec, config: dict[str, Any]
 ) -> tuple[SceneView, AbstractNetwork, TrainedOn]:
     view = view_from_config(config["view"])
     acceleration, steering = (
@@ -209,8 +248,8 @@ def _build(
         action_range=(acceleration, steering),
     )
     trained_on = TrainedOn(**config["provenance"]["trained_on"])
-    with torch.random.fork_rng(devices=[]):  # initial weights are drawn and at once replaced
-        network = plug.network(plug.config(**config["network"]), shape)
+    with torch.random.fork_rng(devices=[]):  # for initial weights, which are replaced
+        network = spec.network(spec.config(**config["network"]), shape)
     return view, network, trained_on
 
 
@@ -222,18 +261,18 @@ def _positive(field: str, given: Any) -> float:
 
 
 def _check_training(training: dict[str, Any], shape: NetworkShape, view: SceneView) -> None:
-    """Weights may fit a network of another view or horizon that they were not trained for."""
-    found = {"view": view.name, "horizon_s": round(shape.horizon * shape.dt_s, 6)}
-    for field, value in found.items():
+    """Refuses a view or horizon other than in training; the weights might fit nevertheless."""
+    loaded = {"view": view.name, "horizon_s": round(shape.horizon * shape.dt_s, 6)}
+    for field, value in loaded.items():
         if training.get(field, value) != value:
             raise ValueError(f"{field} is {value}, but it was trained with {training[field]}")
 
 
 def read_weights(path: Path) -> dict[str, Tensor]:
-    """The tensors of a finished run.
+    """Reads the weights of a finished run.
 
     Raises:
-        CheckpointError: they are missing, damaged, or not finite.
+        CheckpointError: The file is missing or damaged, or a weight is not finite.
     """
     try:
         weights = load_file(path)
@@ -256,21 +295,22 @@ def _load_weights(network: AbstractNetwork, path: Path) -> None:
 
 
 def save_weights(weights: dict[str, Tensor], path: Path) -> None:
-    """Writes tensors aside, then renames."""
-    _write(save({name: tensor.detach().contiguous() for name, tensor in weights.items()}), path)
+    """Writes tensors as safetensors, atomically."""
+    write_file(save({name: tensor.detach().contiguous() for name, tensor in weights.items()}), path)
 
 
 def write_json(content: dict[str, Any], path: Path) -> None:
-    """Writes JSON aside, then renames."""
-    _write((json.dumps(content, indent=1, sort_keys=True) + "\n").encode(), path)
+    """Writes JSON with sorted keys, atomically."""
+    write_file((json.dumps(content, indent=1, sort_keys=True) + "\n").encode(), path)
 
 
-def _write(content: bytes, path: Path) -> None:
-    aside = path.with_name(path.name + ".part")
-    aside.write_bytes(content)
-    os.replace(aside, path)
+def write_file(content: bytes, path: Path) -> None:
+    """Writes a file atomically, and removes what killed processes left beside it."""
+    with atomic_file(path) as partial:
+        partial.write_bytes(content)
+    remove_stale(path)
 
 
 def _brief(error: BaseException) -> str:
-    words = " ".join(str(error).split())
-    return words if len(words) <= 200 else words[:197] + "..."
+    text = " ".join(str(error).split())
+    return text if len(text) <= 200 else text[:197] + "..."

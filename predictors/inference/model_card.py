@@ -1,4 +1,4 @@
-"""The model card of a run: a `README.md` for people, with a header that model hubs read."""
+"""The model card of a run: a `README.md` with a header that model hubs read."""
 
 import json
 import sys
@@ -8,7 +8,7 @@ from types import MappingProxyType
 from typing import Any
 
 from asp_env.data.classes import PREDICTED, AgentClass
-from predictors.models.network import LearnedPlug
+from predictors.models.network import AbstractNetwork
 
 PAPERS: Mapping[str, str] = MappingProxyType(
     {
@@ -23,42 +23,46 @@ PAPERS: Mapping[str, str] = MappingProxyType(
         ),
     }
 )
-"""By predictor."""
+"""The paper of each predictor."""
 
 HISTORIES = MappingProxyType(
     {
-        "recorded": "as in the files, which may be smoothed with what came after: more than a "
-        "vehicle has",
-        "causal": "filtered forward on noisy positions, so that nothing of the future is in them",
+        "recorded": "as in the files, which may be smoothed with later frames that a vehicle does "
+        "not have",
+        "causal": "filtered forward from noisy positions, without later frames",
     }
 )
+"""What the option `history` of a training means."""
 
 
-def model_card(config: dict[str, Any], plug: LearnedPlug, *, weights: str) -> str:
-    """The text of a run's card; the same for the same configuration.
+def model_card(config: dict[str, Any], network: type[AbstractNetwork], *, weights: str) -> str:
+    """Writes the card of a run; equal configurations give equal text.
 
     Args:
-        config: the content of the run's `config.json`. What it does not say is left out.
-        plug: of the predictor.
-        weights: the first digits of the hash of its weights.
+        config: The content of the run's `config.json`. Facts that are missing there are omitted.
+        network: The network's class; the docstring of its module describes the predictor.
+        weights: The first digits of the hash of its weights.
+
+    Returns:
+        Markdown.
     """
-    name, horizon_s = plug.name, config["horizon"] * config["dt_s"]
+    name, horizon_s = config["predictor"], config["horizon"] * config["dt_s"]
     lines = [
         *_header(config),
         f"# {name}, {horizon_s:g} s",
         "",
-        *_what(plug),
+        *_description(name, network),
         "",
         *_table(_facts(config, weights)),
         "",
         "```",
-        f"asp-env evaluate DATA --predictors {name}:RUN --horizon {horizon_s:g} --out judged",
+        f"asp-env evaluate DATA --predictors {name}:RUN --horizon {horizon_s:g} --out evaluated",
         f"asp-env export {name}:RUN --out {name}.onnx",
         "```",
         "",
         "RUN is this folder. Nothing in it is unpickled.",
         "",
-        "## Trained on",
+        "## Training data",
         "",
         *_table(_data(config["provenance"])),
         "",
@@ -72,9 +76,9 @@ def model_card(config: dict[str, Any], plug: LearnedPlug, *, weights: str) -> st
         "",
         "## Terms",
         "",
-        "The weights carry the terms of the recordings that they were trained on: those of "
-        "recordings under CC BY-NC-SA, for instance, are for non-commercial use, name their source "
-        "and are passed on under the same terms. The program is under the MIT licence.",
+        "The weights are subject to the terms of the recordings that they were trained on. For "
+        "recordings under CC BY-NC-SA, for instance, the weights are for non-commercial use, with "
+        "attribution and under the same terms. The program is under the MIT licence.",
     ]
     return "\n".join(lines) + "\n"
 
@@ -92,13 +96,13 @@ def _header(config: dict[str, Any]) -> Iterator[str]:
     yield ""
 
 
-def _what(plug: LearnedPlug) -> Iterator[str]:
-    """The first two paragraphs of the predictor's own documentation."""
-    told = (sys.modules[plug.network.__module__].__doc__ or "").strip().split("\n\n")
-    for paragraph in told[:2]:
+def _description(name: str, network: type[AbstractNetwork]) -> Iterator[str]:
+    """The first two paragraphs of the docstring of the network's module, and the paper."""
+    docstring = sys.modules[network.__module__].__doc__ or ""
+    for paragraph in docstring.strip().split("\n\n")[:2]:
         yield from (paragraph, "")
-    if plug.name in PAPERS:
-        yield f"After {PAPERS[plug.name]}."
+    if name in PAPERS:
+        yield f"Paper: {PAPERS[name]}."
 
 
 def _facts(config: dict[str, Any], weights: str) -> dict[str, object]:
@@ -106,12 +110,12 @@ def _facts(config: dict[str, Any], weights: str) -> dict[str, object]:
     training = config["provenance"].get("config", {})
     classes = [kind.name.lower() for kind in AgentClass if kind in PREDICTED]
     return {
-        "preset": training.get("preset"),
-        "sees": f"view `{json.dumps(config['view'], sort_keys=True)}`",
-        "needs": f"{history * dt_s:g} s of history: {history} ticks of {dt_s:g} s",
-        "says": f"{config['network'].get('modes')} modes of {config['horizon']} ticks of {dt_s:g} s"
-        f" ({config['horizon'] * dt_s:g} s) and their probabilities",
-        "of": ", ".join(classes),
+        "recipe": training.get("preset"),
+        "view": f"`{json.dumps(config['view'], sort_keys=True)}`",
+        "history": f"{history * dt_s:g} s: {history} ticks of {dt_s:g} s",
+        "forecast": f"{config['network'].get('modes')} modes of {config['horizon']} ticks of "
+        f"{dt_s:g} s ({config['horizon'] * dt_s:g} s) and their probabilities",
+        "agent classes": ", ".join(classes),
         "network": f"`{json.dumps(config['network'], sort_keys=True)}`",
         "weights": f"SHA-256 `{weights}…`",
     }
@@ -120,37 +124,42 @@ def _facts(config: dict[str, Any], weights: str) -> dict[str, object]:
 def _data(provenance: dict[str, Any]) -> dict[str, object]:
     trained_on, training = provenance["trained_on"], provenance.get("config", {})
     parts, snippets = Counter(trained_on["parts"].values()), provenance.get("snippets", {})
-    dealt = [f"{count} {part}" for part, count in sorted(parts.items())]
-    history = training.get("history")
+    validation, history = training.get("validation"), training.get("history")
+    standing_share = training.get("standing_share")
     return {
         "data": f"`{trained_on['source']}`",
-        "validation data": None if not (other := training.get("validation")) else f"`{other}`",
+        "validation data": f"`{validation}`" if validation else None,
         "split": trained_on["split"],
-        "recordings": ", ".join(dealt) or None,
-        "snippets": ", ".join(f"{count} {part}" for part, count in sorted(snippets.items()))
-        or None,
+        "recordings": _counts(parts),
+        "snippets": _counts(snippets),
         "standing targets": None
-        if (share := training.get("standing_share")) is None
-        else f"at most {share:g} of the training snippets",
+        if standing_share is None
+        else f"at most {standing_share:g} of the training snippets",
         "histories": None if history is None else f"{history}: {HISTORIES.get(history, '')}",
         "hash of the data": provenance.get("data_hash"),
     }
 
 
+def _counts(counts: Mapping[str, int]) -> str | None:
+    return ", ".join(f"{count} {part}" for part, count in sorted(counts.items())) or None
+
+
 def _recipe(provenance: dict[str, Any]) -> dict[str, object]:
-    shown = ("view", "pixels", "network", "predictor", "preset", "history", "validation", "split")
+    elsewhere = {
+        *("view", "pixels", "network", "predictor", "preset", "history", "validation", "split")
+    }
     training = provenance.get("config", {})
     best = provenance.get("best_value")
     return {
-        **{field: value for field, value in sorted(training.items()) if field not in shown},
-        "started from weights": provenance.get("start"),
+        **{field: value for field, value in sorted(training.items()) if field not in elsewhere},
+        "initial weights": provenance.get("start"),
         "processes": provenance.get("processes"),
         "best epoch": provenance.get("best_epoch"),
         "selected by": None
         if best is None
-        else f"{best:.4g} m, the lowest of all epochs, counted from 0: on validation snippets that "
-        "move (over 1 m/s now, or over 2 m away at a tick to come), the mean distance of the most "
-        "probable mode from the recorded position at the last tick",
+        else f"{best:.4g} m, the lowest of all epochs, counted from 0: the mean distance of "
+        "the most probable mode from the recorded position at the last tick, over validation "
+        "snippets that move (over 1 m/s now, or over 2 m away at a future tick)",
         "versions": ", ".join(
             f"{name} {number}" for name, number in sorted(provenance.get("versions", {}).items())
         )
@@ -159,18 +168,18 @@ def _recipe(provenance: dict[str, Any]) -> dict[str, object]:
 
 
 def _limits(config: dict[str, Any]) -> Iterator[str]:
-    seconds = config["history"] * config["dt_s"]
+    history_s = config["history"] * config["dt_s"]
     yield (
-        f"- Forecasts vehicles that were seen throughout the last {seconds:g} s, at ticks of "
+        f"- Forecasts vehicles that are observed throughout the last {history_s:g} s, at ticks of "
         f"{config['dt_s']:g} s; bicycles, pedestrians, animals and trailers are not forecast."
     )
     yield (
-        "- Learned from the places, drivers and sensors named above. Elsewhere nothing is known of "
-        "its errors: judge it there first."
+        "- Trained on the places, traffic and sensors named above. Its errors elsewhere are "
+        "unknown: evaluate it there first."
     )
     yield (
         f"- Probabilities are calibrated by a temperature, {config['temperature']:.4g}, on the "
-        "validation data; on other data they may be too sure."
+        "validation data; on other data they may be overconfident."
     )
     yield "- Not tested for use in a vehicle."
 

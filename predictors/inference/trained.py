@@ -1,13 +1,12 @@
-"""A trained network behind the predictor socket."""
+"""A trained network as a predictor."""
 
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from types import MappingProxyType
-from typing import NamedTuple, final
+from typing import final
 
 import numpy as np
-import torch
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 from torch import Tensor
 
 from asp_env.data.predictor import Forecast, make_forecast
@@ -15,32 +14,24 @@ from asp_env.data.scene import Scene
 from asp_env.data.snippets import Future
 from asp_env.data.split import TrainedOn
 from asp_env.errors import AspEnvError
-from asp_env.geometry import from_frame, wrap_angle
 from asp_env.views import PictureView, SceneView
-from predictors.models.batch import Batch, Labels, make_batch, make_labels
+from predictors.models.batch import Batch, make_batch, make_labels
 from predictors.models.chaining import Chaining
 from predictors.models.network import AbstractNetwork, Modes
-from predictors.models.ssp_asp import SSPASPNetwork
-from predictors.physical import seen_for
+from predictors.physical import predictable_targets
 
-TARGETS_AT_ONCE = 256
-"""More are drawn and forecast in turn: on CPUs it is no slower, and the memory is bounded."""
+MAX_CHUNK_TARGETS = 256
+"""Targets that are forecast at once. Chosen by hand: on CPUs larger chunks are no faster, and the
+memory is bounded."""
 
-PIXELS_AT_ONCE = 64 * 360 * 240
-"""Of pictures: 64 at full size, for which ResNet18 takes some 1.2 GiB."""
-
-
-class _Said(NamedTuple):
-    """A forecast of some targets, in the recording's frame."""
-
-    states: np.ndarray
-    actions: np.ndarray | None
-    log_probs: np.ndarray
+MAX_CHUNK_PIXELS = 64 * 360 * 240
+"""Pixels of rasters that are read at once: 64 rasters of full size, for which ResNet18 takes
+about 1.2 GiB."""
 
 
 @final
 class TrainedPredictor:
-    """Forecasts with a network that is not trained any more."""
+    """Forecasts with a trained network."""
 
     def __init__(
         self,
@@ -49,20 +40,21 @@ class TrainedPredictor:
         network: AbstractNetwork,
         view: SceneView,
         trained_on: TrainedOn,
-        about: Mapping[str, str],
+        metadata: Mapping[str, str],
         temperature: float = 1.0,
         chaining: Chaining = "beam",
     ) -> None:
-        """The network sees what `view` draws; `about` is what tables tell of its training.
+        """Sets the network to evaluation.
 
         Args:
-            name: what tables call it.
-            network: trained.
-            view: what it was trained on.
-            trained_on: which recordings it has seen.
-            about: what tables tell of it.
-            temperature: what logits are divided by, fitted on validation.
-            chaining: of segments, for a network that chains any; `oracle` is privileged.
+            name: Name of the predictor in tables.
+            network: The trained network.
+            view: The view that it was trained on.
+            trained_on: The recordings that it was trained on.
+            metadata: Source of the training data, view, preset and hash of the weights.
+            temperature: Divisor of the logits, fitted on validation data.
+            chaining: How segments are chained, for a network that chains any; with `oracle` the
+                predictor is privileged.
         """
         self.name = name
         self.view = view
@@ -73,90 +65,82 @@ class TrainedPredictor:
         self.trained_on: TrainedOn | None = trained_on
         self.chaining: Chaining = chaining
         self.network = network.eval()
-        self._about = MappingProxyType(dict(about))
+        self._metadata = MappingProxyType(dict(metadata))
         self._temperature = temperature
-        self._at_once = TARGETS_AT_ONCE
+        self._chunk = MAX_CHUNK_TARGETS
         if isinstance(view, PictureView):
             pixels = math.prod(view.shape[1:])
-            self._at_once = min(TARGETS_AT_ONCE, max(1, PIXELS_AT_ONCE // pixels))
+            self._chunk = min(MAX_CHUNK_TARGETS, max(1, MAX_CHUNK_PIXELS // pixels))
 
     @property
     def metadata(self) -> Mapping[str, str]:
         """Source of the training data, view, preset, and a hash of the weights."""
-        return self._about
+        return self._metadata
 
     def predict(self, scene: Scene, future: Future | None = None) -> Forecast:
-        """Forecasts the targets of predicted classes seen for the whole history.
+        """Forecasts the targets of predicted classes that are valid for the whole history.
 
-        Reads no future, unless its chaining is `oracle`.
+        Args:
+            scene: The scene.
+            future: The recorded future, read by the chaining `oracle` only.
 
         Raises:
-            AspEnvError: the scene has another time step, or a shorter history; or chaining by
-                oracle gets no future.
+            AspEnvError: The scene has another time step or a shorter history, or the chaining
+                `oracle` gets no future.
         """
         scene.check_dt(self.dt_s, self.name)
-        valid = seen_for(scene, self.history)
-        known = np.flatnonzero(valid)
-        label = self._label(scene, future, known) if self.privileged else None
-        with torch.inference_mode():
-            parts = [
-                self._predict(scene.with_targets(scene.targets[known[rows]]), label, rows)
-                for first in range(0, max(len(known), 1), self._at_once)
-                for rows in [slice(first, first + self._at_once)]
-            ]
-        log_probs = _scattered([part.log_probs for part in parts], valid)
+        valid = predictable_targets(scene, self.history)
+        rows = np.flatnonzero(valid)
+        label = self._label(scene, future, rows) if self.privileged else None
+        chunks = [
+            self._forecast(scene.with_targets(scene.targets[rows[part]]), label, part)
+            for first in range(0, max(len(rows), 1), self._chunk)
+            for part in [slice(first, first + self._chunk)]
+        ]
+        log_probs = _scatter([chunk.log_probs for chunk in chunks], valid)
         log_probs[~valid] = -np.log(log_probs.shape[1])
-        with_actions = parts[0].actions is not None
+        actions = None
+        if chunks[0].actions_valid.all():
+            actions = _scatter([chunk.actions for chunk in chunks], valid)
         return make_forecast(
             scene,
-            states=_scattered([part.states for part in parts], valid),
-            actions=_scattered([p.actions for p in parts if p.actions is not None], valid)
-            if with_actions
-            else None,
+            states=_scatter([chunk.states for chunk in chunks], valid),
+            actions=actions,
             log_probs=log_probs,
             valid=valid,
         )
 
-    def _label(self, scene: Scene, future: Future | None, known: np.ndarray) -> Labels:
+    def modes(self, batch: Batch) -> Modes:
+        """Returns the calibrated modes in the targets' frames, log-probabilities for logits."""
+        return self.network.calibrated(batch, temperature=self._temperature, chaining=self.chaining)
+
+    def _label(
+        self, scene: Scene, future: Future | None, rows: np.ndarray
+    ) -> Float[Tensor, "n t 2"]:
+        """Recorded positions of some targets in their own frames."""
         if future is None or future.states.shape[1] < self.horizon:
             raise AspEnvError(
                 f"{self.name} chained by oracle needs the recorded future of {self.horizon} ticks"
             )
-        some = Future(
-            states=future.states[known, : self.horizon], valid=future.valid[known, : self.horizon]
+        chosen = Future(
+            states=future.states[rows, : self.horizon], valid=future.valid[rows, : self.horizon]
         )
-        return make_labels(scene.with_targets(scene.targets[known]), some)
+        return make_labels(scene.with_targets(scene.targets[rows]), chosen).states[..., :2]
 
-    def modes(self, batch: Batch, truth: Float[Tensor, "n t 2"] | None = None) -> Modes:
-        """What the network says of targets, in their own frames, as log-probabilities.
-
-        Args:
-            batch: of targets.
-            truth: their positions to come, which chaining by oracle alone reads.
-        """
-        if isinstance(self.network, SSPASPNetwork):
-            modes = self.network.chain(batch, self.chaining, truth)
-        else:
-            modes: Modes = self.network(batch)
-        return modes._replace(logits=(modes.logits / self._temperature).log_softmax(dim=-1))
-
-    def _predict(self, scene: Scene, label: Labels | None, rows: slice) -> _Said:
-        batch = make_batch(scene, self.view, self.history)
-        modes = self.modes(batch, None if label is None else label.states[rows, :, :2])
-        now = scene.target_states.astype(np.float64)[:, None, None]
-        local = modes.states.numpy()
-        xy = from_frame(local[..., :2].astype(np.float64), now)
-        heading = wrap_angle(local[..., 2:3] + now[..., 2:3])
-        states = np.concatenate([xy, heading, local[..., 3:]], axis=-1).astype(np.float32)
-        return _Said(
-            states=states,
-            actions=None if modes.actions is None else modes.actions.numpy(),
-            log_probs=modes.logits.numpy(),
+    def _forecast(
+        self, scene: Scene, label: Float[Tensor, "n t 2"] | None, part: slice
+    ) -> Forecast:
+        return self.network.forecast(
+            scene,
+            make_batch(scene, self.view, self.history),
+            temperature=self._temperature,
+            chaining=self.chaining,
+            label=None if label is None else label[part],
         )
 
 
-def _scattered(parts: list[np.ndarray], valid: np.ndarray) -> np.ndarray:
-    """Rows of the valid targets at their places among all, zeros elsewhere."""
+def _scatter(parts: Sequence[np.ndarray], valid: Bool[np.ndarray, " t"]) -> np.ndarray:
+    """Rows of the valid targets at their indices among all targets; zeros elsewhere."""
     rows = np.concatenate(parts)
     out = np.zeros((len(valid), *rows.shape[1:]), dtype=np.float32)
     out[valid] = rows

@@ -1,9 +1,15 @@
-"""Chaining segments of several modes into longer forecasts. N targets, K chains, M modes, T ticks.
+"""Chains of segments: a long forecast is made of several segments of M modes each.
 
-A later segment starts from one mode of the one before. `top1` goes on from the most probable mode
-alone (as it is, before any are merged), `full` from every one, `beam` from every one and keeps the
-most probable chains, or those that speak for most. `oracle` goes on from the mode nearest to the
-label (the paper's label matching, at test time): it knows the future, and tables say so.
+A later segment starts where a mode of the segment before ends. The chainings differ in which modes
+are continued:
+
+- `beam`: all of them; after each segment the most probable chains remain, or the merged ones.
+- `full`: all of them, and every chain remains.
+- `top1`: only the most probable mode (before any are merged).
+- `oracle`: only the mode nearest to the label. This is the label matching of Janjoš et al. (2021)
+  applied at test time; it reads the recorded future, so such a predictor is privileged.
+
+Dimensions: n targets, k chains, m modes, t ticks, z features.
 """
 
 from typing import Literal, NamedTuple
@@ -18,29 +24,39 @@ from predictors.models.losses import Assignment, best_mode
 Chaining = Literal["beam", "top1", "full", "oracle"]
 CHAININGS: tuple[Chaining, ...] = ("beam", "top1", "full", "oracle")
 
-
 MIN_MASS = 1e-4
-"""Of a chain that stands for nothing that another does not stand for already."""
+"""Probability of a merged chain whose neighbourhood has no probability left. Chosen by hand: it
+keeps logarithms finite."""
 
 
 class Chains(NamedTuple):
-    """What has been forecast so far, and where it goes on from."""
+    """The forecast up to the end of a segment, and the features there."""
 
     states: Float[Tensor, "n k t 4"]
     actions: Float[Tensor, "n k t 2"]
     log_probs: Float[Tensor, "n k"]
     z: Float[Tensor, "n k z"]
-    """Predicted features at the end."""
+    """Predicted features at the end of the last segment."""
 
 
-def starts(
+def chains_to_extend(
     chains: Chains,
     chaining: Chaining,
     *,
     label: Float[Tensor, "n t 2"] | None = None,
     assignment: Assignment = "angle",
 ) -> Chains:
-    """The chains that the next segment goes on from; where it is one, its probability is one."""
+    """Selects the chains that the next segment continues.
+
+    Args:
+        chains: All chains.
+        chaining: The rule.
+        label: Recorded positions over the whole horizon; read by `oracle` only.
+        assignment: How `oracle` matches the label.
+
+    Returns:
+        All chains, or the chosen one with probability one.
+    """
     if chaining in ("beam", "full"):
         return chains
     if chaining == "oracle":
@@ -49,75 +65,85 @@ def starts(
         row = best_mode(chains.states[..., :2], label[:, :ticks], assignment)
     else:
         row = chains.log_probs.argmax(dim=1)
-    chosen = pick(chains, row[:, None])
+    chosen = select(chains, row[:, None])
     return chosen._replace(log_probs=torch.zeros_like(chosen.log_probs))
 
 
-def grow(chains: Chains, segment: Chains) -> Chains:
-    """Every chain followed by each of the modes that were predicted for it.
+def extend(chains: Chains, segment: Chains) -> Chains:
+    """Appends to every chain each of the modes that were predicted for it.
 
     Args:
-        chains: of K chains.
-        segment: of K·M rows for each target, M in turn for each chain.
+        chains: K chains of each target.
+        segment: K·M rows of each target: the M modes that follow the first chain, and so on.
+
+    Returns:
+        K·M chains; their probability is the product of both.
     """
-    k, grown = chains.log_probs.shape[1], segment.log_probs.shape[1]
-    again = torch.arange(k, device=segment.z.device).repeat_interleave(grown // k)
+    k, extended = chains.log_probs.shape[1], segment.log_probs.shape[1]
+    rows = torch.arange(k, device=segment.z.device).repeat_interleave(extended // k)
     return Chains(
-        states=torch.cat([chains.states[:, again], segment.states], dim=2),
-        actions=torch.cat([chains.actions[:, again], segment.actions], dim=2),
-        log_probs=chains.log_probs[:, again] + segment.log_probs,
+        states=torch.cat([chains.states[:, rows], segment.states], dim=2),
+        actions=torch.cat([chains.actions[:, rows], segment.actions], dim=2),
+        log_probs=chains.log_probs[:, rows] + segment.log_probs,
         z=segment.z,
     )
 
 
-def prune(chains: Chains, keep: int) -> Chains:
-    """The most probable chains, most probable first, with probabilities that sum to one again."""
-    log_probs, rows = chains.log_probs.topk(min(keep, chains.log_probs.shape[1]), dim=1)
-    return pick(chains, rows)._replace(log_probs=log_probs.log_softmax(dim=1))
+def prune(chains: Chains, count: int) -> Chains:
+    """Selects the most probable chains, in descending order; their probabilities sum to one."""
+    log_probs, rows = chains.log_probs.topk(min(count, chains.log_probs.shape[1]), dim=1)
+    return select(chains, rows)._replace(log_probs=log_probs.log_softmax(dim=1))
 
 
-def merge(chains: Chains, keep: int, scale_m: float) -> Chains:
-    """A few chains, each where most of the probability lies that those before it leave.
+def merge(chains: Chains, count: int, scale_m: float) -> Chains:
+    """Merges chains into a few, each with the probability of the chains near it.
 
-    What a chain stands for is the probability of all chains, each weighted by a Gaussian of twice
-    the mean distance between them (for two that part at a constant rate, the distance of their
-    ends), with the standard deviation `scale_m`. The first one kept stands for most: it is the peak
-    of the distribution over trajectories, which one chain that happens to be the most probable need
-    not be near. It takes from the others what it stands for; then the next is found likewise.
+    The mass of a chain is the probability of all chains, each weighted by a Gaussian of twice the
+    mean distance between both (for two chains that part at a constant rate, the distance of their
+    ends), with the standard deviation `scale_m`. The chain with the largest mass comes first: it is
+    the peak of the distribution over trajectories, which the most probable single chain need not
+    be near. Its weighted share is removed from every chain's probability, and the next chain is
+    chosen likewise from what remains.
+
+    Args:
+        chains: All chains.
+        count: Number of chains to choose.
+        scale_m: Standard deviation of the Gaussian.
 
     Returns:
-        With the mean states and features of what runs near those kept, by the same Gaussian at half
-        the scale. Their actions are still those of the chains kept: infer them anew.
+        The chosen chains with the mean states and features of the chains near them, weighted by the
+        same Gaussian at half the scale. Their actions are those of the chosen chains and do not
+        lead to the mean states: infer them anew.
     """
-    at = chains.states[..., :2]
-    apart_m = torch.linalg.vector_norm(at[:, :, None] - at[:, None], dim=-1).mean(dim=-1)
-    near = (-0.5 * (2 * apart_m / scale_m).square()).exp()
-    left = chains.log_probs.exp()
-    taken = torch.zeros_like(left)
-    rows, masses, shares = [], [], []
-    for _ in range(min(keep, left.shape[1])):
-        stands_for = (near * left[:, None]).sum(dim=-1)
-        # A sum of probabilities is one at most: what is taken comes last.
-        row = (stands_for - 2 * taken).argmax(dim=1, keepdim=True)
-        told = near.gather(1, row[:, :, None].expand(-1, 1, near.shape[2]))[:, 0]
-        own = torch.zeros_like(left).scatter(1, row, MIN_MASS)
-        share = told**4 * left + own  # half the scale: the fourth power of the Gaussian
+    positions = chains.states[..., :2]
+    apart_m = torch.linalg.vector_norm(positions[:, :, None] - positions[:, None], dim=-1)
+    near = (-0.5 * (2 * apart_m.mean(dim=-1) / scale_m).square()).exp()
+    remaining = chains.log_probs.exp()
+    taken = torch.zeros_like(remaining)
+    rows, masses, weights = [], [], []
+    for _ in range(min(count, remaining.shape[1])):
+        mass = (near * remaining[:, None]).sum(dim=-1)
+        # A mass is at most one, so chains that are taken already come last.
+        row = (mass - 2 * taken).argmax(dim=1, keepdim=True)
+        near_row = near.gather(1, row[:, :, None].expand(-1, 1, near.shape[2]))[:, 0]
+        own = torch.zeros_like(remaining).scatter(1, row, MIN_MASS)
+        weight = near_row**4 * remaining + own  # half the scale: the Gaussian to the fourth power
         rows.append(row)
-        masses.append(stands_for.gather(1, row))
-        shares.append(share / share.sum(dim=1, keepdim=True))
-        left = left * (1 - told)
+        masses.append(mass.gather(1, row))
+        weights.append(weight / weight.sum(dim=1, keepdim=True))
+        remaining = remaining * (1 - near_row)
         taken = taken.scatter(1, row, 1.0)
     log_probs = (torch.cat(masses, dim=1) + MIN_MASS).log().log_softmax(dim=1)
-    share = torch.stack(shares, dim=1)
-    kept = pick(chains, torch.cat(rows, dim=1))
-    turned = wrap_angle(chains.states[:, None, ..., 2] - kept.states[:, :, None, :, 2])
-    heading = kept.states[..., 2] + (share[..., None] * turned).sum(dim=2)
-    means = (share @ chains.states.flatten(2)).view_as(kept.states)
+    weight = torch.stack(weights, dim=1)
+    chosen = select(chains, torch.cat(rows, dim=1))
+    turn = wrap_angle(chains.states[:, None, ..., 2] - chosen.states[:, :, None, :, 2])
+    heading = chosen.states[..., 2] + (weight[..., None] * turn).sum(dim=2)
+    means = (weight @ chains.states.flatten(2)).view_as(chosen.states)
     states = torch.stack([means[..., 0], means[..., 1], heading, means[..., 3]], dim=-1)
-    return kept._replace(states=states, log_probs=log_probs, z=share @ chains.z)
+    return chosen._replace(states=states, log_probs=log_probs, z=weight @ chains.z)
 
 
-def pick(chains: Chains, rows: Int[Tensor, "n k"]) -> Chains:
-    """Some chains of each target."""
+def select(chains: Chains, rows: Int[Tensor, "n k"]) -> Chains:
+    """Selects chains of each target by their index."""
     target = torch.arange(rows.shape[0], device=rows.device)[:, None]  # len() is fixed in an export
     return Chains(*(field[target, rows] for field in chains))

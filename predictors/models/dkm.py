@@ -1,8 +1,13 @@
 """DKM: the deep kinematic model (Cui et al. 2019), as Janjoš et al. (2021) compare with it.
 
-From the raster and the present speed, acceleration and yaw rate to actions, and through the
-bicycle model to states: a state-to-action mapping. Which layers lie behind the encoder is read
-into the paper: one hidden layer, then a linear one.
+A state-to-action mapping: the observation and the present speed, acceleration and yaw rate are
+mapped to actions, and the bicycle model (equation 4 of Janjoš et al. 2021) turns actions into
+states. The loss is L_FFW (equation 10).
+
+Neither paper specifies the layers behind the encoder. Here the features pass a LayerNorm, and one
+hidden layer and a linear layer follow.
+
+Dimensions: n targets, m modes, t ticks ahead, z features.
 """
 
 from dataclasses import dataclass
@@ -17,17 +22,16 @@ from predictors.models.encoders import make_encoder
 from predictors.models.heads import ConnectedHead
 from predictors.models.network import (
     AbstractNetwork,
-    LearnedPlug,
     Modes,
     NetworkConfig,
     NetworkShape,
-    drive,
+    rollout_from_now,
 )
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class DKMConfig(NetworkConfig):
-    """What decides the network and its loss."""
+    """Options of DKM; the defaults are those of Janjoš et al. (2021)."""
 
     hidden: int = 4096
     """Width of the layer between the encoder and the output."""
@@ -37,17 +41,21 @@ class DKMConfig(NetworkConfig):
         """Checks the sizes.
 
         Raises:
-            AspEnvError: one is not positive.
+            AspEnvError: A size is not positive.
         """
         self.check_positive("features", "modes", "hidden")
 
 
 @final
 class DKMNetwork(AbstractNetwork):
-    """Encoder, fully connected head and the bicycle model."""
+    """Encoder, fully connected head and the bicycle model.
+
+    The head reads [z, speed, acceleration, yaw rate], (n, z + 3), and returns actions (n, m, t, 2)
+    and logits (n, m).
+    """
 
     def __init__(self, config: DKMConfig, shape: NetworkShape) -> None:
-        """With random weights."""
+        """Initialises the weights at random."""
         super().__init__(config, shape)
         self._integrator: Integrator = config.integrator
         self.encoder = make_encoder(config.encoder, shape, config.features)
@@ -57,14 +65,10 @@ class DKMNetwork(AbstractNetwork):
         )
 
     def forward(self, batch: Batch) -> Modes:
-        """The modes of every target."""
-        z = self.norm(self.encoder(batch.seen).float())
+        """Returns states (n, m, t, 4), logits (n, m) and actions (n, m, t, 2)."""
+        z = self.norm(self.encoder(batch.observation).float())
         with torch.autocast(z.device.type, enabled=False):
-            raw, logits = self.head(torch.cat([z, self.scaled_motion(batch)], dim=-1))
-            actions = self.actions_from(raw)
-            states = drive(actions, batch, self.shape.dt_s, self._integrator)
+            outputs, logits = self.head(torch.cat([z, self.scaled_motion(batch)], dim=-1))
+            actions = self.bounded_actions(outputs)
+            states = rollout_from_now(actions, batch, self.shape.dt_s, self._integrator)
         return Modes(states, logits, actions)
-
-
-DKM = LearnedPlug(name="dkm", config=DKMConfig, network=DKMNetwork)
-"""What the registry holds under `dkm`."""

@@ -1,17 +1,19 @@
 """FFW-ASP: feed-forward prediction in action space (Janjoš, Dolgov, Zöllner 2021).
 
-An encoder turns the target's surroundings into features z. A recurrent decoder reads [z, a] at
-every step of the past actions a; its last state gives, for each mode, future actions and a logit.
-The bicycle model turns actions into states, on which the loss is taken.
+An action-to-action mapping (equations 6 to 8). The encoder φ maps the observation of the target's
+surroundings to features z. The decoder γ, a GRU, reads [z, a] at every tick of the past actions a;
+its last state gives future actions and a logit for each mode. The bicycle model f (equation 4)
+turns actions into states, on which the loss L_FFW (equation 10) is taken.
 
-Read into the paper: z passes a LayerNorm before the decoder; actions are tanh times the symmetric
-99.9th percentile of the training data's actions, within the limits of actions. Changed, as options
-that the `paper` recipe leaves off: `skip` leads z, the present speed and the past actions around
-the recurrent layers to the output, without which accuracy is lost; `hidden` puts a hidden layer
-there; `head="connected"` puts the fully connected head of DKM in the recurrent one's place (the
-paper's ablation).
+The paper leaves open: here z passes a LayerNorm before γ, and outputs are scaled by tanh times the
+99.9th percentile of the absolute actions in the training data, within the limits of actions.
 
-Dimensions: n targets, m modes, t ticks ahead, z features.
+Options that differ from the paper; the recipe `paper` leaves them off: `skip` leads z, the present
+speed and the past actions around the GRU to the output (the GRU alone loses accuracy); `hidden`
+inserts a hidden layer before the output; `head="connected"` replaces the GRU by the fully connected
+head of DKM, which is the ablation of the paper.
+
+Dimensions: n targets, m modes, h past ticks, t ticks ahead, z features.
 """
 
 from dataclasses import dataclass
@@ -27,20 +29,19 @@ from predictors.models.encoders import make_encoder
 from predictors.models.heads import ConnectedHead, RecurrentReader
 from predictors.models.network import (
     AbstractNetwork,
-    LearnedPlug,
     Modes,
     NetworkConfig,
     NetworkShape,
-    drive,
+    rollout_from_now,
 )
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class FFWASPConfig(NetworkConfig):
-    """What decides the network and its loss; the defaults are the paper's."""
+    """Options of FFW-ASP; the defaults are the paper's."""
 
     head: Literal["recurrent", "connected"] = "recurrent"
-    """What reads features and past actions: a GRU in turn, or a layer all at once."""
+    """Whether a GRU or a fully connected layer reads the features and the past actions."""
     gru_width: int = 512
     gru_layers: int = 2
     skip: bool = False
@@ -53,7 +54,7 @@ class FFWASPConfig(NetworkConfig):
         """Checks the sizes.
 
         Raises:
-            AspEnvError: one is not positive.
+            AspEnvError: A size is not positive.
         """
         self.check_positive("features", "modes", "gru_width", "gru_layers")
         if self.hidden < 0:
@@ -62,10 +63,14 @@ class FFWASPConfig(NetworkConfig):
 
 @final
 class FFWASPNetwork(AbstractNetwork):
-    """Encoder, decoder and the bicycle model."""
+    """φ, γ and the bicycle model.
+
+    φ maps the observation to z (n, z). γ reads z and the past actions (n, h, 2), and its head
+    returns actions (n, m, t, 2) and logits (n, m).
+    """
 
     def __init__(self, config: FFWASPConfig, shape: NetworkShape) -> None:
-        """With random weights."""
+        """Initialises the weights at random."""
         super().__init__(config, shape)
         self._integrator: Integrator = config.integrator
         self._skip = config.skip
@@ -82,8 +87,8 @@ class FFWASPNetwork(AbstractNetwork):
         self.head = ConnectedHead(width, config.hidden, modes=config.modes, ticks=shape.horizon)
 
     def forward(self, batch: Batch) -> Modes:
-        """The modes of every target."""
-        z = self.norm(self.encoder(batch.seen).float())
+        """Returns states (n, m, t, 4), logits (n, m) and actions (n, m, t, 2)."""
+        z = self.norm(self.encoder(batch.observation).float())
         with torch.autocast(z.device.type, enabled=False):
             past = self.scaled_actions(batch.actions)
             inputs = [] if self.reader is None else [self.reader(z, past)]
@@ -91,11 +96,7 @@ class FFWASPNetwork(AbstractNetwork):
                 inputs += [z, past.flatten(1)]
             if self._skip:
                 inputs.append(self.scaled_motion(batch)[:, :1])
-            raw, logits = self.head(torch.cat(inputs, dim=-1))
-            actions = self.actions_from(raw)
-            states = drive(actions, batch, self.shape.dt_s, self._integrator)
+            outputs, logits = self.head(torch.cat(inputs, dim=-1))
+            actions = self.bounded_actions(outputs)
+            states = rollout_from_now(actions, batch, self.shape.dt_s, self._integrator)
         return Modes(states, logits, actions)
-
-
-FFWASP = LearnedPlug(name="ffw-asp", config=FFWASPConfig, network=FFWASPNetwork)
-"""What the registry holds under `ffw-asp`."""

@@ -1,4 +1,10 @@
-"""Which of several modes is trained on a label, and what it costs."""
+"""Losses of several modes against one label: best mode, regression, classification.
+
+Janjoš et al. (2021) define them in equations 9 (Huber loss) and 10 (regression of the best mode and
+classification).
+
+Dimensions: n targets, m modes, t ticks. Positions are in the target's frame now, in metres.
+"""
 
 from collections.abc import Mapping
 from types import MappingProxyType
@@ -9,22 +15,33 @@ from jaxtyping import Float, Int
 from torch import Tensor
 from torch.nn import functional
 
+from asp_env.geometry import to_frame
 from asp_env.metrics.forecast import errors
 from asp_env.metrics.forecast.errors import ModeRule, ends_alike
 
 Assignment = Literal["angle", "distance", "angle-random"]
+"""How the best mode of a label is chosen: see `best_mode` and `best_or_random_mode`."""
+
 Classification = Literal["cross-entropy", "softmax"]
+"""The classification term: see `classification_loss`."""
 
 RULES: Mapping[Assignment, ModeRule] = MappingProxyType(
     {"angle": "paper", "angle-random": "paper", "distance": "ade"}
 )
-"""What each assignment is called where forecasts are judged."""
+"""The rule of `asp_env.metrics.forecast` that each assignment corresponds to."""
 
 HUBER_M = 1.0
+"""Cut-off h of the Huber loss (equation 9 of Janjoš et al. 2021)."""
 
 ANNEAL_FROM_M = 8.0
+"""Temperature at the start of annealing. Chosen by hand: far modes still get a gradient."""
+
 ANNEAL_UNTIL = 0.5
+"""Share of the training after which only the best mode learns. Chosen by hand."""
+
 MIN_TEMPERATURE_M = 0.05
+"""Below this temperature the softmin is replaced by the best mode. Chosen by hand: it keeps the
+division by the temperature finite."""
 
 
 def best_mode(
@@ -32,30 +49,47 @@ def best_mode(
     label: Float[Tensor, "n t 2"],
     assignment: Assignment = "angle",
 ) -> Int[Tensor, " n"]:
-    """The mode that each label is assigned to. Positions are seen from the agent, now at (0, 0).
+    """Chooses the mode that each label is assigned to.
 
-    `distance` takes the mode with the lowest mean L2 distance. `angle` (Cui et al. 2019, and the
-    paper) takes it among the modes whose last point lies within 5° of the label's last point, seen
-    from the agent; where there is none it takes the lowest distance of all. A label that ends
-    within 2 m has no direction: distance alone. `angle-random` is `angle` but in losses, where it
-    takes `chance_mode` if there is none.
+    `distance` takes the mode with the lowest mean L2 distance. `angle` (Cui et al. 2019, Janjoš et
+    al. 2021) takes it among the modes whose last point lies within 5° of the label's last point,
+    seen from the target; where there is none it takes the lowest distance of all modes. A label
+    that ends within 2 m has no direction, so its assignment is by distance. `angle-random` is
+    `angle` here; only in `mode_terms` it stands for `best_or_random_mode`.
+
+    Args:
+        positions: Positions of the modes.
+        label: Recorded positions.
+        assignment: The rule.
+
+    Returns:
+        The index of a mode for each target.
     """
     return errors.best_mode(positions, label, RULES[assignment])
 
 
-def chance_mode(
+def best_or_random_mode(
     positions: Float[Tensor, "n m t 2"], label: Float[Tensor, "n t 2"]
 ) -> Int[Tensor, " n"]:
-    """As `best_mode` by angle, but where no mode is within 5° any one, as in the published code.
+    """Chooses as `best_mode` by angle, but a random mode where none lies within 5°.
 
-    Without that, a mode that wins all labels at first may keep them: others never learn. Chance is
-    read off the last bits of the distances, so that equal weights and labels draw alike.
+    This is the rule of the published code of MTP (Cui et al. 2019). Without it, a mode that wins
+    all labels at first may keep winning them, and the other modes never learn. The random choice is
+    derived from the last bits of the distances (multiplicative hashing, Knuth), so that equal
+    weights and labels give equal choices.
+
+    Args:
+        positions: Positions of the modes.
+        label: Recorded positions.
+
+    Returns:
+        The index of a mode for each target.
     """
     distance = torch.linalg.vector_norm(positions - label[:, None], dim=-1).mean(dim=-1)
     bits = distance.float().contiguous().view(torch.int32).long()
-    drawn = (bits * 2_654_435_761 >> 8 & 0xFFFF).argmax(dim=1)
+    random = (bits * 2_654_435_761 >> 8 & 0xFFFF).argmax(dim=1)
     decided = ends_alike(positions, label).any(dim=1)
-    return torch.where(decided, best_mode(positions, label, "angle"), drawn)
+    return torch.where(decided, best_mode(positions, label, "angle"), random)
 
 
 def mode_terms(
@@ -67,18 +101,21 @@ def mode_terms(
     classification: Classification,
     share: float | None,
 ) -> dict[str, Tensor]:
-    """The losses `regression` and `classification` of modes against labels.
+    """The terms `regression` and `classification` of the loss.
 
     Args:
-        positions: of the modes, seen from the agent, now at (0, 0).
-        logits: of the modes.
-        label: what happened.
-        assignment: which mode is the best one.
-        classification: what its improbability costs.
-        share: of the training that is over, for annealing; None trains the best mode alone.
+        positions: Positions of the modes.
+        logits: Logits of the modes.
+        label: Recorded positions.
+        assignment: How the best mode is chosen.
+        classification: The classification term.
+        share: Share of the training that is over, for annealing; None trains the best mode alone.
+
+    Returns:
+        Scalars, means over the targets.
     """
     if assignment == "angle-random":
-        best = chance_mode(positions.detach(), label)
+        best = best_or_random_mode(positions.detach(), label)
     else:
         best = best_mode(positions.detach(), label, assignment)
     if share is None:
@@ -99,8 +136,14 @@ def annealed_loss(
 ) -> Float[Tensor, ""]:
     """Huber loss of all modes, weighted by the softmin of their mean distances over a temperature.
 
-    The temperature falls along a line from 8 m to zero at half of the training; from there on the
-    best mode alone learns (annealed winner-takes-all, Perera et al. 2024).
+    The temperature falls linearly from 8 m to zero at half of the training; from there on only the
+    best mode learns (annealed winner-takes-all, Perera et al. 2024).
+
+    Args:
+        positions: Positions of the modes.
+        label: Recorded positions.
+        best: Index of the best mode of each target.
+        share: Share of the training that is over.
     """
     temperature_m = ANNEAL_FROM_M * (1 - share / ANNEAL_UNTIL)
     if temperature_m <= MIN_TEMPERATURE_M:
@@ -115,7 +158,16 @@ def annealed_loss(
 def regression_loss(
     positions: Float[Tensor, "n m t 2"], label: Float[Tensor, "n t 2"], best: Int[Tensor, " n"]
 ) -> Float[Tensor, ""]:
-    """Huber loss with h = 1 of the best modes' positions, mean over targets, ticks, coordinates."""
+    """Huber loss (equation 9) of the best modes' positions.
+
+    Args:
+        positions: Positions of the modes.
+        label: Recorded positions.
+        best: Index of the best mode of each target.
+
+    Returns:
+        The mean over targets, ticks and coordinates.
+    """
     chosen = positions[torch.arange(len(best), device=best.device), best]
     return functional.huber_loss(chosen, label, delta=HUBER_M)
 
@@ -125,10 +177,18 @@ def classification_loss(
     best: Int[Tensor, " n"],
     kind: Classification = "cross-entropy",
 ) -> Float[Tensor, ""]:
-    """How improbable the best modes are, mean over targets.
+    """The cost of improbable best modes.
 
-    `softmax` is the paper's formula read literally, the negative probability; its gradient vanishes
-    where that probability is near zero, so the cross-entropy is the default.
+    `softmax` is the last term of equation 10 read literally, the negative probability. Its gradient
+    vanishes where the probability is near zero, so the cross-entropy is the default.
+
+    Args:
+        logits: Logits of the modes.
+        best: Index of the best mode of each target.
+        kind: The term.
+
+    Returns:
+        The mean over targets.
     """
     if kind == "softmax":
         probability = logits.softmax(dim=1).gather(1, best[:, None])
@@ -139,8 +199,10 @@ def classification_loss(
 def into_frame(
     positions: Float[Tensor, "*batch t 2"], origin: Float[Tensor, "*#batch 4"]
 ) -> Float[Tensor, "*batch t 2"]:
-    """Positions as seen from states [x, y, heading, speed]: x ahead, y left."""
-    delta = positions - origin[..., None, :2]
-    cos, sin = origin[..., None, 2].cos(), origin[..., None, 2].sin()
-    ahead = cos * delta[..., 0] + sin * delta[..., 1]
-    return torch.stack([ahead, cos * delta[..., 1] - sin * delta[..., 0]], dim=-1)
+    """Transforms positions into the frames of states: x ahead, y left.
+
+    Args:
+        positions: Positions in the frame that the states are given in.
+        origin: States [x, y, heading, speed].
+    """
+    return to_frame(positions, origin[..., None, :])

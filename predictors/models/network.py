@@ -1,95 +1,109 @@
-"""What every trainable network is: made of a configuration and a shape, giving modes and a loss."""
+"""The base of all networks: configuration, shape, modes, loss and the forecast in the world.
+
+Dimensions: n targets, m modes, t ticks ahead, z features.
+"""
 
 from abc import ABC, abstractmethod
 from dataclasses import dataclass
 from typing import NamedTuple
 
+import numpy as np
 import torch
 from jaxtyping import Float
 from torch import Tensor, nn
 
-from asp_env.data.predictor import Predictor
+from asp_env.data.predictor import Forecast, make_forecast
+from asp_env.data.scene import Scene
 from asp_env.dynamics import clip_actions, rollout
 from asp_env.dynamics.bicycle import Integrator
 from asp_env.errors import AspEnvError
+from asp_env.geometry import from_frame, wrap_angle
 from asp_env.views.vectors import VectorShape
 from predictors.models.batch import Batch, Labels
+from predictors.models.chaining import Chaining
 from predictors.models.losses import Assignment, Classification, mode_terms
 
 MOTION_SCALE = (10.0, 3.0, 0.5)
-"""What speed (m/s), acceleration (m/s²) and yaw rate (rad/s) are divided by before a network."""
+"""Divisors of speed (m/s), acceleration (m/s²) and yaw rate (rad/s) at the input of a network.
+Chosen by hand: typical inputs then lie within [-1, 1]."""
 
 
 class Modes(NamedTuple):
-    """What a network says of N targets, in their own frames."""
+    """Output of a network: M modes of T ticks for N targets, in the targets' frames now."""
 
     states: Float[Tensor, "n m t 4"]
+    """[x m, y m, heading rad, speed m/s]."""
     logits: Float[Tensor, "n m"]
     actions: Float[Tensor, "n m t 2"] | None = None
-    """None from a network that predicts positions."""
+    """[acceleration m/s², steering rad]; None from a network that predicts positions."""
 
 
 class TrainingProgress(NamedTuple):
-    """Where in its training a network is."""
+    """How far the training has come, for losses that depend on it."""
 
     share: float = 1.0
-    """Of all steps: 0 at the first, 1 at the end."""
+    """Share of all optimiser steps: 0 at the first one, 1 at the end."""
     pretraining: bool = False
-    """Whether the epochs come first in which only the features are learned."""
+    """Whether only the features are learned (the first epochs of `ssp-asp`)."""
 
 
 class Features(NamedTuple):
-    """Features of the scene to come, as encoded from it and as predicted, for diagnosis."""
+    """Features at the end of the first segment, for diagnosis."""
 
     encoded: Float[Tensor, "n z"]
+    """Encoded from the inputs at that time."""
     predicted: Float[Tensor, "n z"]
+    """Predicted from the inputs now."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class NetworkShape:
-    """What a network is made for, besides its own configuration."""
+    """Sizes of inputs and outputs, which follow from the view, the data and the horizon."""
 
-    seen: tuple[int, int, int] | VectorShape
-    """Channels, height, width of pictures, or the shape of vectors."""
+    observation: tuple[int, int, int] | VectorShape
+    """Channels, height and width of rasters, or the shape of vectors."""
     packed: bool
-    """Whether pictures come packed to bits."""
+    """Whether rasters are packed to bits."""
     history: int
     """Past ticks."""
     horizon: int
     """Ticks ahead."""
     dt_s: float
     action_range: tuple[float, float]
-    """What outputs in [-1, 1] are multiplied by: m/s², rad. The normaliser."""
+    """Scale of actions (m/s², rad): outputs in [-1, 1] are multiplied by it. The normaliser."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class NetworkConfig:
-    """What the configurations of all networks hold; the defaults are the paper's."""
+    """Options of all networks; the defaults are those of Janjoš et al. (2021)."""
 
     encoder: str = "resnet18"
-    """`resnet18` or `small` for pictures, `vector` for vectors."""
+    """`resnet18` or `small` for rasters, `vector` for vectors."""
     features: int = 512
-    """z, the width of what the encoder gives."""
+    """Number of features z that the encoder returns."""
     modes: int = 3
+    """Number of modes M; SSP-ASP predicts M in each segment."""
     assignment: Assignment = "angle-random"
+    """How the best mode of a label is chosen."""
     classification: Classification = "cross-entropy"
+    """The classification term of the loss."""
     annealed: bool = False
-    """Whether all modes learn from every label at first, by nearness (softmin), and the best one
-    alone at the end."""
+    """Whether all modes learn from every label at first, weighted by their distance (softmin), and
+    only the best one at the end."""
 
     def __post_init__(self) -> None:
         """Checks the sizes.
 
         Raises:
-            AspEnvError: one is not positive.
+            AspEnvError: A size is not positive.
         """
         self.check_positive("features", "modes")
 
     def check_positive(self, *fields: str) -> None:
-        """Refuses sizes below one.
+        """Refuses values below one.
 
         Raises:
-            AspEnvError: one is not positive.
+            AspEnvError: One of the fields is not positive.
         """
         for field in fields:
             if getattr(self, field) < 1:
@@ -97,45 +111,126 @@ class NetworkConfig:
 
 
 class AbstractNetwork(nn.Module, ABC):
-    """A network that can be trained and put behind the socket; made of (config, shape)."""
+    """A trainable network, constructed from its configuration and its shape.
+
+    The names of modules and buffers are keys of the files of weights.
+    """
+
+    merging_temperature: Tensor | None
+    """Scalar divisor of the log-probabilities of chains before they are merged, fitted after the
+    training; None for a network that merges none."""
 
     def __init__(self, config: NetworkConfig, shape: NetworkShape) -> None:
-        """Keeps both."""
+        """Stores both arguments and registers the scales of inputs and outputs."""
         super().__init__()
         self.config = config
         self.shape = shape
         self.register_buffer("action_range", torch.tensor(shape.action_range), persistent=False)
         self.register_buffer("motion_scale", torch.tensor(MOTION_SCALE), persistent=False)
+        self.register_buffer("merging_temperature", None)
 
     @property
     def later_ticks(self) -> tuple[int, ...]:
-        """How many ticks after now the later scenes lie that it learns from; mostly none."""
+        """Ticks ahead at which the loss reads future inputs: the ends of the segments, if any."""
         return ()
 
     @abstractmethod
     def forward(self, batch: Batch) -> Modes:
-        """The modes of every target."""
+        """Returns the modes of every target."""
 
-    def loss(self, modes: Modes, labels: Labels, moment: TrainingProgress) -> dict[str, Tensor]:
-        """The terms of the loss by name, `loss` their weighted sum."""
+    def chain(
+        self, batch: Batch, chaining: Chaining, label: Float[Tensor, "n t 2"] | None = None
+    ) -> Modes:
+        """Returns the modes with a given chaining of segments.
+
+        Networks that predict the whole horizon at once ignore the chaining.
+
+        Args:
+            batch: Inputs.
+            chaining: How segments are chained.
+            label: Recorded positions in the targets' frames; read by `oracle` only.
+        """
+        del chaining, label
+        return self(batch)
+
+    def calibrated(
+        self,
+        batch: Batch,
+        *,
+        temperature: float = 1.0,
+        chaining: Chaining = "beam",
+        label: Float[Tensor, "n t 2"] | None = None,
+    ) -> Modes:
+        """Returns the modes with calibrated log-probabilities in place of logits.
+
+        Args:
+            batch: Inputs.
+            temperature: Divisor of the logits, fitted on validation data. For the chaining `full`,
+                the merging temperature takes its place if there is one.
+            chaining: How segments are chained.
+            label: Recorded positions in the targets' frames; read by `oracle` only.
+        """
+        modes = self.chain(batch, chaining, label)
+        divisor: float | Tensor = temperature
+        if chaining == "full" and self.merging_temperature is not None:
+            divisor = self.merging_temperature
+        return modes._replace(logits=(modes.logits / divisor).log_softmax(dim=-1))
+
+    @torch.inference_mode()
+    def forecast(
+        self,
+        scene: Scene,
+        batch: Batch,
+        *,
+        temperature: float = 1.0,
+        chaining: Chaining = "beam",
+        label: Float[Tensor, "n t 2"] | None = None,
+    ) -> Forecast:
+        """Forecasts the targets of a scene in the frame of its recording.
+
+        Args:
+            scene: N targets, each valid at every tick of the history.
+            batch: Inputs made of the scene.
+            temperature: As in `calibrated`.
+            chaining: As in `calibrated`.
+            label: As in `calibrated`.
+
+        Returns:
+            The forecast; all its rows are valid.
+        """
+        modes = self.calibrated(batch, temperature=temperature, chaining=chaining, label=label)
+        now = scene.target_states.astype(np.float64)[:, None, None]
+        local = modes.states.numpy()
+        xy = from_frame(local[..., :2].astype(np.float64), now)
+        heading = wrap_angle(local[..., 2:3] + now[..., 2:3])
+        return make_forecast(
+            scene,
+            states=np.concatenate([xy, heading, local[..., 3:]], axis=-1).astype(np.float32),
+            actions=None if modes.actions is None else modes.actions.numpy(),
+            log_probs=modes.logits.numpy(),
+            valid=np.ones(len(local), dtype=bool),
+        )
+
+    def loss(self, modes: Modes, labels: Labels, progress: TrainingProgress) -> dict[str, Tensor]:
+        """The terms of the loss of given modes by name; `loss` is their weighted sum."""
         terms = mode_terms(
             modes.states[..., :2],
             modes.logits,
             labels.states[..., :2],
             assignment=self.config.assignment,
             classification=self.config.classification,
-            share=moment.share if self.config.annealed else None,
+            share=progress.share if self.config.annealed else None,
         )
         return {"loss": terms["regression"] + terms["classification"], **terms}
 
     def training_loss(
-        self, batch: Batch, labels: Labels, moment: TrainingProgress
+        self, batch: Batch, labels: Labels, progress: TrainingProgress
     ) -> dict[str, Tensor]:
-        """The terms of the loss that is trained on, `loss` their weighted sum."""
-        return self.loss(self(batch), labels, moment)
+        """The terms of the loss in training by name; `loss` is their weighted sum."""
+        return self.loss(self(batch), labels, progress)
 
     def features(self, batch: Batch, labels: Labels) -> Features | None:
-        """Encoded and predicted features of the scene to come; None where none are predicted."""
+        """Features at the end of the first segment; None if the network predicts no features."""
         del batch, labels
         return None
 
@@ -143,65 +238,53 @@ class AbstractNetwork(nn.Module, ABC):
         """Called after every step of the optimiser."""
 
     def scaled_actions(self, actions: Float[Tensor, "n t 2"]) -> Float[Tensor, "n t 2"]:
-        """Past actions as a network reads them: in units of the range, without outliers."""
+        """Past actions as inputs: in units of the action range, clamped to ±1.5."""
         return (actions / self.get_buffer("action_range")).clamp(-1.5, 1.5)
 
     def scaled_motion(self, batch: Batch) -> Float[Tensor, "n 3"]:
-        """Speed, acceleration and yaw rate as a network reads them."""
+        """Speed, acceleration and yaw rate as inputs: over `MOTION_SCALE`, clamped to ±3."""
         return (batch.motion / self.get_buffer("motion_scale")).clamp(-3, 3)
 
-    def actions_from(self, raw: Float[Tensor, "n m t 2"]) -> Float[Tensor, "n m t 2"]:
-        """Outputs of any size as actions: tanh times the range, within the limits."""
-        return clip_actions(raw.tanh() * self.get_buffer("action_range"))
+    def bounded_actions(self, outputs: Float[Tensor, "n m t 2"]) -> Float[Tensor, "n m t 2"]:
+        """Actions of unbounded outputs: tanh times the action range, within the limits."""
+        return clip_actions(outputs.tanh() * self.get_buffer("action_range"))
 
 
 def start_states(batch: Batch) -> Float[Tensor, "n 4"]:
-    """The targets now, seen from themselves: at (0, 0) with heading 0 and their speed."""
+    """The targets' states now in their own frames: at (0, 0) with heading 0 and their speed."""
     return batch.motion[:, :1] * batch.motion.new_tensor([0.0, 0.0, 0.0, 1.0])
 
 
-def drive(
+def rollout_from_now(
     actions: Float[Tensor, "n m t 2"], batch: Batch, dt_s: float, integrator: Integrator
 ) -> Float[Tensor, "n m t 4"]:
-    """The states that actions lead to from (0, 0) at the present speed."""
+    """The states that actions lead to from the targets' states now.
+
+    Args:
+        actions: [acceleration m/s², steering rad] of each mode.
+        batch: Inputs, which hold speeds and lengths.
+        dt_s: Time step.
+        integrator: `euler` (equation 4 of Janjoš et al. 2021) or `heun`.
+    """
     start = start_states(batch)[:, None].expand(-1, actions.shape[1], -1)
-    return drive_from(start, actions, batch.length_m, dt_s, integrator)
+    return rollout_from(start, actions, batch.length_m, dt_s, integrator)
 
 
-def drive_from(
+def rollout_from(
     start: Float[Tensor, "n m 4"],
     actions: Float[Tensor, "n m t 2"],
     length_m: Float[Tensor, " n"],
     dt_s: float,
     integrator: Integrator,
 ) -> Float[Tensor, "n m t 4"]:
-    """The states that actions lead to from each mode's own start."""
+    """The states that actions lead to from a start state of each mode.
+
+    Args:
+        start: Start states.
+        actions: [acceleration m/s², steering rad] of each mode.
+        length_m: Lengths of the targets.
+        dt_s: Time step.
+        integrator: `euler` or `heun`.
+    """
     lengths = length_m[:, None].expand(-1, actions.shape[1])
     return rollout(start, actions, lengths, dt_s, integrator=integrator)
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class LearnedPlug:
-    """What the registry holds under a learned predictor's name, for training and loading."""
-
-    name: str
-    """By which it is registered."""
-    config: type[NetworkConfig]
-    """A frozen dataclass of what JSON can hold."""
-    network: type[AbstractNetwork]
-    """Made of (config, shape); its module tells what the predictor is."""
-
-    def from_name(self, argument: str, *, horizon: int, dt_s: float) -> Predictor:
-        """The predictor of a finished run's folder; it keeps the horizon it was trained for.
-
-        Behind an @ stands how segments are chained, for a run that chains any: `RUN@beam` (as
-        without it), `RUN@top1`, `RUN@full`, or `RUN@oracle`, which knows the recorded future.
-
-        Raises:
-            CheckpointError: the folder holds no finished run of this predictor.
-            AspEnvError: it was trained for another time step, or the chaining does not apply.
-        """
-        del horizon
-        from predictors.inference.checkpoint import load_learned
-
-        return load_learned(self, argument, dt_s=dt_s)

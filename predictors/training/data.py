@@ -1,7 +1,4 @@
-"""Training data: snippets drawn on the fly, in the order of an epoch.
-
-MERGED: What a run learns from and is selected on.
-"""
+"""Training data: the snippets of a run, their split, their order in an epoch, and their batches."""
 
 import copy
 from collections.abc import Iterator, Sequence
@@ -23,24 +20,31 @@ from asp_env.views import SceneView
 from predictors.training.data_loading import (
     BatchSource,
     BatchWorkers,
-    Drawn,
+    Sample,
     load_by_thread,
     load_by_workers,
 )
 from predictors.training.recipes import TrainingConfig
 
+VALIDATION_BATCH = 256
+"""Snippets of a validation batch. Chosen by hand."""
+
 CHUNK = 4096
-"""Snippets read at once where a whole set is scanned."""
+"""Snippets that are read at once where a whole set is scanned. Chosen by hand: it bounds memory."""
 
 RANGE_PERCENTILE = 99.9
+"""Percentile of absolute actions that outputs are scaled by. The paper scales by the range in the
+training data; outliers of the inverse bicycle model would dominate it."""
+
 MIN_ACTION_RANGE = (0.5, 0.05)
+"""Lowest scale of actions, m/s² and rad. Chosen by hand, for data in which nothing moves."""
 
 
 @final
 class Batches:
-    """Batches of snippets, drawn while the network works on the one before.
+    """Batches of snippets in a given order, made while the network processes the ones before.
 
-    The order is given, hence the batches are the same whenever and by whomever they are drawn.
+    Each process of a distributed training iterates its own shard of every batch.
     """
 
     def __init__(
@@ -53,32 +57,32 @@ class Batches:
         later_ticks: Sequence[int] = (),
         histories: Sequence[Recording] | None = None,
     ) -> None:
-        """Of `batch_size` snippets each, the last one possibly smaller.
+        """Makes an unsharded sequence that loads in a thread.
 
         Args:
-            recordings: what happened, which labels are taken from.
-            snippets: of them.
-            view: what is drawn of each.
-            batch_size: snippets at once.
-            later_ticks: how long after now the later scenes lie that labels hold.
-            histories: the same recordings with what was known at the time; themselves if None.
+            recordings: The recordings that labels are taken from.
+            snippets: Snippets of them, in order.
+            view: The view that renders the observations.
+            batch_size: Snippets of a batch; the last one may be smaller.
+            later_ticks: Ticks ahead at which labels hold future inputs.
+            histories: The same recordings as the inputs show them; None for the recordings.
         """
         self.snippets = snippets
-        self.drawing = BatchSource(
+        self.source = BatchSource(
             recordings=recordings,
             histories=recordings if histories is None else histories,
             view=view,
             later_ticks=tuple(later_ticks),
         )
-        self._crew: tuple[BatchWorkers, int] | None = None
+        self._workers: tuple[BatchWorkers, int] | None = None
         self._batch_size = batch_size
         self._rank = 0
-        self.ranks = 1
+        self.num_shards = 1
 
-    def drawn_by(self, crew: BatchWorkers, number: int) -> "Batches":
-        """The same, drawn by a crew that knows their drawing by this number."""
+    def with_workers(self, workers: BatchWorkers, source: int) -> "Batches":
+        """The same batches, loaded by processes that have `self.source` at an index."""
         other = copy.copy(self)
-        other._crew = crew, number
+        other._workers = workers, source
         return other
 
     def reordered(self, rows: Int[np.ndarray, " m"]) -> "Batches":
@@ -87,46 +91,134 @@ class Batches:
         other.snippets = self.snippets.select(rows)
         return other
 
-    def dealt(self, rank: int, ranks: int) -> "Batches":
-        """One of `ranks` shares of every batch, dealt like cards.
+    def shard(self, rank: int, num_shards: int) -> "Batches":
+        """One of several shards: every `num_shards`-th snippet of each batch, from `rank` on.
 
-        A share of nothing, where a batch is smaller than `ranks`, holds one snippet of another's.
+        A batch with fewer snippets than shards leaves some shards without one of their own; these
+        repeat the batch's last snippet.
         """
         other = copy.copy(self)
-        other._rank, other.ranks = rank, ranks
+        other._rank, other.num_shards = rank, num_shards
         return other
 
-    def rows(self, number: int) -> int:
-        """How many snippets a batch holds in all shares together."""
-        return min(self._batch_size, len(self.snippets) - number * self._batch_size)
+    def num_snippets(self, batch: int) -> int:
+        """Number of snippets of a batch, all shards together."""
+        return min(self._batch_size, len(self.snippets) - batch * self._batch_size)
 
-    def share(self, number: int) -> Int[np.ndarray, " n"]:
-        """Which snippets of the order a batch is drawn of here."""
-        first = number * self._batch_size
-        last = first + self.rows(number)
-        return np.arange(min(first + self._rank, last - 1), last, self.ranks)
+    def shard_rows(self, batch: int) -> Int[np.ndarray, " n"]:
+        """Rows of the snippets of this shard in a batch, at least one."""
+        first = batch * self._batch_size
+        last = first + self.num_snippets(batch)
+        return np.arange(min(first + self._rank, last - 1), last, self.num_shards)
 
-    def own(self, number: int) -> int:
-        """How many of `share` are not another's: all of them, or none."""
-        return len(range(self._rank, self.rows(number), self.ranks))
+    def num_own(self, batch: int) -> int:
+        """Number of `shard_rows` that no other shard has: all of them, or none."""
+        return len(range(self._rank, self.num_snippets(batch), self.num_shards))
 
     def __len__(self) -> int:
-        """How many batches there are."""
         return -(-len(self.snippets) // self._batch_size)
 
-    def __iter__(self) -> Iterator[Drawn]:
-        """All batches in order."""
-        chosen = (self.snippets.select(self.share(number)) for number in range(len(self)))
-        if self._crew is None:
-            return load_by_thread(self.drawing, chosen)
-        return load_by_workers(*self._crew, chosen)
+    def __iter__(self) -> Iterator[Sample]:
+        batches = (self.snippets.select(self.shard_rows(batch)) for batch in range(len(self)))
+        if self._workers is None:
+            return load_by_thread(self.source, batches)
+        return load_by_workers(*self._workers, batches)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class DatasetSplit:
+    """The snippets of one part of the data."""
+
+    recordings: Recordings
+    snippets: SnippetIndex
+
+    def batches(
+        self, view: SceneView, *, size: int, later_ticks: Sequence[int], config: TrainingConfig
+    ) -> Batches:
+        """Batches in the order of the snippets.
+
+        Args:
+            view: The view that renders the observations.
+            size: Snippets of a batch.
+            later_ticks: Ticks ahead at which labels hold future inputs.
+            config: The configuration; its `history` decides what the inputs show.
+        """
+        histories: Sequence[Recording] = self.recordings
+        if config.history == "causal":
+            histories = causal_histories(self.recordings)
+        return Batches(
+            self.recordings,
+            self.snippets,
+            view=view,
+            batch_size=size,
+            later_ticks=later_ticks,
+            histories=histories,
+        )
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class TrainingData:
+    """The data of a run."""
+
+    training: DatasetSplit
+    validation: DatasetSplit
+    trained_on: TrainedOn
+    data_hash: str
+    validation_hash: str | None
+    """Hash of separate validation data, if there are any."""
+
+
+def open_training_data(config: TrainingConfig, data: str) -> TrainingData:
+    """Opens the data and splits them, or takes all of them if validation data are given.
+
+    Args:
+        config: The configuration.
+        data: DATA, as `open_data` takes it.
+
+    Raises:
+        AspEnvError: The data are bad, a part is empty, or a recording is in both data sets.
+    """
+    recordings = open_data(data)
+    index = _index(recordings, config)
+    if config.validation is None:
+        parts, trained_on = snippet_parts(recordings, index, config.split)
+        training, validation = (
+            DatasetSplit(recordings=recordings, snippets=index.select(parts == part))
+            for part in ("train", "validation")
+        )
+        validation_hash = None
+    else:
+        separate = open_data(config.validation)
+        training = DatasetSplit(recordings=recordings, snippets=index)
+        validation = DatasetSplit(recordings=separate, snippets=_index(separate, config))
+        trained_on = _separate_parts(recordings, separate)
+        validation_hash = separate.data_hash()
+    for part, split in (("training", training), ("validation", validation)):
+        if not len(split.snippets):
+            raise AspEnvError(
+                f"data {data!r}: no snippet is left for {part} after the split by "
+                f"{config.split}; give more recordings or longer ones"
+            )
+    return TrainingData(
+        training=_chosen(training, config, config.standing_share, config.max_snippets),
+        validation=_chosen(validation, config, 1.0, config.max_validation_snippets),
+        trained_on=trained_on,
+        data_hash=recordings.data_hash(),
+        validation_hash=validation_hash,
+    )
 
 
 def epoch_rows(count: int, *, per_epoch: int, epoch: int, seed: int) -> Int[np.ndarray, " rows"]:
-    """Which of `count` snippets an epoch shows, in which order.
+    """Rows of the snippets of an epoch, in order.
 
-    Shuffles of all of them follow each other without end, and an epoch is a stretch of that row of
-    `per_epoch`; with `per_epoch = count` each epoch is one shuffle. The same for equal arguments.
+    The epochs are consecutive stretches of an endless sequence of shuffles of all snippets; with
+    `per_epoch = count` each epoch is one shuffle. Equal arguments give equal rows.
+
+    Args:
+        count: Number of snippets.
+        per_epoch: Snippets of an epoch.
+        epoch: Index of the epoch.
+        seed: Seed of the shuffles.
     """
     first, last = epoch * per_epoch, (epoch + 1) * per_epoch
     shuffles = range(first // count, (last - 1) // count + 1)
@@ -145,79 +237,85 @@ def choose_snippets(
     max_snippets: int | None,
     seed: int,
 ) -> SnippetIndex:
-    """The snippets that are learnt from: standing ones held back, and no more than so many.
+    """Limits the share of standing targets and the number of snippets.
 
     Args:
-        recordings: what the snippets are of.
-        snippets: those that there are.
-        standing_share: standing targets (not in the subset `moving`) are left out at random until
-            they are at most this share of what remains; 1 keeps them all.
-        max_snippets: how many to keep at most, at random; all of them if None.
-        seed: of what is left out.
+        recordings: The recordings of the snippets.
+        snippets: All snippets.
+        standing_share: Standing targets (not in the subset `moving`) are omitted at random until
+            they are at most this share of the rest; 1 omits none.
+        max_snippets: Largest number of snippets, chosen at random; None for all.
+        seed: Seed of the random choices.
+
+    Returns:
+        The chosen snippets in their order.
 
     Raises:
-        AspEnvError: none is left.
+        AspEnvError: None is left.
     """
     rng = np.random.default_rng(seed)
-    keep = np.arange(len(snippets))
+    rows = np.arange(len(snippets))
     if standing_share < 1:
         is_moving = moving_snippets(recordings, snippets)
-        going, standing = np.flatnonzero(is_moving), np.flatnonzero(~is_moving)
-        allowed = int(len(going) * standing_share / (1 - standing_share))
+        in_motion, standing = np.flatnonzero(is_moving), np.flatnonzero(~is_moving)
+        allowed = int(len(in_motion) * standing_share / (1 - standing_share))
         if len(standing) > allowed:
             standing = rng.choice(standing, allowed, replace=False)
-        keep = np.sort(np.concatenate([going, standing]))
-    if max_snippets is not None and len(keep) > max_snippets:
-        keep = np.sort(rng.choice(keep, max_snippets, replace=False))
-    if not len(keep):
+        rows = np.sort(np.concatenate([in_motion, standing]))
+    if max_snippets is not None and len(rows) > max_snippets:
+        rows = np.sort(rng.choice(rows, max_snippets, replace=False))
+    if not len(rows):
         raise AspEnvError(
-            f"none of the {len(snippets)} snippets to learn from moves, and standing ones may be a "
-            f"share of {standing_share:g} at most: give recordings with traffic that moves, or "
-            "train with a standing_share of 1, as the preset paper does"
+            f"none of the {len(snippets)} training snippets moves, and standing targets may be a "
+            f"share of at most {standing_share:g}: give recordings with moving traffic, or "
+            "train with a standing_share of 1, as the recipe paper does"
         )
-    return snippets.select(keep)
+    return snippets.select(rows)
 
 
 def moving_snippets(
     recordings: Sequence[Recording], snippets: SnippetIndex
 ) -> Bool[np.ndarray, " n"]:
-    """Which snippets are in the subset `moving`, on which predictors are compared."""
+    """Mask of the snippets in the subset `moving`, on which predictors are compared."""
     parts = [np.zeros(0, dtype=bool)]
-    for chosen in _chunks(snippets):
-        now, _ = gather_present(recordings, chosen)
-        future = gather_future(recordings, chosen)
+    for chunk in _chunks(snippets):
+        now, _ = gather_present(recordings, chunk)
+        future = gather_future(recordings, chunk)
         parts.append(moving(now, future.states[..., :2], future.valid))
     return np.concatenate(parts)
 
 
 def action_range(recordings: Sequence[Recording], snippets: SnippetIndex) -> tuple[float, float]:
-    """What a network's outputs in [-1, 1] are multiplied by: (m/s², rad).
+    """The scale of actions: the 99.9th percentiles of the absolute actions of all futures.
 
-    The 99.9th percentiles of the absolute actions of the snippets' futures, since the outliers of
-    the inverse model ruin a maximum; within the limits of actions, and never quite zero. The same
-    to the last bit as `np.percentile` of all, of which only the highest are held.
+    The result is equal bit for bit to `np.percentile` of all actions, of which only the highest are
+    stored.
+
+    Returns:
+        Acceleration (m/s²) and steering (rad), within `MIN_ACTION_RANGE` and the limits of actions.
     """
-    count = len(snippets) * snippets.horizon
+    count = len(snippets) * snippets.horizon_ticks
     if not count:
         return MIN_ACTION_RANGE
     place = (count - 1) * (RANGE_PERCENTILE / 100)
     below = int(place)
-    highest = np.zeros((0, 2))  # the values from there up: a thousandth of all
-    for chosen in _chunks(snippets):
-        now, lengths = gather_present(recordings, chosen)
-        future = gather_future(recordings, chosen).states
+    highest = np.zeros((0, 2))  # the values from that place up: a thousandth of all
+    for chunk in _chunks(snippets):
+        now, lengths = gather_present(recordings, chunk)
+        future = gather_future(recordings, chunk).states
         before = np.concatenate([now[:, None], future[:, :-1]], axis=1)
         actions = inverse(before, future, lengths[:, None], snippets.dt_s)
         highest = np.concatenate([highest, np.abs(actions).reshape(-1, 2)])
-        if (spare := len(highest) - (count - below)) > 0:
-            highest = np.partition(highest, spare, axis=0)[spare:]
+        if (surplus := len(highest) - (count - below)) > 0:
+            highest = np.partition(highest, surplus, axis=0)[surplus:]
     lower, upper = np.sort(highest, axis=0)[[0, min(1, count - below - 1)]]
     share = place - below
-    highest = np.where(
+    # Interpolates from the nearer end, as np.percentile does.
+    percentiles = np.where(
         share < 0.5, lower + (upper - lower) * share, upper - (upper - lower) * (1 - share)
     )
     low, high = np.array(MIN_ACTION_RANGE), np.array([MAX_ACCELERATION_MPS2, MAX_STEERING_RAD])
-    acceleration, steering = np.clip(highest, low, high)
+    acceleration, steering = np.clip(percentiles, low, high)
     return float(acceleration), float(steering)
 
 
@@ -226,105 +324,30 @@ def _chunks(snippets: SnippetIndex) -> Iterator[SnippetIndex]:
         yield snippets.select(np.arange(first, min(first + CHUNK, len(snippets))))
 
 
-VALIDATION_BATCH = 256
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class DatasetSplit:
-    """Some snippets of some recordings."""
-
-    recordings: Recordings
-    snippets: SnippetIndex
-
-    def batches(
-        self, view: SceneView, *, size: int, later_ticks: Sequence[int], config: TrainingConfig
-    ) -> Batches:
-        """In their order, as a network of `config` sees them."""
-        histories: Sequence[Recording] = self.recordings
-        if config.history == "causal":
-            histories = causal_histories(self.recordings)
-        return Batches(
-            self.recordings,
-            self.snippets,
-            view=view,
-            batch_size=size,
-            later_ticks=later_ticks,
-            histories=histories,
-        )
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class TrainingData:
-    """What there is for a run."""
-
-    training: DatasetSplit
-    validation: DatasetSplit
-    trained_on: TrainedOn
-    data_hash: str
-    validation_hash: str | None
-    """Of separate validation data, if there are any."""
-
-
-def open_training_data(config: TrainingConfig, data: str) -> TrainingData:
-    """Opens DATA and deals it, or takes all of it where validation data are given.
-
-    Raises:
-        AspEnvError: the data are bad, nothing is left for a part, or a recording is in both.
-    """
-    recordings = open_data(data)
-    index = _index(recordings, config)
-    if config.validation is None:
-        parts, trained_on = snippet_parts(recordings, index, config.split)
-        training, validation = (
-            DatasetSplit(recordings=recordings, snippets=index.select(parts == part))
-            for part in ("train", "validation")
-        )
-        validation_hash = None
-    else:
-        others = open_data(config.validation)
-        training = DatasetSplit(recordings=recordings, snippets=index)
-        validation = DatasetSplit(recordings=others, snippets=_index(others, config))
-        trained_on = _dealt_by_hand(recordings, others)
-        validation_hash = others.data_hash()
-    for part, share in (("training", training), ("validation", validation)):
-        if not len(share.snippets):
-            raise AspEnvError(
-                f"data {data!r}: no snippet is left for {part} after the split by "
-                f"{config.split}; give more recordings or longer ones"
-            )
-    return TrainingData(
-        training=_chosen(training, config, config.standing_share, config.max_snippets),
-        validation=_chosen(validation, config, 1.0, config.max_validation_snippets),
-        trained_on=trained_on,
-        data_hash=recordings.data_hash(),
-        validation_hash=validation_hash,
-    )
-
-
 def _index(recordings: Recordings, config: TrainingConfig) -> SnippetIndex:
     return index_snippets(recordings, dt_s=config.dt_s, horizon_s=config.horizon_s)
 
 
-def _dealt_by_hand(training: Recordings, validation: Recordings) -> TrainedOn:
-    learned, selected = training.hashes(), validation.hashes()
-    if both := set(learned) & set(selected):
-        names = dict(zip(selected, validation.names, strict=True))
+def _separate_parts(training: Recordings, validation: Recordings) -> TrainedOn:
+    train, select = training.hashes(), validation.hashes()
+    if both := set(train) & set(select):
+        names = dict(zip(select, validation.names, strict=True))
         raise AspEnvError(
             f"recording {names[min(both)]} of {validation.source!r} is in {training.source!r} too: "
-            "select on recordings that are not learned from"
+            "validate on recordings that are not trained on"
         )
-    parts = dict.fromkeys(learned, "train") | dict.fromkeys(selected, "validation")
+    parts = dict.fromkeys(train, "train") | dict.fromkeys(select, "validation")
     return TrainedOn(source=training.source, split="recording", parts=parts)
 
 
 def _chosen(
-    share: DatasetSplit, config: TrainingConfig, standing_share: float, most: int | None
+    split: DatasetSplit, config: TrainingConfig, standing_share: float, max_snippets: int | None
 ) -> DatasetSplit:
     chosen = choose_snippets(
-        share.recordings,
-        share.snippets,
+        split.recordings,
+        split.snippets,
         standing_share=standing_share,
-        max_snippets=most,
+        max_snippets=max_snippets,
         seed=config.seed,
     )
-    return DatasetSplit(recordings=share.recordings, snippets=chosen)
+    return DatasetSplit(recordings=split.recordings, snippets=chosen)

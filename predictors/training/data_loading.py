@@ -1,8 +1,8 @@
-"""Drawing batches ahead: by a thread, or by processes of their own where a GPU outruns one.
+"""Loading of batches ahead of the network: in a thread, or in processes.
 
-A thread shares the interpreter with the program that feeds the network; processes do not. Each of
-them opens the recordings anew, mapped from the same cache. Batches come in their order, whoever
-draws them, and are the same to the last bit.
+A thread shares the interpreter with the program that feeds the network; processes do not, which
+pays where a GPU is faster than one thread. Each process opens the recordings itself, mapped from
+the same cache. Batches come in their order and are equal bit for bit, wherever they are made.
 """
 
 import os
@@ -24,117 +24,130 @@ from asp_env.data.snippets import SnippetIndex, gather_future, gather_scene
 from asp_env.views import SceneView
 from predictors.models.batch import Batch, Labels, make_batch, make_labels
 
-AHEAD = 4
-"""Batches drawn in advance by each thread or process."""
+PREFETCH = 4
+"""Batches that each thread or process loads in advance. Chosen by hand: it smooths the differences
+between batches."""
 
-Drawn = tuple[Batch, Labels]
+Sample = tuple[Batch, Labels]
+"""Inputs and labels of one batch."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class BatchSource:
-    """What is drawn of snippets, and of which recordings."""
+    """What batches are made from."""
 
     recordings: Sequence[Recording]
-    """What happened, which labels are taken from."""
+    """The recordings that labels are taken from."""
     histories: Sequence[Recording]
-    """The same recordings with what was known at the time."""
+    """The same recordings, as the inputs show them."""
     view: SceneView
     later_ticks: tuple[int, ...] = ()
-    """How long after now the later scenes lie that labels hold."""
+    """Ticks ahead at which labels hold future inputs."""
 
-    def draw(self, chosen: SnippetIndex) -> Drawn:
-        """Some snippets as one batch."""
-        scene = gather_scene(self.histories, chosen)
+    def load(self, snippets: SnippetIndex) -> Sample:
+        """Makes one batch of all the snippets."""
+        scene = gather_scene(self.histories, snippets)
         later = tuple(
             make_batch(
-                gather_scene(self.histories, chosen.shifted(ticks)), self.view, chosen.history
+                gather_scene(self.histories, snippets.shifted(ticks)), self.view, snippets.history
             )
             for ticks in self.later_ticks
         )
-        labels = make_labels(scene, gather_future(self.recordings, chosen), later)
-        return make_batch(scene, self.view, chosen.history), labels
+        labels = make_labels(scene, gather_future(self.recordings, snippets), later)
+        return make_batch(scene, self.view, snippets.history), labels
 
 
 @final
 class BatchWorkers:
-    """Processes that draw; they end with the one that started them, however it ends."""
+    """Processes that make batches; they end with the process that started them, even if killed."""
 
-    def __init__(self, drawings: Sequence[BatchSource], processes: int) -> None:
-        """So many processes, of which each knows all the drawings by their number."""
-        self.ahead = AHEAD * processes
+    def __init__(self, sources: Sequence[BatchSource], processes: int) -> None:
+        """Starts the processes; each of them has all the sources."""
+        self.prefetch = PREFETCH * processes
         self._pool = ProcessPoolExecutor(
             processes,
             mp_context=multiprocessing.get_context("spawn"),  # GPUs and threads survive no fork
             initializer=_begin,
-            initargs=(tuple(drawings),),
+            initargs=(tuple(sources),),
         )
 
-    def submit(self, number: int, chosen: SnippetIndex) -> Future[Drawn]:
-        """Has a batch drawn."""
-        return self._pool.submit(_draw, number, chosen)
+    def submit(self, source: int, snippets: SnippetIndex) -> Future[Sample]:
+        """Starts to make a batch of the snippets from the source of that index."""
+        return self._pool.submit(_load, source, snippets)
 
     def close(self) -> None:
-        """Ends the processes; what is not begun is not drawn."""
+        """Cancels the batches that are not begun, and ends the processes."""
         self._pool.shutdown(cancel_futures=True)
 
 
 @contextmanager
-def batch_workers(drawings: Sequence[BatchSource], processes: int) -> Iterator[BatchWorkers | None]:
-    """A crew for as long as it is needed; None for no processes."""
+def batch_workers(sources: Sequence[BatchSource], processes: int) -> Iterator[BatchWorkers | None]:
+    """Processes for the duration of a `with` block; None if there are to be no processes."""
     if not processes:
         yield None
         return
-    crew = BatchWorkers(drawings, processes)
+    workers = BatchWorkers(sources, processes)
     try:
-        yield crew
+        yield workers
     finally:
-        crew.close()
+        workers.close()
 
 
-def load_by_thread(drawing: BatchSource, chosen: Iterable[SnippetIndex]) -> Iterator[Drawn]:
-    """Batches in their order, drawn while the network works on the ones before."""
-    with ThreadPoolExecutor(1, thread_name_prefix="draw") as pool:
-        yield from _in_order(chosen, lambda each: pool.submit(drawing.draw, each), AHEAD)
+def load_by_thread(source: BatchSource, batches: Iterable[SnippetIndex]) -> Iterator[Sample]:
+    """Makes batches in order, in a thread.
+
+    Args:
+        source: What they are made from.
+        batches: The snippets of each batch.
+    """
+    with ThreadPoolExecutor(1, thread_name_prefix="load") as pool:
+        yield from _in_order(batches, lambda each: pool.submit(source.load, each), PREFETCH)
 
 
 def load_by_workers(
-    crew: BatchWorkers, number: int, chosen: Iterable[SnippetIndex]
-) -> Iterator[Drawn]:
-    """The same by processes."""
-    return _in_order(chosen, lambda each: crew.submit(number, each), crew.ahead)
+    workers: BatchWorkers, source: int, batches: Iterable[SnippetIndex]
+) -> Iterator[Sample]:
+    """Makes batches in order, in processes.
+
+    Args:
+        workers: The processes.
+        source: Index of what they are made from.
+        batches: The snippets of each batch.
+    """
+    return _in_order(batches, lambda each: workers.submit(source, each), workers.prefetch)
 
 
 def _in_order(
-    chosen: Iterable[SnippetIndex],
-    submit: Callable[[SnippetIndex], Future[Drawn]],
-    ahead: int,
-) -> Iterator[Drawn]:
-    left = iter(chosen)
-    waiting = deque(submit(each) for each in islice(left, ahead))
-    while waiting:
-        ready = waiting.popleft().result()
-        waiting.extend(submit(each) for each in islice(left, 1))
+    batches: Iterable[SnippetIndex],
+    submit: Callable[[SnippetIndex], Future[Sample]],
+    prefetch: int,
+) -> Iterator[Sample]:
+    remaining = iter(batches)
+    pending = deque(submit(each) for each in islice(remaining, prefetch))
+    while pending:
+        ready = pending.popleft().result()
+        pending.extend(submit(each) for each in islice(remaining, 1))
         yield ready
 
 
-_drawings: tuple[BatchSource, ...] = ()
-"""What this process draws, if it is of a crew."""
+_sources: tuple[BatchSource, ...] = ()
+"""The sources of this process, if it is one of `BatchWorkers`."""
 
 
-def _begin(drawings: tuple[BatchSource, ...]) -> None:
-    global _drawings
-    _drawings = drawings
+def _begin(sources: tuple[BatchSource, ...]) -> None:
+    global _sources
+    _sources = sources
     torch.set_num_threads(1)
     threading.Thread(target=_end_with_parent, daemon=True).start()
 
 
 def _end_with_parent() -> None:
-    """A parent that was killed cannot tell its processes to end."""
+    """Ends this process when its parent ends; a parent that is killed cannot shut the pool down."""
     parent = parent_process()
     if parent is not None:
         connection.wait([parent.sentinel])
         os._exit(1)
 
 
-def _draw(number: int, chosen: SnippetIndex) -> Drawn:
-    return _drawings[number].draw(chosen)
+def _load(source: int, snippets: SnippetIndex) -> Sample:
+    return _sources[source].load(snippets)

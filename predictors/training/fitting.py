@@ -1,7 +1,4 @@
-"""The state of an unfinished run, written without pickles: tensors and JSON in one file.
-
-MERGED: Training with Lightning: data, network, optimisation, checkpoint. Resumes where it was killed.
-"""
+"""A training run from data to checkpoint, with Lightning; it resumes where it was interrupted."""
 
 import ctypes
 import dataclasses
@@ -23,19 +20,29 @@ from asp_env.data.source import open_data
 from asp_env.errors import AspEnvError
 from asp_env.views import make_view
 from predictors.inference.calibration import calibrate
-from predictors.inference.checkpoint import CONFIG, read_config, save_learned, shape_for, write_json
-from predictors.models.network import LearnedPlug
+from predictors.inference.checkpoint import (
+    CONFIG,
+    PredictorSpec,
+    read_config,
+    save_trained,
+    shape_for,
+    write_json,
+)
 from predictors.training.data import VALIDATION_BATCH, action_range, open_training_data
 from predictors.training.data_loading import batch_workers
-from predictors.training.lightning_parts import BestCheckpoint, EpochLogger, Fit
+from predictors.training.lightning_parts import BestCheckpoint, EpochLogger, TrainingModule
 from predictors.training.pretrained import PretrainedWeights
 from predictors.training.recipes import SEGMENT_S, TrainingConfig
 from predictors.training.trainer import LOGS, Hardware, SafetensorsIO, make_trainer, quiet
 
 RUN = "run.json"
-STATE = "unfinished"
-BEFORE = "3s"
+"""File of an unfinished run's configuration and data hash."""
 
+STATE = "unfinished"
+"""Folder of an unfinished run's state."""
+
+FIRST_STAGE = "3s"
+"""Folder of the run for 3 s that a run for a longer horizon starts from."""
 
 ONE_PROCESS = Hardware()
 
@@ -48,65 +55,63 @@ def train(
     start: Path | None = None,
     hardware: Hardware = ONE_PROCESS,
 ) -> Path:
-    """Trains a predictor, or goes on with a run that was killed.
+    """Trains a predictor, or continues an unfinished run.
 
     With several devices the running program is started again for each of them, with the arguments
-    of its command line, and has to arrive here; nodes see the same `out` and data. The first
-    process alone writes. A run may go on on other hardware than it began on.
+    of its command line, and must call this function again; all nodes must see the same `out` and
+    data. Only the first process writes. A run may be continued on other hardware.
 
     Args:
-        config: everything that decides the weights, besides the data and the start.
+        config: Everything that decides the weights, besides the data and the start.
         data: DATA, as `open_data` takes it.
-        out: the run's folder. It holds `logs` and, until the run is finished, `unfinished`; then
+        out: The run's folder. It holds `logs` and, until the run is finished, `unfinished`; then
             `config.json`, `weights.safetensors` and `README.md`, of the epoch with the lowest
             `validation FDE moving`.
-        start: the folder of a finished run, or a file of ResNet18 weights, to start from.
-        hardware: what to work on.
+        start: The folder of a finished run, or a file of ResNet18 weights, to start from.
+        hardware: Devices and nodes.
 
     Returns:
         `out`.
 
     Raises:
-        AspEnvError: the folder holds a finished run, or one of another configuration, or something
-            else; the data or the start are bad; the hardware is not there; or the loss is not
+        AspEnvError: The folder holds a finished run, a run of another configuration, or other
+            files; the data or the start are bad; the hardware is not available; or the loss is not
             finite.
     """
     chosen = open_training_data(config, data)
     run = {"config": dataclasses.asdict(config), "data_hash": chosen.data_hash}
     if chosen.validation_hash is not None:
         run["validation_hash"] = chosen.validation_hash
-    plug: LearnedPlug = registry.find("predictors", config.predictor)
+    spec: PredictorSpec = registry.find("predictors", config.predictor)
     view = make_view(config.view, pixels=config.pixels)
-    begin = None
+    pretrained = None
     if start is not None:
-        begin = PretrainedWeights.read(start, plug, view=view, dt_s=config.dt_s)
-    if begin is not None:
-        run["start"] = begin.weights_hash
-    resumed = _resumes(out, run, staged=start == out / BEFORE)
+        pretrained = PretrainedWeights.read(start, spec, view=view, dt_s=config.dt_s)
+        run["start"] = pretrained.weights_hash
+    resumed = _resumes(out, run, staged=start == out / FIRST_STAGE)
 
     training = chosen.training
-    if begin is None or begin.action_range is None:
+    if pretrained is None or pretrained.action_range is None:
         scale = action_range(training.recordings, training.snippets)
     else:
-        scale = begin.action_range
+        scale = pretrained.action_range
     shape = shape_for(
         view,
         history=training.snippets.history,
-        horizon=training.snippets.horizon,
+        horizon=training.snippets.horizon_ticks,
         dt_s=config.dt_s,
         action_range=scale,
     )
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(config.seed)
-        network = plug.network(config.network, shape)
-    new = [] if begin is None else begin.apply(network)
+        network = spec.network(config.network, shape)
+    not_loaded = [] if pretrained is None else pretrained.apply(network)
     trained_on = chosen.trained_on
-    if begin is not None and begin.trained_on is not None:
-        trained_on = trained_on.after(begin.trained_on)
-    later = network.later_ticks
+    if pretrained is not None and pretrained.trained_on is not None:
+        trained_on = trained_on.continued_from(pretrained.trained_on)
     batches = [
-        share.batches(view, size=size, later_ticks=later, config=config)
-        for share, size in (
+        split.batches(view, size=size, later_ticks=network.later_ticks, config=config)
+        for split, size in (
             (training, config.batch_size),
             (chosen.validation, VALIDATION_BATCH),
         )
@@ -122,10 +127,10 @@ def train(
         if not resumed:
             write_json(run, state / RUN)
         shutil.rmtree(out / LOGS / started, ignore_errors=True)
-    with batch_workers([each.drawing for each in batches], hardware.num_workers) as crew:
-        if crew is not None:
-            batches = [each.drawn_by(crew, number) for number, each in enumerate(batches)]
-        module = Fit(network, config=config, training=batches[0], validation=batches[1])
+    with batch_workers([each.source for each in batches], hardware.num_workers) as workers:
+        if workers is not None:
+            batches = [each.with_workers(workers, index) for index, each in enumerate(batches)]
+        module = TrainingModule(network, config=config, training=batches[0], validation=batches[1])
         _fit(trainer, module, best.state_path, hardware)
         if not trainer.is_global_zero:
             trainer.strategy.barrier()
@@ -134,9 +139,9 @@ def train(
         network.load_state_dict(load_file(best.best_path))
         with torch.compiler.set_stance("force_eager") if hardware.compiled else nullcontext():
             temperature = calibrate(network, batches[1])
-    save_learned(
+    save_trained(
         out,
-        plug=plug,
+        spec=spec,
         network_config=config.network,
         shape=shape,
         view=view,
@@ -149,7 +154,7 @@ def train(
                 "training": len(training.snippets),
                 "validation": len(chosen.validation.snippets),
             },
-            "not_started": new,
+            "not_started": not_loaded,
             "best_epoch": best.best_epoch,
             "best_value": best.best_value,
             "processes": trainer.world_size,
@@ -171,67 +176,74 @@ def train_stages(
     start: Path | None = None,
     hardware: Hardware = ONE_PROCESS,
 ) -> Path:
-    """Trains in stages: above 3 s it goes on from a run for 3 s in `out/3s`, made if need be.
+    """Trains in stages: a run for more than 3 s starts from a run for 3 s in `out/3s`.
+
+    The first stage is trained if it is missing.
 
     Args:
-        config_for: the configuration of a horizon in seconds.
-        horizon_s: that is asked for.
-        data: DATA.
-        out: the run's folder.
-        start: where to start from instead.
-        hardware: what to work on.
+        config_for: Maps a horizon in seconds to the configuration.
+        horizon_s: The horizon of the predictor.
+        data: DATA, as `open_data` takes it.
+        out: The run's folder.
+        start: Where to start from instead of a first stage.
+        hardware: Devices and nodes.
+
+    Returns:
+        `out`.
 
     Raises:
-        AspEnvError: as `train`.
+        AspEnvError: As `train`, or the first stage is of another configuration or other data.
     """
     config = config_for(horizon_s)
     if start is None and horizon_s > SEGMENT_S:
-        start, before = out / BEFORE, config_for(SEGMENT_S)
+        start, first = out / FIRST_STAGE, config_for(SEGMENT_S)
         if (start / CONFIG).exists():
-            _check_before(start, before, data)
+            _check_first_stage(start, first, data)
         else:
-            train(before, data, start, hardware=hardware)
+            train(first, data, start, hardware=hardware)
     return train(config, data, out, start=start, hardware=hardware)
 
 
-def _check_before(start: Path, config: TrainingConfig, data: str) -> None:
-    """A finished run for 3 s may be of other data: of the test recordings, in the worst case."""
-    found = read_config(start).get("provenance", {})
+def _check_first_stage(start: Path, config: TrainingConfig, data: str) -> None:
+    """Refuses a first stage of other data, possibly the test recordings, or another recipe."""
+    provenance = read_config(start).get("provenance", {})
     expected = {
         "config": json.loads(json.dumps(dataclasses.asdict(config))),
         "data_hash": open_data(data).data_hash(),
     }
-    if other := [name for name, value in expected.items() if found.get(name) != value]:
+    if other := [name for name, value in expected.items() if provenance.get(name) != value]:
         raise AspEnvError(
             f"{start} holds a finished run of another {' and '.join(other)}: delete it to train it "
-            "again, or name it by --start to go on from it"
+            "again, or name it by --start"
         )
 
 
 def _resumes(out: Path, run: dict[str, Any], *, staged: bool) -> bool:
-    """Whether the folder holds this run unfinished; False where there is nothing yet."""
+    """Whether the folder holds this run unfinished; False if it is new or empty."""
     if (out / CONFIG).exists():
         raise AspEnvError(f"{out} holds a finished run: give another --out, or delete it")
     if (out / STATE / RUN).exists():
         try:
-            found = json.loads((out / STATE / RUN).read_text())
+            stored = json.loads((out / STATE / RUN).read_text())
         except ValueError:
-            found = None
-        if found != json.loads(json.dumps(run)):
+            stored = None
+        if stored != json.loads(json.dumps(run)):
             raise AspEnvError(
                 f"{out} holds an unfinished run of another configuration or other data: "
                 "give another --out, or delete it"
             )
         return True
-    # A kill right after the folder was made left it without a word of what it is.
-    known = (BEFORE, STATE) if staged else (STATE,)
-    if out.exists() and (not out.is_dir() or any(each.name not in known for each in out.iterdir())):
+    # An interruption right after the folder was made leaves it without `run.json`.
+    allowed = (FIRST_STAGE, STATE) if staged else (STATE,)
+    if out.exists() and (
+        not out.is_dir() or any(each.name not in allowed for each in out.iterdir())
+    ):
         raise AspEnvError(f"{out} holds something that is no run: give another --out")
     return False
 
 
-def _fit(trainer: pl.Trainer, module: Fit, state: Path, hardware: Hardware) -> None:
-    _keep_freed_memory()
+def _fit(trainer: pl.Trainer, module: TrainingModule, state: Path, hardware: Hardware) -> None:
+    _retain_freed_memory()
     if hardware.compiled:
         module.network.get_submodule("encoder").compile()
     with quiet(), _threads(module.config.threads):
@@ -254,8 +266,8 @@ def _epochs_done(state: Path) -> int:
     return int(SafetensorsIO().load_checkpoint(state)["epoch"]) + 1
 
 
-def _keep_freed_memory() -> None:
-    """Lets glibc keep what is freed: large arrays otherwise fault every page in every step."""
+def _retain_freed_memory() -> None:
+    """Makes glibc retain freed memory: large arrays otherwise fault every page in every step."""
     if platform.libc_ver()[0] == "glibc":
         libc = ctypes.CDLL(None)
         trim_threshold, mmap_threshold = -1, -3

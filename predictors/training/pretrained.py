@@ -1,4 +1,4 @@
-"""Where a run starts from, other than from random weights."""
+"""Weights that a run starts from instead of random ones."""
 
 import hashlib
 import json
@@ -10,9 +10,9 @@ from torch import Tensor
 from asp_env.data.split import TrainedOn
 from asp_env.errors import CheckpointError
 from asp_env.views import SceneView
-from predictors.inference.checkpoint import WEIGHTS, read_config, read_weights
+from predictors.inference.checkpoint import WEIGHTS, PredictorSpec, read_config, read_weights
 from predictors.models.encoders import load_resnet18
-from predictors.models.network import AbstractNetwork, LearnedPlug
+from predictors.models.network import AbstractNetwork
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -24,18 +24,25 @@ class PretrainedWeights:
     action_range: tuple[float, float] | None
     """The normaliser that the weights belong to; None for a ResNet18."""
     weights: dict[str, Tensor] | None
-    """None for a ResNet18."""
+    """None for a ResNet18, whose file is read later."""
     trained_on: TrainedOn | None
-    """What the weights have seen; None for a ResNet18, which has seen other things."""
+    """The recordings that the weights were trained on; None for a ResNet18."""
 
     @classmethod
     def read(
-        cls, path: Path, plug: LearnedPlug, *, view: SceneView, dt_s: float
+        cls, path: Path, spec: PredictorSpec, *, view: SceneView, dt_s: float
     ) -> "PretrainedWeights":
-        """From the folder of a run, or a file of ResNet18 weights.
+        """Reads the folder of a run; a file is taken for ResNet18 weights.
+
+        Args:
+            path: The folder or the file.
+            spec: The kind of predictor that starts.
+            view: Its view.
+            dt_s: Its time step.
 
         Raises:
-            CheckpointError: it is missing, damaged, or of another predictor, view or time step.
+            CheckpointError: The run is missing, damaged, or of another predictor, view or time
+                step.
         """
         if path.is_file():
             digest = hashlib.sha256(path.read_bytes()).hexdigest()
@@ -43,12 +50,12 @@ class PretrainedWeights:
                 path=path, weights_hash=digest, action_range=None, weights=None, trained_on=None
             )
         config = read_config(path)
-        if config["predictor"] != plug.name:
+        if config["predictor"] != spec.name:
             raise CheckpointError(
-                f"{path} holds the predictor {config['predictor']!r}, which {plug.name!r} cannot "
+                f"{path} holds the predictor {config['predictor']!r}, which {spec.name!r} cannot "
                 "start from"
             )
-        # Pictures of the same size may still show other things: weights would fit, and be wrong.
+        # Rasters of the same size may show other things: the weights would fit, and be wrong.
         if config.get("view") != json.loads(json.dumps(view.config())):
             raise CheckpointError(
                 f"{path} has another view than this run: start from one of the same"
@@ -64,7 +71,7 @@ class PretrainedWeights:
             trained_on = TrainedOn(**config["provenance"]["trained_on"])
         except (KeyError, TypeError, ValueError) as error:
             raise CheckpointError(
-                f"{path} does not say its normaliser and what it learned from: train again"
+                f"{path} does not name its normaliser and its training data: train again"
             ) from error
         digest = hashlib.sha256((path / WEIGHTS).read_bytes()).hexdigest()
         return cls(
@@ -76,20 +83,23 @@ class PretrainedWeights:
         )
 
     def apply(self, network: AbstractNetwork) -> list[str]:
-        """Loads the weights that fit the network; the names of those that it keeps at random.
+        """Loads the weights that fit the network.
 
-        A network for a longer horizon has an output of another size, and keeps that.
+        A network for a longer horizon may have an output of another size, which is not loaded.
+
+        Returns:
+            The names of the weights that were not loaded.
 
         Raises:
-            CheckpointError: none of the encoder's weights fit.
+            CheckpointError: The encoder's weights do not fit.
         """
         if self.weights is None:
             load_resnet18(network, self.path)
             return []
         own = network.state_dict()
-        # A follower that the run had not yet begins where its leader stands.
-        followers = {f"target_{name}": value for name, value in self.weights.items()}
-        weights = followers | self.weights
+        # A second encoder that the pretrained run had not starts as a copy of the first.
+        copies = {f"target_{name}": value for name, value in self.weights.items()}
+        weights = copies | self.weights
         fitting = {
             name: value
             for name, value in weights.items()

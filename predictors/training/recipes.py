@@ -1,4 +1,8 @@
-"""Runs as functions: each gives a whole configuration; variants change fields of another."""
+"""Recipes: how each predictor is trained, as functions that return a whole configuration.
+
+Each recipe takes a view and a horizon in seconds. Its docstring gives its command; variants
+(`predictors.training.variants`) change fields of a recipe.
+"""
 
 import dataclasses
 from collections.abc import Callable, Mapping
@@ -16,42 +20,48 @@ from predictors.models.network import NetworkConfig
 from predictors.models.ssp_asp import SSPASPConfig
 
 SEGMENT_S = 3.0
-"""How much a predictor that chains segments forecasts at once."""
+"""Length of the segments that `ssp-asp` chains, seconds: the paper's shorter horizon."""
 
 CHAINED = frozenset({"ssp-asp"})
-"""Predictors whose runs for longer horizons go on from the weights of a run for one segment, as in
-the paper; the others predict any horizon at once and learn it from the start."""
+"""Predictors whose runs for longer horizons start from the weights of a run for one segment, as in
+the paper; the others predict every horizon at once and are trained on it from the start."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class TrainingConfig:
-    """Everything that decides the weights, but the data's content."""
+    """Everything that decides the weights, besides the content of the data.
+
+    The names of the fields are keys of `config.json`.
+    """
 
     predictor: str
     preset: str
-    """Name of the recipe that it comes from; tables show it."""
+    """Name of the recipe."""
     network: NetworkConfig
     view: str
     pixels: tuple[int, int] | None
-    """Height and width of pictures; None for a view that draws none."""
+    """Height and width of rasters; None for the view's own, or for a view without rasters."""
     horizon_s: float
     dt_s: float = DEFAULT_DT_S
     split: Split = "recording"
     validation: str | None = None
-    """Other data to select on; all of DATA is learned from then."""
+    """Separate validation data; all of DATA is trained on then."""
     history: Literal["recorded", "causal"] = "recorded"
-    """Whether histories are as recorded, smoothed with what came after, or filtered forward."""
+    """Whether inputs show the histories as recorded, smoothed with later frames, or filtered
+    forward."""
     seed: int = 0
     max_snippets: int | None = None
-    """Training snippets to keep at most, at random; None keeps all."""
+    """Largest number of training snippets, chosen at random; None for all."""
     max_validation_snippets: int | None = None
     standing_share: float = 1.0
-    """Standing targets are at most this share of the training snippets."""
+    """Largest share of standing targets in the training snippets."""
     epochs: int = 10
+    """Epochs after the pre-training."""
     pretraining_epochs: int = 0
-    """Before those: epochs in which ssp-asp learns its features alone."""
+    """Epochs before, in which `ssp-asp` learns its features only."""
     snippets_per_epoch: int | None = None
-    """At most; None shows all of them in every epoch. Bounds the time of a run on much data."""
+    """Largest number of snippets in an epoch, which bounds the time of a run on much data; None for
+    all."""
     batch_size: int = 32
     learning_rate: float = 1e-4
     weight_decay: float = 0.0
@@ -59,15 +69,15 @@ class TrainingConfig:
     """`plateau` divides the learning rate by 5 after 3 epochs without improvement; `one-cycle`
     raises it over the first tenth of all steps and lowers it along a cosine to zero."""
     precision: Literal["32-true", "bf16-mixed"] = "32-true"
-    """Of the encoder; all that follows it is always float32."""
+    """Precision of the encoder; the rest of the network is always float32."""
     threads: int | None = None
-    """Threads of torch within one operation; None leaves its own choice."""
+    """Threads of torch within one operation; None for its default."""
 
     def __post_init__(self) -> None:
         """Checks the numbers.
 
         Raises:
-            AspEnvError: one is out of its range.
+            AspEnvError: A number is out of its range.
         """
         for field in (
             "epochs",
@@ -91,89 +101,49 @@ class TrainingConfig:
 
     @property
     def all_epochs(self) -> int:
-        """Those of pre-training and those after it."""
+        """Number of epochs, pre-training included."""
         return self.pretraining_epochs + self.epochs
 
 
-def _paper(predictor: str, network: NetworkConfig, view: str, horizon_s: float) -> TrainingConfig:
-    """The schedule of the paper at full size: Adam at 1e-4, batches of 32, 10 epochs."""
-    if view.startswith("vectors"):
-        network = dataclasses.replace(network, encoder="vector")
-    return TrainingConfig(
-        predictor=predictor,
-        preset="paper",
-        network=network,
-        view=view,
-        pixels=None,
-        horizon_s=horizon_s,
-    )
-
-
-def _small(
-    predictor: str, preset: str, network: NetworkConfig, view: str, horizon_s: float
-) -> TrainingConfig:
-    """Minutes on two cores: pictures of a quarter of the resolution, a small encoder, one cycle.
-
-    A longer horizon takes as many epochs again: after those for 3 s, where a predictor chains
-    segments, or in one go.
-    """
-    at_once = horizon_s > SEGMENT_S and predictor not in CHAINED
-    vectors = view.startswith("vectors")
-    pixels = (90, 90) if view == "mtp" else (90, 60)
-    network = dataclasses.replace(network, encoder="vector" if vectors else "small", features=256)
-    return TrainingConfig(
-        predictor=predictor,
-        preset=preset,
-        network=network,
-        view=view,
-        pixels=None if vectors else pixels,
-        horizon_s=horizon_s,
-        standing_share=0.25,
-        epochs=16 if at_once else 8,
-        snippets_per_epoch=6_000,
-        max_validation_snippets=2_000,
-        batch_size=64,
-        learning_rate=1e-3,
-        weight_decay=1e-2,
-        schedule="one-cycle",
-        precision="32-true" if vectors else "bf16-mixed",
-        threads=1,
-    )
-
-
 def mtp_paper(view: str, horizon_s: float) -> TrainingConfig:
-    """Of the paper's references: state to positions."""
+    """`asp-env train mtp DATA --recipe paper`: MTP with the encoder and schedule of the paper."""
     return _paper("mtp", MTPConfig(), view, horizon_s)
 
 
 def mtp_cpu(view: str, horizon_s: float) -> TrainingConfig:
-    """The same structure, small."""
+    """`asp-env train mtp DATA`: MTP at small size, see `_small`."""
     return _small("mtp", "cpu", MTPConfig(hidden=256), view, horizon_s)
 
 
 def dkm_paper(view: str, horizon_s: float) -> TrainingConfig:
-    """What the paper compares with: state to actions."""
+    """`asp-env train dkm DATA --recipe paper`: DKM with the encoder and schedule of the paper."""
     return _paper("dkm", DKMConfig(), view, horizon_s)
 
 
 def dkm_cpu(view: str, horizon_s: float) -> TrainingConfig:
-    """The same structure, small, under Heun."""
+    """`asp-env train dkm DATA`: DKM at small size, see `_small`, integrated by Heun's method."""
     return _small("dkm", "cpu", DKMConfig(hidden=256, integrator="heun"), view, horizon_s)
 
 
 def ffw_asp_paper(view: str, horizon_s: float) -> TrainingConfig:
-    """The paper's feed-forward network; 6 s are predicted at once."""
+    """`asp-env train ffw-asp DATA --recipe paper`: the paper's FFW-ASP, also at 6 s."""
     return _paper("ffw-asp", FFWASPConfig(), view, horizon_s)
 
 
 def ffw_asp_cpu(view: str, horizon_s: float) -> TrainingConfig:
-    """The same structure, small, under Heun."""
+    """`asp-env train ffw-asp DATA`: FFW-ASP at small size, see `_small`, by Heun's method."""
     network = FFWASPConfig(gru_width=128, integrator="heun")
     return _small("ffw-asp", "cpu", network, view, horizon_s)
 
 
 def ffw_asp_ours(view: str, horizon_s: float) -> TrainingConfig:
-    """Small, with what the ablations taught: features and actions skip past the recurrent head."""
+    """`asp-env train ffw-asp DATA --recipe ours`: small size, improved by the ablations.
+
+    Differs from `cpu`: features, speed and past actions skip the GRU, which has one layer
+    and is followed by a hidden layer; modes are assigned by distance; more standing targets,
+    longer epochs and a higher learning rate. Chosen on validation data of synthetic traffic
+    (`docs/results.md`).
+    """
     network = FFWASPConfig(
         gru_width=128, gru_layers=1, skip=True, hidden=256, integrator="heun", assignment="distance"
     )
@@ -184,14 +154,27 @@ def ffw_asp_ours(view: str, horizon_s: float) -> TrainingConfig:
 
 
 def ssp_asp_paper(view: str, horizon_s: float) -> TrainingConfig:
-    """The paper's self-supervised network, with three epochs of forward-model pre-training."""
+    """`asp-env train ssp-asp DATA --recipe paper`: the paper's SSP-ASP.
+
+    Three epochs of pre-training come before the ten of the paper. A run for more than 3 s starts
+    from one for 3 s, without pre-training.
+
+    Raises:
+        AspEnvError: The horizon is not a whole number of segments.
+    """
     _check_segments(horizon_s)
     config = _paper("ssp-asp", SSPASPConfig(), view, horizon_s)
     return _pretrained(config, horizon_s, 3, of=config.epochs + 3)
 
 
 def ssp_asp_cpu(view: str, horizon_s: float) -> TrainingConfig:
-    """The same structure, small, under Heun; pre-training takes two of the eight epochs."""
+    """`asp-env train ssp-asp DATA`: SSP-ASP at small size, see `_small`, by Heun's method.
+
+    Pre-training takes two of the eight epochs, so that the time is that of the other predictors.
+
+    Raises:
+        AspEnvError: The horizon is not a whole number of segments.
+    """
     _check_segments(horizon_s)
     network = SSPASPConfig(gru_width=128, integrator="heun")
     config = _small("ssp-asp", "cpu", network, view, horizon_s)
@@ -199,10 +182,16 @@ def ssp_asp_cpu(view: str, horizon_s: float) -> TrainingConfig:
 
 
 def ssp_asp_ours(view: str, horizon_s: float) -> TrainingConfig:
-    """Small, with what the ablations taught.
+    """`asp-env train ssp-asp DATA --recipe ours`: small size, improved by the ablations.
 
-    Annealed modes hold apart what the best mode alone lets collapse; a run that goes on from one
-    that had them keeps them as they are. Chains that run near each other speak for each other.
+    Differs from `cpu`: no pre-training; features, speed and past actions skip the GRU, which has
+    one layer and is followed by a hidden layer; features are normalised and fixed as targets; modes
+    are assigned by distance and annealed at 3 s, which keeps them apart, and a run for 6 s starts
+    from those; later segments follow the most probable mode ever more often; forecasts are merged
+    into three modes. Chosen on validation data of synthetic traffic (`docs/results.md`).
+
+    Raises:
+        AspEnvError: The horizon is not a whole number of segments.
     """
     _check_segments(horizon_s)
     network = SSPASPConfig(
@@ -222,8 +211,89 @@ def ssp_asp_ours(view: str, horizon_s: float) -> TrainingConfig:
     return _small("ssp-asp", "ours", network, view, horizon_s)
 
 
+Recipe = Callable[[str, float], TrainingConfig]
+"""Makes a configuration of a view and a horizon in seconds."""
+
+RECIPES: Mapping[str, Mapping[str, Recipe]] = MappingProxyType(
+    {
+        "mtp": {"cpu": mtp_cpu, "paper": mtp_paper},
+        "dkm": {"cpu": dkm_cpu, "paper": dkm_paper},
+        "ffw-asp": {"cpu": ffw_asp_cpu, "paper": ffw_asp_paper, "ours": ffw_asp_ours},
+        "ssp-asp": {"cpu": ssp_asp_cpu, "paper": ssp_asp_paper, "ours": ssp_asp_ours},
+    }
+)
+"""Recipes by predictor and name."""
+
+
+def recipe(predictor: str, name: str, *, view: str, horizon_s: float) -> TrainingConfig:
+    """Makes the configuration of a recipe.
+
+    Args:
+        predictor: Name of the predictor.
+        name: Name of the recipe.
+        view: Name of the view.
+        horizon_s: Horizon, seconds.
+
+    Raises:
+        AspEnvError: A name is unknown (known ones are listed), or the horizon does not fit.
+    """
+    if predictor not in RECIPES:
+        raise unknown_name("trainable predictor", predictor, RECIPES)
+    recipes = RECIPES[predictor]
+    if name not in recipes:
+        raise unknown_name(f"recipe of {predictor}", name, recipes)
+    return recipes[name](view, horizon_s)
+
+
+def _paper(predictor: str, network: NetworkConfig, view: str, horizon_s: float) -> TrainingConfig:
+    """The paper's size and schedule: Adam at 1e-4, batches of 32, 10 epochs, `plateau`."""
+    if view.startswith("vectors"):
+        network = dataclasses.replace(network, encoder="vector")
+    return TrainingConfig(
+        predictor=predictor,
+        preset="paper",
+        network=network,
+        view=view,
+        pixels=None,
+        horizon_s=horizon_s,
+    )
+
+
+def _small(
+    predictor: str, name: str, network: NetworkConfig, view: str, horizon_s: float
+) -> TrainingConfig:
+    """Small size, for minutes on two cores; the numbers are chosen by hand.
+
+    Rasters have a quarter of the resolution, the encoder is small, and the schedule is
+    `one-cycle`. A longer horizon takes as many epochs again: after those for 3 s if segments are
+    chained, else at once.
+    """
+    at_once = horizon_s > SEGMENT_S and predictor not in CHAINED
+    vectors = view.startswith("vectors")
+    pixels = (90, 90) if view == "mtp" else (90, 60)
+    network = dataclasses.replace(network, encoder="vector" if vectors else "small", features=256)
+    return TrainingConfig(
+        predictor=predictor,
+        preset=name,
+        network=network,
+        view=view,
+        pixels=None if vectors else pixels,
+        horizon_s=horizon_s,
+        standing_share=0.25,
+        epochs=16 if at_once else 8,
+        snippets_per_epoch=6_000,
+        max_validation_snippets=2_000,
+        batch_size=64,
+        learning_rate=1e-3,
+        weight_decay=1e-2,
+        schedule="one-cycle",
+        precision="32-true" if vectors else "bf16-mixed",
+        threads=1,
+    )
+
+
 def _check_segments(horizon_s: float) -> None:
-    """Refuses, before anything is trained, what cannot be chained."""
+    """Refuses a horizon that cannot be chained, before anything is trained."""
     if horizon_s < SEGMENT_S or abs(horizon_s / SEGMENT_S - round(horizon_s / SEGMENT_S)) > 1e-6:
         raise AspEnvError(
             f"ssp-asp chains segments of {SEGMENT_S:g} s, the horizon of {horizon_s:g} s is no "
@@ -234,34 +304,7 @@ def _check_segments(horizon_s: float) -> None:
 def _pretrained(
     config: TrainingConfig, horizon_s: float, epochs: int, *, of: int
 ) -> TrainingConfig:
-    """With pre-training, where the run does not go on from one that had it."""
+    """Makes some of all epochs pre-training, unless the run starts from one that had it."""
     if horizon_s > SEGMENT_S:
         return config
     return dataclasses.replace(config, pretraining_epochs=epochs, epochs=of - epochs)
-
-
-Recipe = Callable[[str, float], TrainingConfig]
-
-RECIPES: Mapping[str, Mapping[str, Recipe]] = MappingProxyType(
-    {
-        "mtp": {"cpu": mtp_cpu, "paper": mtp_paper},
-        "dkm": {"cpu": dkm_cpu, "paper": dkm_paper},
-        "ffw-asp": {"cpu": ffw_asp_cpu, "paper": ffw_asp_paper, "ours": ffw_asp_ours},
-        "ssp-asp": {"cpu": ssp_asp_cpu, "paper": ssp_asp_paper, "ours": ssp_asp_ours},
-    }
-)
-"""Of (view, horizon in seconds), by predictor and preset."""
-
-
-def recipe(predictor: str, preset: str, *, view: str, horizon_s: float) -> TrainingConfig:
-    """The configuration of a predictor's preset.
-
-    Raises:
-        AspEnvError: there is none; those that there are get listed.
-    """
-    if predictor not in RECIPES:
-        raise unknown_name("trainable predictor", predictor, RECIPES)
-    presets = RECIPES[predictor]
-    if preset not in presets:
-        raise unknown_name(f"preset of {predictor}", preset, presets)
-    return presets[preset](view, horizon_s)

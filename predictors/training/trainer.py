@@ -1,8 +1,8 @@
-"""What a run is worked out on: devices, nodes and whether the encoder is compiled.
+"""The Lightning trainer: devices and nodes, and the state of an unfinished run as safetensors.
 
 Processes share every batch evenly, so that `batch_size` is that of all of them together and the
-weights are those of one process up to rounding. Batch statistics are those of the whole batch on
-GPUs; between CPUs they are not exchanged, and each process normalises by its own share of a batch.
+weights are those of one process up to rounding. On GPUs batch statistics are those of the whole
+batch; between CPUs they are not exchanged, and each process normalises by its own shard of a batch.
 """
 
 import importlib.util
@@ -31,105 +31,38 @@ from safetensors.torch import save
 from torch import distributed, nn
 
 from asp_env.errors import AspEnvError, CheckpointError
+from predictors.inference.checkpoint import write_file
 from predictors.training.recipes import TrainingConfig
-
-
-@final
-class SafetensorsIO(CheckpointIO):
-    """Lightning's checkpoints as safetensors, with everything that is no tensor in the header."""
-
-    def save_checkpoint(
-        self, checkpoint: dict[str, Any], path: _PATH, storage_options: Any | None = None
-    ) -> None:
-        """Writes aside, then renames."""
-        del storage_options
-        tensors: dict[str, torch.Tensor] = {}
-        tree = _encode(checkpoint, tensors)
-        aside = Path(f"{path}.part")
-        aside.write_bytes(save(tensors, metadata={"tree": json.dumps(tree)}))
-        os.replace(aside, path)
-
-    def load_checkpoint(
-        self, path: _PATH, map_location: Any | None = None, weights_only: bool | None = None
-    ) -> dict[str, Any]:
-        """What was saved.
-
-        Raises:
-            CheckpointError: the file is damaged.
-        """
-        del map_location, weights_only
-        try:
-            with safe_open(str(path), framework="pt") as file:
-                names = file.keys()
-                tensors = {name: file.get_tensor(name) for name in names}
-                return _decode(json.loads(file.metadata()["tree"]), tensors)
-        except (OSError, KeyError, TypeError, ValueError, SafetensorError) as error:
-            raise CheckpointError(
-                f"{path} cannot be read: delete its folder to start the run again"
-            ) from error
-
-    def remove_checkpoint(self, path: _PATH) -> None:
-        """Deletes the file if it is there."""
-        Path(path).unlink(missing_ok=True)
-
-
-def _encode(value: Any, tensors: dict[str, torch.Tensor]) -> Any:
-    if isinstance(value, torch.Tensor):
-        name = str(len(tensors))
-        tensors[name] = value.detach().clone().contiguous()
-        return {"tensor": name}
-    if isinstance(value, dict):
-        return {"dict": [[_encode(k, tensors), _encode(v, tensors)] for k, v in value.items()]}
-    if isinstance(value, tuple):
-        return {"tuple": [_encode(item, tensors) for item in value]}
-    if isinstance(value, list):
-        return [_encode(item, tensors) for item in value]
-    if value is None or isinstance(value, str | bool | int | float):
-        return value
-    raise TypeError(f"the state of a run holds a {type(value).__name__}, which is not stored")
-
-
-def _decode(tree: Any, tensors: dict[str, torch.Tensor]) -> Any:
-    if isinstance(tree, list):
-        return [_decode(item, tensors) for item in tree]
-    if not isinstance(tree, dict):
-        return tree
-    ((kind, content),) = tree.items()
-    if kind == "tensor":
-        return tensors[content]
-    if kind == "tuple":
-        return tuple(_decode(item, tensors) for item in content)
-    return {_decode(key, tensors): _decode(value, tensors) for key, value in content}
-
 
 T = TypeVar("T")
 
 LOGS = "logs"
+"""Folder of the logs within a run."""
 
 RENDEZVOUS = ("MASTER_ADDR", "MASTER_PORT", "NODE_RANK")
-"""Variables that tell the nodes of one another, where no launcher does."""
+"""Environment variables by which nodes find each other without a launcher."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Hardware:
-    """It changes no weights but by rounding (and batch statistics, see above)."""
+    """Where a run is computed; it changes the weights only by rounding and batch statistics."""
 
     devices: int | Literal["auto"] = 1
     """Processes on each node, with a GPU each if there are GPUs; `auto` is one per GPU."""
     nodes: int = 1
-    """How many machines take part; the command is started on each of them."""
+    """Number of machines; the command is started on each of them."""
     strategy: Literal["auto", "ddp"] = "auto"
-    """`ddp` also where there is but one process."""
+    """`ddp` forces distributed training even for a single process."""
     compiled: bool = False
     """Whether the encoder is compiled by `torch.compile`."""
     num_workers: int = 0
-    """Processes that draw batches ahead for each device; with none, a thread does."""
+    """Processes for data loading of each device; with 0, a thread loads."""
 
     def __post_init__(self) -> None:
         """Checks the numbers.
 
         Raises:
-            AspEnvError: one is too low, or there is nothing to compile with.
+            AspEnvError: A number is too low, or there is no compiler.
         """
         if self.num_workers < 0:
             raise AspEnvError(f"training: num_workers is {self.num_workers}, expected 0 or more")
@@ -154,11 +87,18 @@ def make_trainer(
     started: str,
     callbacks: Sequence[pl.Callback],
 ) -> pl.Trainer:
-    """What runs the epochs of a configuration; logs go to `out/logs/started`.
+    """Makes the trainer of a run.
+
+    Args:
+        config: The configuration.
+        hardware: Devices and nodes.
+        out: The run's folder.
+        started: Folder of the logs within `out/logs`.
+        callbacks: Lightning's callbacks.
 
     Raises:
-        AspEnvError: there are not so many devices, the nodes do not know of one another, or a batch
-            is too small to be shared.
+        AspEnvError: There are too few devices, the nodes cannot find each other, or a batch has
+            fewer snippets than there are processes.
     """
     count = hardware.devices_per_node
     processes = count * hardware.nodes
@@ -170,7 +110,7 @@ def make_trainer(
         )
     strategy: DDPStrategy | Literal["auto"] = "auto"
     if processes > 1 or hardware.strategy == "ddp":
-        # In pre-training no gradient reaches what predicts actions.
+        # In pre-training the action predictor gets no gradient.
         strategy = DDPStrategy(find_unused_parameters=config.pretraining_epochs > 0)
     try:
         with quiet():
@@ -217,7 +157,7 @@ def make_trainer(
 
 @contextmanager
 def quiet() -> Iterator[None]:
-    """Lightning advises on loaders, loggers and folders; what matters here raises."""
+    """Hides Lightning's advice on loaders, loggers and folders; faults still raise."""
     for name in ("lightning.pytorch", "lightning.fabric"):
         logging.getLogger(name).setLevel(logging.WARNING)
     with warnings.catch_warnings():
@@ -226,29 +166,99 @@ def quiet() -> Iterator[None]:
 
 
 def gathered(value: T) -> list[T]:
-    """What every process gives, in their order."""
+    """The values of all processes in the order of their ranks."""
     if not (distributed.is_available() and distributed.is_initialized()):
         return [value]
-    found: list[T] = [value] * distributed.get_world_size()
-    distributed.all_gather_object(found, value)
-    return found
+    values: list[T] = [value] * distributed.get_world_size()
+    distributed.all_gather_object(values, value)
+    return values
 
 
 def share_buffers(module: nn.Module) -> None:
-    """Gives every process the first one's running statistics."""
+    """Copies the running statistics of the first process to all others."""
     if distributed.is_available() and distributed.is_initialized():
         for buffer in module.buffers():
             distributed.broadcast(buffer, 0)
 
 
 def is_first_process() -> bool:
-    """Whether this process is the one that writes; true outside of training."""
-    there = distributed.is_available() and distributed.is_initialized()
-    return not there or distributed.get_rank() == 0
+    """Whether this process has rank 0, which writes the files; true outside of training."""
+    initialized = distributed.is_available() and distributed.is_initialized()
+    return not initialized or distributed.get_rank() == 0
+
+
+@final
+class SafetensorsIO(CheckpointIO):
+    """Stores Lightning's checkpoints as safetensors with JSON in the header; no pickles."""
+
+    def save_checkpoint(
+        self, checkpoint: dict[str, Any], path: _PATH, storage_options: Any | None = None
+    ) -> None:
+        """Writes a checkpoint.
+
+        Raises:
+            TypeError: It holds an object that is neither a tensor nor JSON.
+        """
+        del storage_options
+        tensors: dict[str, torch.Tensor] = {}
+        tree = _encode(checkpoint, tensors)
+        write_file(save(tensors, metadata={"tree": json.dumps(tree)}), Path(path))
+
+    def load_checkpoint(
+        self, path: _PATH, map_location: Any | None = None, weights_only: bool | None = None
+    ) -> dict[str, Any]:
+        """Reads a checkpoint.
+
+        Raises:
+            CheckpointError: The file is damaged.
+        """
+        del map_location, weights_only
+        try:
+            with safe_open(str(path), framework="pt") as file:
+                names = file.keys()
+                tensors = {name: file.get_tensor(name) for name in names}
+                return _decode(json.loads(file.metadata()["tree"]), tensors)
+        except (OSError, KeyError, TypeError, ValueError, SafetensorError) as error:
+            raise CheckpointError(
+                f"{path} cannot be read: delete its folder to start the run again"
+            ) from error
+
+    def remove_checkpoint(self, path: _PATH) -> None:
+        """Deletes the file if it exists."""
+        Path(path).unlink(missing_ok=True)
+
+
+def _encode(value: Any, tensors: dict[str, torch.Tensor]) -> Any:
+    if isinstance(value, torch.Tensor):
+        name = str(len(tensors))
+        tensors[name] = value.detach().clone().contiguous()
+        return {"tensor": name}
+    if isinstance(value, dict):
+        return {"dict": [[_encode(k, tensors), _encode(v, tensors)] for k, v in value.items()]}
+    if isinstance(value, tuple):
+        return {"tuple": [_encode(item, tensors) for item in value]}
+    if isinstance(value, list):
+        return [_encode(item, tensors) for item in value]
+    if value is None or isinstance(value, str | bool | int | float):
+        return value
+    raise TypeError(f"the state of a run holds a {type(value).__name__}, which is not stored")
+
+
+def _decode(tree: Any, tensors: dict[str, torch.Tensor]) -> Any:
+    if isinstance(tree, list):
+        return [_decode(item, tensors) for item in tree]
+    if not isinstance(tree, dict):
+        return tree
+    ((kind, content),) = tree.items()
+    if kind == "tensor":
+        return tensors[content]
+    if kind == "tuple":
+        return tuple(_decode(item, tensors) for item in content)
+    return {_decode(key, tensors): _decode(value, tensors) for key, value in content}
 
 
 def _launches(trainer: pl.Trainer) -> bool:
-    """Whether nothing but this program starts its processes."""
+    """Whether this program starts the other processes itself."""
     strategy = trainer.strategy
     return isinstance(strategy, ParallelStrategy) and isinstance(
         strategy.cluster_environment, LightningEnvironment

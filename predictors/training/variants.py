@@ -1,7 +1,8 @@
-"""What is changed of a recipe to learn what a part of it is good for, by name.
+"""Variants of recipes, for ablations: named changes of a configuration.
 
-Each change leaves the number of steps as it was, those of a run that it goes on from included, so
-that a difference is not one of training time; but `long`, and `staged` at the paper's size.
+A variant has as many training steps in total as its recipe, including those of the run that it
+starts from, so that a difference is not one of training time. The exceptions are `long`, and
+`staged` of the recipe `paper`.
 """
 
 import dataclasses
@@ -19,22 +20,22 @@ Change = Callable[[TrainingConfig], TrainingConfig]
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Variant:
-    """A change of a recipe, and where it says something."""
+    """A change of a recipe."""
 
     change: Change
     horizons_s: tuple[float, ...] = (SEGMENT_S,)
-    """The horizons that it is meant for."""
+    """The horizons for which it is an ablation, seconds."""
     warm_starts_from_3s: bool | None = None
-    """Whether a run for more than 3 s goes on from the weights of one for 3 s; None for what
-    the predictor's recipe does."""
+    """Whether a run for more than 3 s starts from the weights of a run for 3 s; None for what the
+    predictor's recipe does."""
 
     def apply(self, config: TrainingConfig, name: str) -> TrainingConfig:
-        """The changed recipe; its preset tells the change."""
+        """The changed configuration; the name of its recipe ends with that of the variant."""
         return dataclasses.replace(self.change(config), preset=f"{config.preset}+{name}")
 
 
 def _network(**fields: Any) -> Change:
-    """Other fields of the network."""
+    """Changes fields of the network's configuration."""
 
     def change(config: TrainingConfig) -> TrainingConfig:
         return dataclasses.replace(config, network=dataclasses.replace(config.network, **fields))
@@ -42,8 +43,8 @@ def _network(**fields: Any) -> Change:
     return change
 
 
-def _after(*changes: Change) -> Change:
-    """One change after the other."""
+def _sequence(*changes: Change) -> Change:
+    """Applies several changes in order."""
 
     def change(config: TrainingConfig) -> TrainingConfig:
         for each in changes:
@@ -54,16 +55,16 @@ def _after(*changes: Change) -> Change:
 
 
 def connected_head(config: TrainingConfig) -> TrainingConfig:
-    """The head of DKM, as wide as there, in place of the recurrent one."""
+    """Replaces the recurrent head by that of DKM, with the same width."""
     hidden = 4096 if config.network.encoder == "resnet18" else 256
     return _network(head="connected", hidden=hidden)(config)
 
 
 def no_trail(config: TrainingConfig) -> TrainingConfig:
-    """A target's own past is not drawn.
+    """Replaces the view by the one that does not show a target's own past.
 
     Raises:
-        AspEnvError: the view has no such twin.
+        AspEnvError: There is no such view.
     """
     view = f"{config.view}-no-trail"
     if view not in VIEWS:
@@ -72,67 +73,67 @@ def no_trail(config: TrainingConfig) -> TrainingConfig:
 
 
 def causal(config: TrainingConfig) -> TrainingConfig:
-    """Histories know nothing that came later."""
+    """Filters histories without later frames."""
     return dataclasses.replace(config, history="causal")
 
 
 def long(config: TrainingConfig) -> TrainingConfig:
-    """Three times the epochs."""
+    """Trains three times the epochs."""
     return dataclasses.replace(
         config, epochs=3 * config.epochs, pretraining_epochs=3 * config.pretraining_epochs
     )
 
 
 def no_pretraining(config: TrainingConfig) -> TrainingConfig:
-    """All epochs learn actions."""
+    """Replaces pre-training by epochs of full training."""
     return dataclasses.replace(config, pretraining_epochs=0, epochs=config.all_epochs)
 
 
 def all_epochs(config: TrainingConfig) -> TrainingConfig:
-    """Those of a run for 3 s besides its own, for a run that does not go on from one."""
-    before, own = _epochs(config, SEGMENT_S), _epochs(config, config.horizon_s)
-    return _share(config, (before + own) / own)
+    """Adds the epochs of a run for 3 s, for a run that does not start from one."""
+    first, own = _epochs(config, SEGMENT_S), _epochs(config, config.horizon_s)
+    return _scaled(config, (first + own) / own)
 
 
 def second_stage(config: TrainingConfig) -> TrainingConfig:
-    """As many epochs as a run for 3 s had, for a run that goes on from it."""
-    return _share(config, _epochs(config, SEGMENT_S) / _epochs(config, config.horizon_s))
+    """Trains as many epochs as a run for 3 s, for a run that starts from one."""
+    return _scaled(config, _epochs(config, SEGMENT_S) / _epochs(config, config.horizon_s))
 
 
 def _epochs(config: TrainingConfig, horizon_s: float) -> int:
-    """Those of the preset."""
+    """Number of epochs of the recipe."""
     return recipe(config.predictor, config.preset, view=config.view, horizon_s=horizon_s).all_epochs
 
 
-def _share(config: TrainingConfig, share: float) -> TrainingConfig:
-    """So many times the epochs, which may be others than the preset's."""
-    return dataclasses.replace(config, epochs=max(1, round(share * config.epochs)))
+def _scaled(config: TrainingConfig, factor: float) -> TrainingConfig:
+    """Multiplies the epochs, which may differ from the recipe's."""
+    return dataclasses.replace(config, epochs=max(1, round(factor * config.epochs)))
 
 
-_OF_ALL = {
+_COMMON = {
     "no-trail": Variant(change=no_trail),
     "causal": Variant(change=causal),
     "long": Variant(change=long),
     "annealed": Variant(change=_network(annealed=True)),
 }
-_OF_ACTIONS = _OF_ALL | {
+_ACTION_SPACE = _COMMON | {
     "euler": Variant(change=_network(integrator="euler")),
     "literal-classification": Variant(change=_network(classification="softmax")),
 }
 
-_AT_ONCE = {"staged": Variant(change=second_stage, horizons_s=(6.0,), warm_starts_from_3s=True)}
+_STAGED = {"staged": Variant(change=second_stage, horizons_s=(6.0,), warm_starts_from_3s=True)}
 
 VARIANTS: Mapping[str, Mapping[str, Variant]] = MappingProxyType(
     {
-        "mtp": _OF_ALL | _AT_ONCE,
-        "dkm": _OF_ACTIONS | _AT_ONCE,
-        "ffw-asp": _OF_ACTIONS
-        | _AT_ONCE
+        "mtp": _COMMON | _STAGED,
+        "dkm": _ACTION_SPACE | _STAGED,
+        "ffw-asp": _ACTION_SPACE
+        | _STAGED
         | {
             "connected-head": Variant(change=connected_head),
             "skip": Variant(change=_network(skip=True)),
         },
-        "ssp-asp": _OF_ACTIONS
+        "ssp-asp": _ACTION_SPACE
         | {
             "skip": Variant(change=_network(skip=True)),
             "no-pretraining": Variant(change=no_pretraining),
@@ -145,7 +146,7 @@ VARIANTS: Mapping[str, Mapping[str, Variant]] = MappingProxyType(
             "ema+normalise": Variant(change=_network(ema=0.99, normalise=True)),
             "no-encoded-branch": Variant(change=_network(encoded_branch=False)),
             "no-future-loss": Variant(
-                change=_after(
+                change=_sequence(
                     _network(feature_weight=0.0, action_weight=0.0, encoded_branch=False),
                     no_pretraining,
                 )
@@ -154,14 +155,14 @@ VARIANTS: Mapping[str, Mapping[str, Variant]] = MappingProxyType(
         },
     }
 )
-"""By predictor and name."""
+"""Variants by predictor and name."""
 
 
 def variant(predictor: str, name: str) -> Variant:
-    """A predictor's variant of that name.
+    """The variant of a predictor.
 
     Raises:
-        AspEnvError: there is none; those that there are get listed.
+        AspEnvError: The name is unknown (known ones are listed).
     """
     variants = VARIANTS.get(predictor, {})
     if name not in variants:
@@ -170,14 +171,14 @@ def variant(predictor: str, name: str) -> Variant:
 
 
 def warm_starts_from_3s(predictor: str, name: str | None = None) -> bool:
-    """Whether a run for more than 3 s goes on from the weights of one for 3 s.
+    """Whether a run for more than 3 s starts from the weights of a run for 3 s.
 
     Args:
-        predictor: whose.
-        name: of a change of its recipe; None for the recipe.
+        predictor: Name of the predictor.
+        name: Name of a variant; None for the recipe.
 
     Raises:
-        AspEnvError: the predictor has no such variant.
+        AspEnvError: The predictor has no such variant.
     """
-    told = None if name is None else variant(predictor, name).warm_starts_from_3s
-    return predictor in CHAINED if told is None else told
+    own = None if name is None else variant(predictor, name).warm_starts_from_3s
+    return predictor in CHAINED if own is None else own

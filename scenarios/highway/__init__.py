@@ -1,1 +1,1 @@
-"""Traffic of highway-env: a world that reacts, and recordings of what happens in it."""
+"""highway-env's traffic: a world that reacts, and recordings of it."""

@@ -1,7 +1,4 @@
-"""A folder of highway-env's traffic in the inD layout, with what its vehicles had in mind.
-
-MERGED: What the registry finds here: the source `highway:`.
-"""
+"""Recordings of highway-env's traffic with internal states, and the source `highway:`."""
 
 from dataclasses import dataclass
 from pathlib import Path
@@ -12,11 +9,11 @@ from rich.progress import track as with_progress
 
 from asp_env.data.cache import get_or_create
 from asp_env.errors import AspEnvError, unknown_name
-from asp_env.files import written_aside
+from asp_env.files import atomic_folder
 from scenarios.highway.road_map import ORIGIN_LAT_LON_DEG, ORIGIN_UTM_M, write_road_map
 from scenarios.highway.rounds import (
     FOLDER,
-    KEPT_EVERY,
+    HIDDEN_EVERY_FRAMES,
     ROUND_S,
     HiddenHistory,
     Round,
@@ -29,9 +26,15 @@ from scenarios.tables import Meta, Track, write_recording_meta, write_tracks, wr
 
 MOST_MINUTES = 60.0
 SMOOTHED_FRAMES = 13
-"""What noisy positions are smoothed over: 0.87 s, as in the other synthetic traffic."""
-NO_PICTURE_M = 0.1
-"""Metres per pixel of a picture that there is not; the layout wants a number."""
+"""Window of the smoothing filter: 0.87 s, as in the traffic of SUMO."""
+NO_IMAGE_M = 0.1
+"""Metres per pixel. There is no image, but the layout requires a number."""
+
+SOURCE_RECORDINGS, SOURCE_MINUTES, SOURCE_SEED = 6, 2.0, 90_521
+"""Content of `highway:SITE`."""
+
+SOURCE_VERSION = 1
+"""Raised when the same seed gives other bytes, so that cached folders are not reused."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -52,23 +55,23 @@ def synthesize(
     noise: bool = False,
     progress: bool = False,
 ) -> None:
-    """Writes highway-env's traffic in the inD layout, 15 frames a second.
+    """Generates highway-env's traffic in the inD layout, 15 frames per second.
 
     Each recording is a sequence of rounds of 20 s, which are highway-env's own episodes with the
-    ego as one of the traffic; from one round to the next all vehicles are others.
+    ego as an ordinary vehicle; the vehicles of different rounds are different agents.
 
     Args:
-        out: folder to make; may exist if it is empty.
+        out: folder to create; may exist if it is empty.
         site: `intersection` or `roundabout`.
-        recordings: how many.
-        minutes: length of each, rounded up to whole rounds.
-        seed: same seed, same bytes on the same machine.
-        noise: whether to write measured instead of true tracks; the truth goes to
-            `truth/XX_trueTracks.csv`, which no reader takes for a recording.
+        recordings: number of recordings.
+        minutes: length of each recording, rounded up to whole rounds.
+        seed: the same seed gives the same bytes on the same machine.
+        noise: whether to write measured instead of true tracks; the true tracks go to
+            `truth/XX_trueTracks.csv`, which readers ignore.
         progress: whether to show a progress bar.
 
     Raises:
-        AspEnvError: an unknown site, an impossible number, or a folder that cannot be written.
+        AspEnvError: the site is unknown, a number is out of range, or the folder cannot be written.
     """
     if site not in SITES:
         raise unknown_name("site", f"highway:{site}", [f"highway:{name}" for name in SITES])
@@ -79,7 +82,7 @@ def synthesize(
         )
     place = SITES[site]
     rounds = int(np.ceil(minutes * 60.0 / ROUND_S - 1e-9))
-    with written_aside(out) as folder:
+    with atomic_folder(out) as folder:
         maps = folder / "maps" / "lanelets" / f"00_{site}"
         maps.mkdir(parents=True)
         write_road_map(maps / "location0.osm", network(site), origin_utm_m=ORIGIN_UTM_M)
@@ -110,7 +113,7 @@ def _record(site: Site, rng: np.random.Generator, rounds: int) -> _Recorded:
         rows += found.hidden
         counts += [len(each) for each in found.hidden]
         steps.append(found.steps)
-    assert frames % KEPT_EVERY == 0
+    assert frames % HIDDEN_EVERY_FRAMES == 0
     return _Recorded(
         vehicles=vehicles,
         hidden=HiddenHistory(
@@ -147,7 +150,7 @@ def _write(
         lat_deg=lat,
         lon_deg=lon,
         utm_origin_m=ORIGIN_UTM_M,
-        metres_per_ortho_pixel=NO_PICTURE_M,
+        metres_per_ortho_pixel=NO_IMAGE_M,
     )
     if noise:
         (folder / "truth").mkdir(exist_ok=True)
@@ -159,7 +162,7 @@ def _write(
 
 
 def _track(site: Site, seen: Seen) -> Track:
-    """What the layout wants of a vehicle; its velocity points where it goes, not where it faces."""
+    """The track of a vehicle; its velocity points along its course, not along its heading."""
     states, slips = np.array(seen.states), np.array(seen.slips)
     course = states[:, 2] + np.append(slips[1:], slips[-1])  # the slip of the step that follows
     velocity = states[:, 3:] * np.stack([np.cos(course), np.sin(course)], axis=1)
@@ -191,28 +194,22 @@ def _measured(rng: np.random.Generator, track: Track) -> Track:
 
 
 def _derivative(values: np.ndarray) -> np.ndarray:
-    """By time, at each frame; zero of a single one."""
+    """Derivative by time at each frame; zero for a single frame."""
     if len(values) < 2:
         return np.zeros_like(values)
     return np.gradient(values, STEP_S, axis=0)
 
 
-SOURCE_RECORDINGS, SOURCE_MINUTES, SOURCE_SEED = 6, 2.0, 90_521
-"""What `highway:SITE` consists of."""
-SOURCE_VERSION = 1
-"""Raise when other bytes come of the same seed, so that nobody mixes them with cached ones."""
-
-
 def open_source(argument: str) -> Path:
-    """The folder of `highway:ARGUMENT`.
+    """The folder of the source `highway:ARGUMENT`.
 
     Args:
-        argument: `intersection` or `roundabout`, made on first use in the user's cache folder; or a
-            folder that `asp-env synthesize OUT --site highway:…` made.
+        argument: `intersection` or `roundabout`, created on first use in the cache folder; or a
+            folder that `asp-env synthesize OUT --site highway:…` wrote.
 
     Raises:
-        AspEnvError: an unknown site, a folder of something else, or a cache folder that cannot be
-            written.
+        AspEnvError: the site is unknown, the folder has another origin, or the cache folder cannot
+            be written.
     """
     if argument in SITES:
         return get_or_create(
@@ -233,7 +230,7 @@ def open_source(argument: str) -> Path:
     if not (folder / FOLDER).is_dir():
         raise AspEnvError(
             f"highway:{argument}: {folder / FOLDER} is missing; expected a folder made by `asp-env "
-            "synthesize OUT --site highway:…`; without what the vehicles had in mind it can only "
-            f"be replayed: use {argument} itself"
+            "synthesize OUT --site highway:…`; without the internal states of the vehicles it can "
+            f"only be replayed: use {argument} itself"
         )
     return folder.absolute()

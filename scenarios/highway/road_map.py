@@ -1,32 +1,29 @@
-"""From highway-env's axes to ours and back: x is the same, y points down there and up here.
+"""The map of a highway-env road network: lanes as strips, markings, and conversion of axes.
 
-Each function is its own inverse.
+In highway-env's axes x is the same and y points down; `mirror_points`, `mirror_states` and
+`mirror_actions` convert to the axes of this package and back (each is its own inverse). Along a
+lane, highway-env's lateral coordinate therefore grows to the right, and the first of its two line
+types is the left one.
 
-MERGED: highway-env's lanes as strips between two borders, in our axes and in the direction of travel.
+highway-env defines where lanes lie and which nodes they join. The map adds what agents that follow
+lanes need:
 
-Seen along a lane, highway-env's lateral coordinate grows to the right: it grows to the left of the
-heading where y points up, and there y points down. The first of its two line types is that at the
-lesser coordinate, the left one.
-
-highway-env tells of a road where its lanes lie and which nodes they join. Added is what those need
-who follow the lanes:
-
-- Where the road ends, highway-env's lanes hold for 5 m more (`AbstractLane.on_lane`). So long they
-  go straight on.
-- Where a lane ends metres short of its follower (all ways in and out of the roundabout do), a
-  smooth curve closes the gap.
-- Such a gap has a mouth. Vehicles steer towards the follower at once and cut the corner between
-  both lanes with their right side; highway-env, which asks where their centres are, calls that on
-  the road. The mouth is the ground to both sides of the curve with the corner rounded off.
-MERGED: What is painted or built along the lanes' borders.
+- Where the road ends, highway-env's lanes hold for another 5 m (`AbstractLane.on_lane`); strips are
+  extended straight by that length.
+- Where a lane ends metres short of its follower (all entries and exits of the roundabout do), a
+smooth
+  curve closes the gap.
+- Each gap has a mouth. Vehicles steer towards the follower at once and cut the corner between both
+lanes
+  with their right side; highway-env, which checks centres only, counts that as on the road. The
+  mouth is the area on both sides of the curve with the corner rounded off.
 
 highway-env draws a continuous line along the outside of a road wherever its lanes have one, also
-across the mouths of its roundabout's ways in and out. A continuous line is here
+across the mouths of its roundabout. Here a continuous line is
 
-- a kerb where nothing else lies beyond it: that is the edge of the road,
-- nothing (virtual) where other lanes lie both beyond it and within, since they lead across it,
+- a kerb where no other lane lies beyond it: the edge of the road,
+- virtual where other lanes lie both beyond it and within, since they lead across it,
 - solid elsewhere, between two lanes side by side.
-MERGED: The map of a highway-env road, as the readers of recordings want it.
 """
 
 import math
@@ -44,16 +41,58 @@ from asp_env.geometry import wrap_angle
 from scenarios.lanelet2 import Area, Border, Lanelet, Marking, write_map
 from scenarios.polylines import Polyline, bezier, polar
 
+LaneIndex = tuple[str, str, int]
+"""Start node, end node, and index among the lanes between them."""
+
+Link = tuple[LaneIndex, LaneIndex]
+
+Lanes = dict[LaneIndex, AbstractLane]
+
+Sides = Float[np.ndarray, "3 n 2"]
+"""Left border, centre line and right border of a lane, with n points each."""
+
+STEP_RAD = math.radians(2.0)
+"""Mean turn between two points of a lane: the chord deviates by 4 mm on a ring of 26 m radius, and
+by 1 cm on the gentle bends before it."""
+
+LOOK_M = 0.1
+"""Distance between the headings that are sampled to determine how much a lane turns."""
+
+MEETS_M = 0.01
+"""Borders whose ends are nearer than this to the start of others need no curve between."""
+
+MOUTH_M = 8.0
+"""Distance of the ends of a mouth from its gap. Measured at the roundabout: with 8 m no box is off
+the road, with 5 m boxes are off by up to 0.4 m, without mouths by up to 1.2 m."""
+
+PLAIN: dict[int, Marking] = {LineType.NONE: "virtual", LineType.STRIPED: "dashed"}
+"""Markings of the line types that are not continuous."""
+
+_KERBS = (LineType.CONTINUOUS, LineType.CONTINUOUS)
+
+BESIDE_M = 0.05
+"""Distance from a border of the points that decide which lanes lie on either side."""
+
+PART_M = 0.1
+"""Resolution of the positions at which the marking of a border changes."""
+
+ORIGIN_UTM_M = (294_000.0, 5_628_000.0)
+"""UTM zone 32 coordinates given to highway-env's origin (near Aachen). highway-env's roads have no
+location, but lanelet2 maps are written in degrees."""
+
+ORIGIN_LAT_LON_DEG = (50.767140, 6.078601)
+"""The same in degrees."""
+
 
 def mirror_points(points: Float[np.ndarray, "*batch 2"]) -> Float[np.ndarray, "*batch 2"]:
-    """Points, or velocities, in the other axes: y changes its sign."""
+    """Mirrors points or velocities (..., 2): the sign of y changes."""
     return points * np.array([1.0, -1.0], dtype=points.dtype)
 
 
 def mirror_states(states: Float[np.ndarray, "*batch 4"]) -> Float[np.ndarray, "*batch 4"]:
-    """States [x, y, heading, speed]: y and heading change their signs.
+    """Mirrors states [x, y, heading, speed] (..., 4): the signs of y and heading change.
 
-    Headings come out in [-π, π). There is no +π, so that -π stays what it is.
+    Headings are wrapped to [-π, π), so that -π is its own mirror image.
     """
     mirrored = states * np.array([1.0, -1.0, -1.0, 1.0], dtype=states.dtype)
     mirrored[..., 2] = wrap_angle(mirrored[..., 2])
@@ -61,49 +100,24 @@ def mirror_states(states: Float[np.ndarray, "*batch 4"]) -> Float[np.ndarray, "*
 
 
 def mirror_actions(actions: Float[np.ndarray, "*batch 2"]) -> Float[np.ndarray, "*batch 2"]:
-    """Actions [acceleration, steering]: what steers to the left here does to the right there."""
+    """Mirrors actions [acceleration, steering] (..., 2): the sign of the steering changes."""
     return actions * np.array([1.0, -1.0], dtype=actions.dtype)
-
-
-LaneIndex = tuple[str, str, int]
-"""Node at which a lane begins, node at which it ends, and its number among those between them."""
-
-Link = tuple[LaneIndex, LaneIndex]
-
-Lanes = dict[LaneIndex, AbstractLane]
-
-Sides = Float[np.ndarray, "3 n 2"]
-"""Left border, centre line and right border of a lane, as equally many points."""
-
-STEP_RAD = math.radians(2.0)
-"""Lanes turn by so much between two points, on average: a chord is then off by 4 mm on a ring of
-26 m radius, and by 1 cm on the gentle bends before one."""
-
-LOOK_M = 0.1
-"""Headings of a lane are looked at so far apart, to see how much it turns."""
-
-MEETS_M = 0.01
-"""Borders that end nearer than this to where others begin need no curve between."""
-
-MOUTH_M = 8.0
-"""So far before and behind a gap its mouth begins and ends. At the roundabout, boxes of vehicles
-were then never off the road; with 5 m by 0.4 m at most, with no mouths by 1.2 m."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Strip:
-    """One lane, in our axes and in the direction of travel."""
+    """A lane in the axes of this package, in the direction of travel."""
 
     left: Polyline
     centre: Polyline
     right: Polyline
     line_types: tuple[int, int]
-    """highway-env's `LineType` on the left and on the right."""
+    """highway-env's `LineType` of the left and of the right border."""
     speed_limit_mps: float
 
 
 def all_lanes(network: RoadNetwork) -> Lanes:
-    """The lanes of a road, in the order in which its graph holds them."""
+    """The lanes of a road network, in the order of its graph."""
     return {
         (begin, end, number): lane
         for begin, roads in network.graph.items()
@@ -113,11 +127,11 @@ def all_lanes(network: RoadNetwork) -> Lanes:
 
 
 def links(network: RoadNetwork) -> list[Link]:
-    """Which lane leads to which, where the graph lets one road follow another.
+    """Pairs of lanes of which the first leads to the second, where the graph connects their roads.
 
-    highway-env knows followers of roads, and its vehicles take the lane that begins nearest. Here a
-    lane leads to that one too, but only if no other lane of its road ends nearer to it, since the
-    others get there by changing lanes. Nor does a lane lead back the way it came.
+    highway-env knows the followers of roads, and its vehicles take the lane that begins nearest.
+    Here a lane leads to that lane too, but only if no other lane of its road ends nearer to it,
+    since the others reach it by changing lanes. No lane leads back in the opposite direction.
     """
     found = []
     for begin, roads in network.graph.items():
@@ -134,22 +148,22 @@ def links(network: RoadNetwork) -> list[Link]:
 
 
 def strips(network: RoadNetwork) -> dict[LaneIndex, Strip]:
-    """All lanes, in the order in which the graph holds them.
+    """All lanes as strips, in the order of the graph.
 
     Raises:
-        AspEnvError: there is a gap between two lanes that both have other ways to go.
+        AspEnvError: there is a gap between two lanes that both have other connections.
     """
     lanes = all_lanes(network)
     found = {}
     for index, (left, centre, right) in _grown(lanes, links(network)).items():
-        told = lanes[index].to_config()["config"]
-        left_is, right_is = told["line_types"]
+        config = lanes[index].to_config()["config"]
+        left_is, right_is = config["line_types"]
         found[index] = Strip(
             left=left,
             centre=centre,
             right=right,
             line_types=(left_is, right_is),
-            speed_limit_mps=float(told["speed_limit"]),
+            speed_limit_mps=float(config["speed_limit"]),
         )
     return found
 
@@ -168,7 +182,7 @@ def mouths(network: RoadNetwork) -> list[tuple[Polyline, Polyline]]:
 
 
 def _grown(lanes: Lanes, joined: list[Link]) -> dict[LaneIndex, Sides]:
-    """All lanes' sides with what closes gaps, or goes on for a while where the road ends."""
+    """The sides of all lanes with the curves that close gaps, or extended where the road ends."""
     leads, follows = ({link[end] for link in joined} for end in (0, 1))
     beyond_m = float(AbstractLane.VEHICLE_LENGTH)
     grown = {index: _sides(lane) for index, lane in lanes.items()}
@@ -189,7 +203,7 @@ def _grown(lanes: Lanes, joined: list[Link]) -> dict[LaneIndex, Sides]:
             grown[follower] = np.concatenate([curve[:, :-1], grown[follower]], axis=1)
         else:
             raise AspEnvError(
-                f"lane {leader} ends short of {follower}, and both have other ways to go; expected "
+                f"lane {leader} ends short of {follower}, and both have other connections; expected "
                 "one of them to have none, so that it can close the gap: use another road"
             )
     return grown
@@ -204,7 +218,7 @@ def _sides(lane: AbstractLane) -> Sides:
 
 
 def _section(lane: AbstractLane, at_m: float) -> Float[np.ndarray, "3 2"]:
-    """Points on left border, centre line and right border, so far along a lane."""
+    """Points on left border, centre line and right border at a distance along a lane."""
     width_m = lane.width_at(at_m)
     return mirror_points(
         np.array([lane.position(at_m, side * width_m) for side in (-0.5, 0.0, 0.5)])
@@ -223,7 +237,7 @@ def _meet(leader: AbstractLane, follower: AbstractLane) -> bool:
 def _across(
     leader: AbstractLane, leader_at_m: float, follower: AbstractLane, follower_at_m: float
 ) -> Sides:
-    """Smooth curves from so far along one lane to so far along another."""
+    """Smooth curves from a position along one lane to a position along another."""
     starts, ends = _section(leader, leader_at_m), _section(follower, follower_at_m)
     start_rad, end_rad = (
         _heading_rad(leader, leader_at_m),
@@ -234,22 +248,18 @@ def _across(
     )
 
 
-PLAIN: dict[int, Marking] = {LineType.NONE: "virtual", LineType.STRIPED: "dashed"}
-"""Types of lines that are one thing everywhere; the others are continuous."""
-
-_KERBS = (LineType.CONTINUOUS, LineType.CONTINUOUS)
-
-BESIDE_M = 0.05
-"""What covers a point so far to a side of a border lies on that side."""
-
-PART_M = 0.1
-"""Where the marking of a border changes is found to within this."""
-
-
 def lanelets(
     strips: list[Strip], mouths: list[tuple[Polyline, Polyline]]
 ) -> tuple[list[Lanelet], list[Area]]:
-    """The lanes with their markings in the same order, and the mouths with kerbs around them."""
+    """The lanes with their markings, in the same order, and the mouths with kerbs around them.
+
+    Args:
+        strips: the lanes.
+        mouths: left and right side of each mouth.
+
+    Returns:
+        One lanelet per lane, and one area per mouth.
+    """
     sides = [(strip.left, strip.right) for strip in strips] + mouths
     types = [strip.line_types for strip in strips] + [_KERBS] * len(mouths)
     rings = [np.concatenate([left, right[::-1]]) for left, right in sides]
@@ -283,7 +293,7 @@ def _mouth(left: tuple[Border, ...], right: tuple[Border, ...]) -> Area:
 def _borders(
     line: Polyline, line_type: int, outside: float, others: list[np.ndarray]
 ) -> tuple[Border, ...]:
-    """A border in parts; `outside` is 1 where the lane's outside lies to the left, else -1."""
+    """Sections of a border by marking; `outside` is 1 if the outside lies to the left, else -1."""
     if line_type in PLAIN:
         return (Border(line=line, marking=PLAIN[line_type]),)
     points, corners = _refined(line)
@@ -300,15 +310,15 @@ def _borders(
     changes = [i for i in range(1, len(markings)) if markings[i] != markings[i - 1]]
     parts = []
     for first, last in pairwise([0, *changes, len(markings)]):
-        kept = corners.copy()
-        kept[[first, last]] = True
-        part = points[first : last + 1][kept[first : last + 1]]
+        selected = corners.copy()
+        selected[[first, last]] = True
+        part = points[first : last + 1][selected[first : last + 1]]
         parts.append(Border(line=part, marking=markings[first]))
     return tuple(parts)
 
 
 def _refined(line: Polyline) -> tuple[Polyline, Bool[np.ndarray, " points"]]:
-    """The same line with more points in between, and which of them it had before."""
+    """The line with additional points, and a mask of the original points."""
     points, corners = [line[:1]], [True]
     for start, end in pairwise(line):
         count = math.ceil(np.hypot(*(end - start)) / PART_M)
@@ -319,7 +329,7 @@ def _refined(line: Polyline) -> tuple[Polyline, Bool[np.ndarray, " points"]]:
 
 
 def _in_any(points: Float[np.ndarray, "n 2"], rings: list[np.ndarray]) -> Bool[np.ndarray, " n"]:
-    """Which points any of the rings encloses, by the even-odd rule."""
+    """Mask of the points that any ring encloses (even-odd rule)."""
     found = np.zeros(len(points), dtype=bool)
     for ring in rings:
         start, end = ring, np.roll(ring, -1, axis=0)
@@ -331,23 +341,15 @@ def _in_any(points: Float[np.ndarray, "n 2"], rings: list[np.ndarray]) -> Bool[n
     return found
 
 
-ORIGIN_UTM_M = (294_000.0, 5_628_000.0)
-"""Where highway-env's origin lies in UTM zone 32: a meadow near Aachen. highway-env's roads lie
-nowhere, but lanelet2 maps are written in degrees."""
-
-ORIGIN_LAT_LON_DEG = (50.767140, 6.078601)
-"""The same in degrees, to a decimetre."""
-
-
 def write_road_map(path: Path, network: RoadNetwork, *, origin_utm_m: tuple[float, float]) -> None:
-    """Writes the lanelet2 map of a road; its frame is highway-env's with y upwards.
+    """Writes the lanelet2 map of a road network, in highway-env's frame with y upwards.
 
-    Lanes are written in the order in which the network's graph holds them.
+    Lanes are written in the order of the network's graph.
 
     Args:
         path: the `.osm` file to write.
-        network: the road; straight, circular and sine lanes are known to work.
-        origin_utm_m: where the frame's origin lies in UTM zone 32.
+        network: the road network; straight, circular and sine lanes are supported.
+        origin_utm_m: coordinates of the frame's origin in UTM zone 32.
 
     Raises:
         AspEnvError: the road has a gap that no lane can close.

@@ -1,8 +1,7 @@
-"""What highway-env's vehicles know besides how they move, as rows of a table.
+"""Rounds: highway-env's episodes without an ego, with the internal states of their vehicles.
 
-With it a road is brought back exactly: the same vehicles in the same order go on as they did.
-
-MERGED: What highway-env's vehicles had in mind while a recording was made, kept beside its tracks.
+The internal state is what highway-env's vehicles hold besides their motion. With it a road is
+restored exactly: the same vehicles in the same order continue in the same way.
 """
 
 import zipfile
@@ -29,10 +28,10 @@ from scenarios.highway.sites import (
 from scenarios.highway.vehicles import Network, Road, TrafficVehicle
 
 LONGEST_ROUTE = 16
-"""Roads; a way through the roundabout has at most 11."""
+"""Roads; a route through the roundabout has at most 11."""
 
 ANY_LANE = -1
-"""In a route, in place of a lane of the road."""
+"""In a route: any lane of the road."""
 
 HIDDEN = np.dtype(
     [
@@ -55,17 +54,33 @@ HIDDEN = np.dtype(
         ("steered", np.bool_),
     ]
 )
-"""Of a vehicle: number in the recording; m, m, rad, m/s in highway-env's axes; the lane that it
-makes for; the speed it wants, m/s; seconds since it thought of changing lanes; the exponent of its
-law; (road, lane) of the rest of its route; whether it crashed, and by how much it is pushed at the
-next step, m; whether it gives way, and since how many checks; whether somebody else steers it."""
+"""Internal state of a vehicle: number in the recording; x m, y m, heading rad and speed m/s in
+highway-env's axes; target lane; desired speed, m/s; seconds since the last decision about a lane
+change; exponent of the driver model; (road, lane) of the remaining route; whether it has crashed,
+and its displacement at the next step, m; whether it yields, and for how many checks; whether it is
+controlled."""
 
 Rows = Shaped[np.ndarray, " _"]
-"""Of `HIDDEN`, in the order of the road's vehicles."""
+"""Rows of `HIDDEN`, in the order of the road's vehicles."""
+
+FOLDER = "hidden"
+"""Folder beside `data` and `maps`."""
+
+WANTED = "made by `asp-env synthesize OUT --site highway:…`"
+
+_DAMAGE = (OSError, ValueError, KeyError, EOFError, TypeError, zipfile.BadZipFile, zlib.error)
+"""Exceptions that NumPy raises for damaged or foreign files."""
+
+ROUND_S = 20
+"""Length of a round. highway-env's own episodes last 11 s and 13 s; by 20 s its roundabout is
+nearly empty."""
+
+HIDDEN_EVERY_FRAMES = 3
+"""Frames between two stored internal states: 0.2 s."""
 
 
 def read_vehicles(road: Road) -> Rows:
-    """The hidden state of all vehicles on a road."""
+    """The internal states of all vehicles on a road."""
     rows = np.zeros(len(road.vehicles), dtype=HIDDEN)
     for row, vehicle in zip(rows, road.vehicles, strict=True):
         _read(row, vehicle, road.network)
@@ -96,7 +111,7 @@ def _read(row: Any, vehicle: Any, network: Network) -> None:
 
 
 def restore(rows: Rows, road: Road, kind: type[TrafficVehicle]) -> list[TrafficVehicle]:
-    """The vehicles of some rows, not yet on the road."""
+    """Creates the vehicles of some rows; they are not yet on the road."""
     return [_restore(row, road, kind) for row in rows]
 
 
@@ -107,7 +122,7 @@ def _restore(row: Any, road: Road, kind: type[TrafficVehicle]) -> TrafficVehicle
     )
     vehicle.track = int(row["track"])
     vehicle.target_lane_index = network.indices[int(row["target_lane"])]
-    # set afterwards, since the constructor takes zeros for nothing
+    # Set afterwards, since the constructor treats zero as missing.
     vehicle.target_speed = float(row["target_speed"])
     vehicle.timer = float(row["timer"])
     vehicle.DELTA = float(row["delta"])
@@ -124,62 +139,53 @@ def _restore(row: Any, road: Road, kind: type[TrafficVehicle]) -> TrafficVehicle
     return vehicle
 
 
-FOLDER = "hidden"
-"""Beside `data` and `maps`."""
-
-WANTED = "made by `asp-env synthesize OUT --site highway:…`"
-
-_DAMAGE = (OSError, ValueError, KeyError, EOFError, TypeError, zipfile.BadZipFile, zlib.error)
-"""What NumPy raises of files that are not whole, or are something else."""
-
-
 @dataclass(frozen=True, slots=True, kw_only=True)
 class HiddenHistory:
-    """The hidden states of all vehicles of a recording, every 0.2 s."""
+    """The internal states of all vehicles of a recording, every 0.2 s."""
 
     site: Site
     rows: Shaped[np.ndarray, " n"]
-    """Of `HIDDEN`, time by time."""
+    """Rows of `HIDDEN`, sorted by time."""
     steps: Int[np.ndarray, " times"]
-    """What the road had counted by then."""
+    """Step count of the road at each time."""
     starts: Int[np.ndarray, " times+1"]
     """Time i has the rows `starts[i]:starts[i + 1]`."""
 
     def __deepcopy__(self, memo: dict[int, Any]) -> "HiddenHistory":
-        """Itself, since nobody changes it."""
+        """Returns the object itself, since it is immutable."""
         del memo
         return self
 
     def at(self, frame: int) -> tuple[Rows, int]:
-        """The vehicles at a frame, and what the road had counted."""
-        time = frame // KEPT_EVERY
+        """The internal states of the vehicles at a frame, and the step count of the road."""
+        time = frame // HIDDEN_EVERY_FRAMES
         return self.rows[self.starts[time] : self.starts[time + 1]], int(self.steps[time])
 
     def coming(self, frame: int) -> Rows:
-        """Those who are there at a frame and were not there before; none behind the last frame."""
-        time = frame // KEPT_EVERY
-        if frame % KEPT_EVERY or not 0 < time < len(self.steps):
+        """The vehicles that are present at a frame and absent before; none after the last frame."""
+        time = frame // HIDDEN_EVERY_FRAMES
+        if frame % HIDDEN_EVERY_FRAMES or not 0 < time < len(self.steps):
             return self.rows[:0]
         now, _ = self.at(frame)
-        before, _ = self.at(frame - KEPT_EVERY)
+        before, _ = self.at(frame - HIDDEN_EVERY_FRAMES)
         return now[~np.isin(now["track"], before["track"])]
 
     def fits(self, recording: Recording) -> bool:
-        """Whether it tells of the same vehicles at the same times."""
-        frames = np.repeat(np.arange(len(self.steps)), np.diff(self.starts)) * KEPT_EVERY
+        """Whether the history describes the vehicles of a recording at the same times."""
+        frames = np.repeat(np.arange(len(self.steps)), np.diff(self.starts)) * HIDDEN_EVERY_FRAMES
         tracks, last = self.rows["track"], recording.last_frames
         if len(self.steps) < -(
-            -recording.num_frames // KEPT_EVERY
+            -recording.num_frames // HIDDEN_EVERY_FRAMES
         ):  # more: all left before the end
             return False
         if len(tracks) and not 0 <= tracks.min() <= tracks.max() < len(recording):
             return False
         there = (recording.first_frames[tracks] <= frames) & (frames <= last[tracks])
-        times = last // KEPT_EVERY - (recording.first_frames - 1) // KEPT_EVERY
+        times = last // HIDDEN_EVERY_FRAMES - (recording.first_frames - 1) // HIDDEN_EVERY_FRAMES
         return bool(there.all() and len(tracks) == times.sum())
 
     def save(self, path: Path) -> None:
-        """Writes a file that needs no pickle."""
+        """Writes an `.npz` file without pickles."""
         np.savez_compressed(
             path,
             site=np.array(self.site.name),
@@ -190,7 +196,7 @@ class HiddenHistory:
 
 
 def load_history(path: Path) -> HiddenHistory:
-    """Reads what `save` wrote.
+    """Reads a file that `HiddenHistory.save` wrote.
 
     Raises:
         DataError: the file is missing, damaged, or of another version.
@@ -202,9 +208,9 @@ def load_history(path: Path) -> HiddenHistory:
     except FileNotFoundError:
         raise DataError(f"{path} is missing: expected a folder {WANTED}") from None
     except _DAMAGE as error:
-        raise DataError(f"{path} is damaged ({error}): expected what was {WANTED}") from error
+        raise DataError(f"{path} is damaged ({error}): expected a folder {WANTED}") from error
     if site not in SITES or rows.dtype != HIDDEN or not _whole(rows, starts, steps):
-        raise DataError(f"{path}: of another version; expected what was {WANTED} by this one")
+        raise DataError(f"{path}: of another version; expected a folder {WANTED} of this version")
     return HiddenHistory(site=SITES[site], rows=rows, starts=starts, steps=steps)
 
 
@@ -217,49 +223,41 @@ def _whole(rows: np.ndarray, starts: np.ndarray, steps: np.ndarray) -> bool:
 
 
 def hidden_path(tracks_path: Path) -> Path:
-    """Where the hidden history of a recording lies, from where its tracks lie."""
+    """Path of the hidden history of a recording, from the path of its tracks."""
     name = tracks_path.name.partition("_")[0]
     return tracks_path.parent.parent / FOLDER / f"{name}_hidden.npz"
 
 
-ROUND_S = 20
-"""highway-env's own episodes last 11 s and 13 s; by then its roundabout is nearly empty."""
-
-
-KEPT_EVERY = 3
-"""Frames from one kept hidden state to the next: 0.2 s."""
-
-
 @dataclass(slots=True, kw_only=True)
 class Seen:
-    """One vehicle while it is on the road."""
+    """The states of one vehicle while it is on the road."""
 
     first_frame: int
     states: list[Float[np.ndarray, " 4"]] = field(default_factory=list)
-    """[x m, y m, heading rad, speed m/s] at each frame, in our axes."""
+    """[x m, y m, heading rad, speed m/s] at each frame, in the axes of this package."""
     slips: list[float] = field(default_factory=list)
     """Slip angle of the step before each frame, rad, left positive."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Round:
-    """What happened in one round; numbers of vehicles are those of `seen`."""
+    """One simulated round; vehicles are numbered as in `seen`."""
 
     seen: list[Seen]
     hidden: list[Rows]
-    """Every `KEPT_EVERY` frames, from the first on."""
+    """Internal states every `HIDDEN_EVERY_FRAMES` frames, from the first frame on."""
     steps: Int[np.ndarray, " kept"]
-    """What the road had counted by then."""
+    """Step count of the road at each time."""
 
 
 def step_road(road: Road) -> None:
-    """One of highway-env's steps of 1/15 s."""
+    """Advances a road by one of highway-env's steps of 1/15 s."""
     road.act()
     road.step(STEP_S)
 
 
 def simulate_round(site: Site, rng: np.random.Generator, *, frames: int) -> Round:
-    """One of highway-env's episodes, in which the ego is one of the traffic."""
+    """Simulates one of highway-env's episodes, in which the ego is an ordinary vehicle."""
     road = populated_road(site, rng)
     seen: list[Seen] = []
     hidden: list[Rows] = []
@@ -271,7 +269,7 @@ def simulate_round(site: Site, rng: np.random.Generator, *, frames: int) -> Roun
                 remove_exited(site, road)
                 spawn_vehicle(site, road, rng)
         _look(road.vehicles, seen, frame)
-        if frame % KEPT_EVERY == 0:
+        if frame % HIDDEN_EVERY_FRAMES == 0:
             hidden.append(read_vehicles(road))
             steps.append(road.steps)
     return Round(seen=seen, hidden=hidden, steps=np.array(steps, dtype=np.int64))
@@ -282,7 +280,7 @@ def _look(vehicles: list[TrafficVehicle], seen: list[Seen], frame: int) -> None:
         if vehicle.track < 0:
             vehicle.track = len(seen)
             seen.append(Seen(first_frame=frame))
-        theirs = np.array([*vehicle.position, vehicle.heading, vehicle.speed])
-        seen[vehicle.track].states.append(mirror_states(theirs))
+        state = np.array([*vehicle.position, vehicle.heading, vehicle.speed])
+        seen[vehicle.track].states.append(mirror_states(state))
         slip = np.arctan(0.5 * np.tan(vehicle.action["steering"]))
         seen[vehicle.track].slips.append(-float(slip))

@@ -1,7 +1,4 @@
-"""The places of highway-env that are driven here, and the traffic that it puts there.
-
-MERGED: Rounds: highway-env's episodes one after the other, as they would go without an ego.
-"""
+"""The sites of highway-env, and the traffic that it creates there."""
 
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -28,12 +25,12 @@ STEPS_PER_S = 15
 STEP_S = 1.0 / STEPS_PER_S
 
 LEAVES_BEFORE_END_M = 20.0
-"""So far before the end of the road vehicles leave, as at highway-env's own intersection."""
+"""Vehicles are removed this far before the end of the road, as at highway-env's intersection."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Site:
-    """One of highway-env's places."""
+    """One of highway-env's road networks with its traffic."""
 
     name: str
     environment: type[AbstractEnv]
@@ -41,13 +38,13 @@ class Site:
     road: type[TrafficRoad]
     speed_limit_mps: float
     config: dict[str, Any]
-    """Where it differs from the environment's own."""
+    """Changes to the default configuration of the environment."""
     populate: Callable[[Any], None]
     """Puts the first vehicles on the road."""
     is_exit: Callable[[str, str], bool]
-    """Whether the lanes from one node to another lead away from the place."""
+    """Whether the lanes from one node to another are exits."""
     spawn: Callable[[Any], None] | None
-    """What may bring another vehicle once a second."""
+    """Called once a second; may add a vehicle."""
 
 
 SITES = {
@@ -80,7 +77,7 @@ SITES = {
 
 
 class _Ego:
-    """In place of an environment's kind of action: its ego is one of the traffic, too."""
+    """Replaces an environment's action type: its ego becomes an ordinary vehicle."""
 
     def __init__(self, site: Site) -> None:
         self.vehicle_class = site.vehicle
@@ -88,9 +85,9 @@ class _Ego:
 
 @cache
 def _environment(site_name: str) -> Any:
-    """highway-env's own environment, which knows how to lay roads and bring vehicles.
+    """highway-env's own environment, which creates roads and vehicles.
 
-    It is never stepped: its clock, its spaces and its copies are of no use here.
+    It is never stepped; its clock, spaces and copies are not used.
     """
     site = SITES[site_name]
     kind = f"{site.vehicle.__module__}.{site.vehicle.__qualname__}"
@@ -101,7 +98,7 @@ def _environment(site_name: str) -> Any:
 
 @cache
 def network(site_name: str) -> Network:
-    """The roads of a place, which never change."""
+    """The road network of a site; it never changes."""
     env = _environment(site_name)
     env._make_road()
     road, env.road = env.road, None
@@ -112,24 +109,24 @@ def empty_road(site: Site, *, steps: int = 0) -> Road:
     """A road without vehicles.
 
     Args:
-        site: where.
-        steps: how many steps it has made, by which the intersection times its rules.
+        site: the site.
+        steps: step count of the road, by which the intersection times its right of way.
     """
-    # given a generator only since highway-env would make one, which takes long
+    # A generator is passed because highway-env would otherwise create one, which is slow.
     road: Road = site.road(network(site.name), np_random=np.random.default_rng(0))
-    road.steps, road.np_random = steps, None  # nothing is drawn while vehicles drive
+    road.steps, road.np_random = steps, None  # nothing is drawn while vehicles move
     return road
 
 
 def populated_road(site: Site, rng: np.random.Generator) -> Road:
-    """A road as highway-env begins its episodes, with the ego as one of the traffic."""
+    """A road as at the start of highway-env's episodes, with the ego as an ordinary vehicle."""
     road = empty_road(site)
     _with(site, road, rng, site.populate)
     return road
 
 
 def spawn_vehicle(site: Site, road: Road, rng: np.random.Generator) -> None:
-    """Brings another vehicle, if the place and chance will have it."""
+    """Adds another vehicle with the site's probability, if there is room."""
     if site.spawn is not None:
         _with(site, road, rng, site.spawn)
 
@@ -144,10 +141,15 @@ def _with(site: Site, road: Road, rng: np.random.Generator, do: Callable[[Any], 
 
 
 def remove_exited(site: Site, road: Road, *, ego: int | None = None) -> None:
-    """Takes away those who are about to come to the end of the road and drive themselves.
+    """Removes uncontrolled vehicles that are about to reach the end of the road.
 
-    At highway-env's roundabout they would go on for ever: there it takes nobody away. An ego stays
-    in any case, as there: without one an episode makes no sense.
+    highway-env's roundabout removes no vehicle, so that they continue forever. The ego stays in
+    any case, as in highway-env.
+
+    Args:
+        site: the site.
+        road: the road.
+        ego: track of the ego, if there is one.
     """
     road.vehicles = [
         each

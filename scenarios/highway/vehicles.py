@@ -1,11 +1,9 @@
-"""highway-env's roads, without the work that cannot change anything.
+"""highway-env's vehicles and roads with the same laws and results, without redundant work.
 
-What happens on them is the same bit for bit: the laws are highway-env's own, which are asked only
-about those whom they may concern. Two points lie at least as far apart as their coordinates do,
-rounding included, so where highway-env asks first whether a distance is too large, a coordinate
-that is too large answers it.
-
-MERGED: highway-env's vehicles and roads as needed here: the same laws, without the faults.
+Checks of highway-env are limited to vehicles that they can affect. Two points lie at least as far
+apart as their coordinates do, rounding included; where highway-env first tests whether a distance
+is too large, a coordinate difference that is too large decides it.
+`tests.benchmarks.highway_parts` measures what each shortcut saves.
 """
 
 import math
@@ -20,51 +18,51 @@ from jaxtyping import Float
 
 from asp_env.dynamics import rollout
 
-FORESEEN_S = np.arange(0.25, 3.0, 0.25)
-"""When highway-env's rules look for conflicts."""
+PREDICTED_S = np.arange(0.25, 3.0, 0.25)
+"""Times at which highway-env's right of way checks for conflicts, s from now."""
 
 _Road: Any = road.Road
 _RegulatedRoad: Any = regulation.RegulatedRoad
 
 
 Road = Any
-"""highway-env's `Road` or `RegulatedRoad`, whose own annotations tell of other vehicles."""
+"""highway-env's `Road` or `RegulatedRoad`, whose annotations name other vehicle classes."""
 
 Pose = list[float]
 """[x m, y m, heading rad, speed m/s] in highway-env's axes."""
 
-REMEMBERED = 256
-"""Places of which a lane remembers where along it they lie."""
+CACHED_POSITIONS = 256
+"""Positions whose local coordinates are cached per lane."""
 
 CELL_M = 4.0
-"""Lanes near a point are looked up by squares of this size."""
+"""Side of the squares by which lanes near a point are indexed."""
 
 
 class TrafficVehicle(IDMVehicle):
-    """Drives itself by highway-env's laws, unless somebody else steers it.
+    """A vehicle of highway-env's driver model, unless it is controlled.
 
-    What is kept of `IDMVehicle`: its decisions and its motion. What is not: copying the whole road
-    to foresee where a steered vehicle goes, and foreseeing the same vehicle once for every other
-    one.
+    Decisions and motion are those of `IDMVehicle`. Left out are the copies of the whole road that
+    predict a controlled vehicle, and repeated predictions of the same vehicle for each of the
+    others.
     """
 
     track: int = -1
-    """Number in its recording."""
+    """Number of the vehicle in its recording."""
     steered: bool = False
-    """Whether somebody else decides what it does."""
+    """Whether the vehicle is controlled."""
 
     def __init__(self, *given: Any, **named: Any) -> None:
         """As of `IDMVehicle`."""
         super().__init__(*given, **named)
         self._coming: list[Pose] = []
-        self._foreseen: tuple[int, Any] = (-1, None)
+        self._predicted: tuple[int, Any] = (-1, None)
 
     def steer(self, acceleration_mps2: float, steering_rad: float, poses: list[Pose]) -> None:
-        """Hands over what somebody else made it do: where it is after each coming sub-step.
+        """Controls the vehicle: sets its action and its pose after each coming sub-step.
 
         Args:
-            acceleration_mps2: held through them.
-            steering_rad: likewise, in highway-env's axes.
+            acceleration_mps2: held during the sub-steps.
+            steering_rad: held during the sub-steps, in highway-env's axes.
             poses: one for each sub-step.
         """
         self.steered = True
@@ -72,19 +70,19 @@ class TrafficVehicle(IDMVehicle):
         self._coming = poses[::-1]
 
     def release(self) -> None:
-        """Leaves it to itself again; it looks for a way from where it is to where it was going."""
+        """Ends control; the vehicle plans a route from its position to its destination."""
         if self.steered:
             self.steered = False
             if self.route:
                 self.plan_route_to(self.route[-1][1])
 
     def act(self, action: Any = None) -> None:
-        """Decides what to do, unless that is somebody else's business."""
+        """Chooses an action, unless the vehicle is controlled."""
         if not self.steered:
             super().act(action)
 
     def step(self, dt: float) -> None:
-        """Moves by its own decision, or to where it was steered; that knows no push by others."""
+        """Moves by its own action, or to the given pose, which ignores impacts."""
         if not self.steered:
             super().step(dt)
             return
@@ -96,18 +94,25 @@ class TrafficVehicle(IDMVehicle):
         self.target_lane_index = self.lane_index
 
     def predict_trajectory_constant_speed(self, times: Any) -> Any:
-        """Where the traffic rules expect it: on its route, or, steered, straight on in its curve.
+        """Positions and headings that the right of way expects at some times.
 
-        Once for each time that the rules are enforced, since nobody moves meanwhile.
+        An uncontrolled vehicle follows its route, a controlled one its current curve. The result
+        is stored for the rest of the step, since no vehicle moves meanwhile.
+
+        Args:
+            times: (n,) seconds from now.
+
+        Returns:
+            Positions (n, 2) and headings (n,) in highway-env's axes.
         """
         road: Road = self.road
-        moment = road.steps
-        if self._foreseen[0] != moment:
-            there = super().predict_trajectory_constant_speed
-            self._foreseen = moment, self._in_its_curve(times) if self.steered else there(times)
-        return self._foreseen[1]
+        if self._predicted[0] != road.steps:
+            along_route = super().predict_trajectory_constant_speed
+            predicted = self._along_curve(times) if self.steered else along_route(times)
+            self._predicted = road.steps, predicted
+        return self._predicted[1]
 
-    def _in_its_curve(self, times: Float[np.ndarray, " n"]) -> tuple[Any, Any]:
+    def _along_curve(self, times: Float[np.ndarray, " n"]) -> tuple[Any, Any]:
         step_s = float(times[0])
         assert np.allclose(np.diff(times), step_s), "steps of equal length"
         state = np.array([*self.position, self.heading, self.speed])
@@ -119,7 +124,7 @@ class TrafficVehicle(IDMVehicle):
 
 
 class IntersectionVehicle(TrafficVehicle):
-    """Of the intersection, which sets these for the class of its vehicles: now that is its own."""
+    """Vehicle of the intersection, with the parameters that its environment sets."""
 
     DISTANCE_WANTED = 7
     COMFORT_ACC_MAX = 6
@@ -127,7 +132,7 @@ class IntersectionVehicle(TrafficVehicle):
 
 
 class RoundaboutVehicle(TrafficVehicle):
-    """Of the roundabout, with what highway-env's class says before its intersection changes it."""
+    """Vehicle of the roundabout, with the default parameters of highway-env's class."""
 
     DISTANCE_WANTED = 10.0
     COMFORT_ACC_MAX = 3.0
@@ -135,10 +140,10 @@ class RoundaboutVehicle(TrafficVehicle):
 
 
 class Network(RoadNetwork):
-    """A network that never changes, in which the nearest lane is found without asking all lanes.
+    """A constant road network that finds the nearest lane without checking all lanes.
 
-    The distance to a lane is at least that to the rectangle around it, so lanes are asked in the
-    order of those until no other can be nearer.
+    The distance to a lane is at least the distance to its bounding box, so lanes are checked in
+    the order of that distance until no other lane can be nearer.
     """
 
     def __init__(self, given: RoadNetwork) -> None:
@@ -152,18 +157,18 @@ class Network(RoadNetwork):
         self._boxes = np.array([_box(lane) for lane in self._lanes])
         self._reaches = dict(zip(self.indices, map(_reach, self._lanes), strict=True))
         for lane in self._lanes:
-            lane.local_coordinates = _remembering(lane.local_coordinates)
+            lane.local_coordinates = _cached(lane.local_coordinates)
         self._near: dict[tuple[int, int], list[tuple[float, int]]] = {}
 
     def __deepcopy__(self, memo: dict[int, Any]) -> "Network":
-        """Itself."""
+        """Returns the object itself, since it is immutable."""
         del memo
         return self
 
     def get_closest_lane_index(
         self, position: Float[np.ndarray, " 2"], heading: float | None = None
     ) -> Any:
-        """What `RoadNetwork` finds by asking all lanes; of equally near ones the first."""
+        """The result of `RoadNetwork`; the first of equally near lanes."""
         x, y = float(position[0]), float(position[1])
         cell = (math.floor(x / CELL_M), math.floor(y / CELL_M))
         near = self._near.get(cell)
@@ -179,7 +184,7 @@ class Network(RoadNetwork):
         return self.indices[found]
 
     def near(self, index: Any, vehicles: list[TrafficVehicle]) -> list[TrafficVehicle]:
-        """Of some vehicles those who may be on a lane, in their order."""
+        """The vehicles that may be on a lane, in their order."""
         left, low, right, high = self._reaches[index]
         found = []
         for vehicle in vehicles:
@@ -195,16 +200,16 @@ class Network(RoadNetwork):
         return [(float(least[i]), int(i)) for i in np.argsort(least, kind="stable")]
 
 
-def _remembering(locate: Callable[[Any], Any]) -> Callable[[Any], Any]:
-    """The same function; vehicles ask it again and again while nobody moves."""
+def _cached(locate: Callable[[Any], Any]) -> Callable[[Any], Any]:
+    """Caches a lane's local coordinates, which are requested repeatedly for the same position."""
     known: dict[bytes, Any] = {}
 
-    @no_type_check  # asked so often that checks in the tests would take longer than all the rest
+    @no_type_check  # called so often that checks in the tests would dominate
     def local_coordinates(position: Float[np.ndarray, " 2"]) -> tuple[float, float]:
         key = position.tobytes()
         found = known.get(key)
         if found is None:
-            if len(known) >= REMEMBERED:
+            if len(known) >= CACHED_POSITIONS:
                 known.clear()
             found = known[key] = locate(position)
         return found
@@ -213,19 +218,20 @@ def _remembering(locate: Callable[[Any], Any]) -> Callable[[Any], Any]:
 
 
 def _box(lane: Any) -> tuple[float, float, float, float]:
-    """A rectangle around a lane's centre line."""
+    """Bounding box of a lane's centre line."""
     return _around(lane, along_m=0.0, across_m=0.0)
 
 
 def _reach(lane: Any) -> tuple[float, float, float, float]:
-    """A rectangle around all that highway-env takes for on a lane when it looks for neighbours."""
+    """Bounding box of the positions that count as on a lane when neighbours are searched."""
     return _around(lane, along_m=float(lane.VEHICLE_LENGTH), across_m=lane.width / 2 + 1.0)
 
 
 def _around(lane: Any, *, along_m: float, across_m: float) -> tuple[float, float, float, float]:
-    """With a margin for what lies between its points.
+    """Bounding box of a lane with a margin.
 
-    And for sine lanes, from which distances are measured as if they went on beyond their ends.
+    The margin covers what lies between the sampled points, and sine lanes, from which distances are
+    measured as if they continued beyond their ends.
     """
     way = np.linspace(-along_m, lane.length + along_m, 200)
     points = np.array([lane.position(s, side) for s in way for side in (-across_m, across_m)])
@@ -234,28 +240,28 @@ def _around(lane: Any, *, along_m: float, across_m: float) -> tuple[float, float
 
 
 class TrafficRoad(_Road):
-    """A road of vehicles and of nothing else, with a `Network`."""
+    """A road with vehicles only, on a `Network`."""
 
     steps: int = 0
 
     def neighbour_vehicles(self, vehicle: TrafficVehicle, lane_index: Any = None) -> Any:
-        """Asks those near the lane: the others are not on it, so in front of nobody there."""
-        everybody = self.vehicles
-        self.vehicles = self.network.near(lane_index or vehicle.lane_index, everybody)
+        """Checks only vehicles near the lane, since no other vehicle is on it."""
+        vehicles = self.vehicles
+        self.vehicles = self.network.near(lane_index or vehicle.lane_index, vehicles)
         try:
             return super().neighbour_vehicles(vehicle, lane_index)
         finally:
-            self.vehicles = everybody
+            self.vehicles = vehicles
 
     def step(self, dt: float) -> None:
-        """Moves everybody, and looks for collisions where a distance asks for a closer look."""
+        """Moves all vehicles and checks for collisions where they are near each other."""
         for vehicle in self.vehicles:
             vehicle.step(dt)
         for vehicle, other in self._close(dt):
             vehicle.handle_collisions(other, dt)
 
     def _close(self, dt: float) -> Iterator[tuple[TrafficVehicle, TrafficVehicle]]:
-        """Pairs in highway-env's order, without those that it finds too far apart to collide."""
+        """Pairs in highway-env's order, without those that are too far apart to collide."""
         places = [vehicle.position.tolist() for vehicle in self.vehicles]
         longest = max((float(vehicle.diagonal) for vehicle in self.vehicles), default=0.0)
         for i, vehicle in enumerate(self.vehicles):
@@ -267,19 +273,19 @@ class TrafficRoad(_Road):
 
 
 class RegulatedTrafficRoad(_RegulatedRoad, TrafficRoad):
-    """With highway-env's rules of who gives way."""
+    """A road with highway-env's right of way."""
 
     def enforce_road_rules(self) -> None:
-        """Looks closer only at those who are foreseen near each other at the same time."""
-        self._meeting = self._foresee()
+        """Checks only pairs that are predicted near each other at the same time."""
+        self._conflicts = self._find_conflicts()
         super().enforce_road_rules()
 
-    def _foresee(self) -> set[tuple[int, int]]:
-        """Pairs, by their `id`, that highway-env does not find too far apart at all times."""
+    def _find_conflicts(self) -> set[tuple[int, int]]:
+        """Pairs, by their `id`, that are not too far apart at all predicted times."""
         if len(self.vehicles) < 2:
             return set()
         ways = np.array(
-            [each.predict_trajectory_constant_speed(FORESEEN_S)[0] for each in self.vehicles]
+            [each.predict_trajectory_constant_speed(PREDICTED_S)[0] for each in self.vehicles]
         )
         apart = np.abs(ways[:, None] - ways).max(axis=-1).min(axis=-1)
         lengths = np.array([each.LENGTH for each in self.vehicles])
@@ -287,5 +293,5 @@ class RegulatedTrafficRoad(_RegulatedRoad, TrafficRoad):
         return {(id(self.vehicles[i]), id(self.vehicles[j])) for i, j in pairs}
 
     def is_conflict_possible(self, v1: TrafficVehicle, v2: TrafficVehicle) -> bool:
-        """What highway-env finds; nothing, of those who stay apart."""
-        return (id(v1), id(v2)) in self._meeting and bool(super().is_conflict_possible(v1, v2))
+        """The result of highway-env; False for pairs that stay apart."""
+        return (id(v1), id(v2)) in self._conflicts and bool(super().is_conflict_possible(v1, v2))

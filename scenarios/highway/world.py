@@ -17,7 +17,7 @@ from asp_env.sim.episodes import gather_controlled
 from asp_env.sim.world import World
 from scenarios.highway.road_map import mirror_actions, mirror_states
 from scenarios.highway.rounds import (
-    KEPT_EVERY,
+    HIDDEN_EVERY_FRAMES,
     WANTED,
     HiddenHistory,
     Rows,
@@ -77,10 +77,10 @@ class HighwayWorld(World):
             raise AspEnvError("recordings in memory: expected those of `highway:…`")
         super().__init__(recordings, num_episodes=num_episodes, dt_s=dt_s, history=history)
         self._stride = frames_per_tick(float(STEPS_PER_S), dt_s)
-        if self._stride % KEPT_EVERY:
+        if self._stride % HIDDEN_EVERY_FRAMES:
             raise AspEnvError(
                 f"time step {dt_s:g} s: what highway-env's vehicles have in mind is kept every "
-                f"{KEPT_EVERY * STEP_S:g} s; choose a multiple of that"
+                f"{HIDDEN_EVERY_FRAMES * STEP_S:g} s; choose a multiple of that"
             )
         self._folder = recordings
         self._runs: list[_Run | None] = [None] * num_episodes
@@ -143,23 +143,23 @@ class HighwayWorld(World):
         rows: Int[np.ndarray, " r"],
         now: Int[np.ndarray, " r"],
         actions: Float[np.ndarray, "b a 2"],
-        driven: Bool[np.ndarray, "r a"],
-        obeys: Bool[np.ndarray, "r a"],
+        controlled: Bool[np.ndarray, "r a"],
+        acting: Bool[np.ndarray, "r a"],
     ) -> None:
-        states, held, lengths = gather_controlled(self.episodes, rows, now, actions, obeys)
+        states, held, lengths = gather_controlled(self.episodes, rows, now, actions, acting)
         times_s = [*((k + 1) * STEP_S for k in range(self._stride - 1)), self.dt_s]
         ways = np.stack([forward(states, held, lengths, each) for each in times_s])
         poses = mirror_states(ways.astype(np.float64)).swapaxes(0, 1).tolist()
         commands = mirror_actions(held.astype(np.float64)).tolist()
         at = 0
         for i, b in enumerate(rows.tolist()):
-            steered = np.flatnonzero(obeys[i]).tolist()
+            steered = np.flatnonzero(acting[i]).tolist()
             obeying = {slot: (at + k) for k, slot in enumerate(steered)}
             for slot, number in obeying.items():
                 acceleration, steering = commands[number]
                 self._vehicle(b, slot).steer(acceleration, steering, poses[number])
-            self._advance(b, driven[i], obeying)
-            self._write(b, int(now[i]) + 1, obeys[i], ways[-1, at : at + len(steered)])
+            self._advance(b, controlled[i], obeying)
+            self._write(b, int(now[i]) + 1, acting[i], ways[-1, at : at + len(steered)])
             at += len(steered)
 
     def _vehicle(self, b: int, slot: int) -> TrafficVehicle:
@@ -167,9 +167,9 @@ class HighwayWorld(World):
         assert run is not None
         return next(each for each in run.road.vehicles if each.track == track)
 
-    def _advance(self, b: int, driven: Bool[np.ndarray, " a"], obeying: dict[int, Any]) -> None:
+    def _advance(self, b: int, controlled: Bool[np.ndarray, " a"], obeying: dict[int, Any]) -> None:
         """One tick of one episode's road."""
-        run, slots, gone = self._runs[b], self._slots[b], self.episodes.gone[b]
+        run, slots, gone = self._runs[b], self._slots[b], self.episodes.departed[b]
         assert run is not None
         road = run.road
         road.vehicles = [each for each in road.vehicles if not gone[slots[each.track]]]
@@ -181,7 +181,7 @@ class HighwayWorld(World):
             run.frame += 1
             if run.frame % STEPS_PER_S == 0:
                 remove_exited(run.history.site, road, ego=int(self.episodes.tracks[b, EGO]))
-                away = [slot for slot in slots.values() if driven[slot] or gone[slot]]
+                away = [slot for slot in slots.values() if controlled[slot] or gone[slot]]
                 self._let_in(run, {int(self.episodes.tracks[b, slot]) for slot in away})
 
     def _let_in(self, run: _Run, away: set[int]) -> None:
@@ -197,7 +197,7 @@ class HighwayWorld(World):
         self,
         b: int,
         tick: int,
-        obeys: Bool[np.ndarray, " a"],
+        acting: Bool[np.ndarray, " a"],
         moved: Float[np.ndarray, "n 4"],
     ) -> None:
         """What became of one episode, into the arrays."""
@@ -211,9 +211,9 @@ class HighwayWorld(World):
             theirs = np.array([(*v.position, v.heading, v.speed) for v in vehicles])
             data.states[b, tick, at] = mirror_states(theirs)
             there[at] = True
-        data.states[b, tick, obeys] = moved
+        data.states[b, tick, acting] = moved
         data.states[b, tick, ~there] = 0.0
-        data.gone[b] |= data.valid[b, tick - 1] & ~there
+        data.departed[b] |= data.valid[b, tick - 1] & ~there
 
     def snapshot(self) -> Any:
         """The whole state, to be handed to `restore`."""

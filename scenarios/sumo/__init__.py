@@ -1,8 +1,9 @@
-"""Traffic from SUMO in the inD layout: intersections and roundabouts, as many as wanted.
+"""Traffic of SUMO in the inD layout: any number of intersections and roundabouts.
 
-The roads are drawn by seed (`junctions`, `roundabouts`), built by netconvert, filled with drivers
-that all differ (`demand`) and simulated (`sumo`). What SUMO reports is turned into the motion of
-vehicles with two axles (`motion`) and written as a camera above the place would have seen it.
+Sites are drawn by seed (`sites`), built by netconvert and filled with agents that all differ
+(`demand`), whose motion SUMO simulates (`network`). The positions that SUMO reports become the
+motion of vehicles with two axles (`motion`), which are written as seen by a camera above the
+location (`place`, `dataset`).
 """
 
 from scenarios.sumo.dataset import open_source, synthesize

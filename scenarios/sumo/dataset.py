@@ -1,23 +1,18 @@
-"""Who touches whom: SUMO watches over lanes, not over the corners of boxes that cut them.
-
-MERGED: One recording's road users: demand, simulation, motion, and what the picture shows of it.
-MERGED: A folder of recordings in the inD layout.
-MERGED: What the registry finds here: the source `synthetic:`.
-"""
+"""Recordings of SUMO's traffic: simulation, tracks in view, files, and the source `synthetic:`."""
 
 import shutil
 import tempfile
 from pathlib import Path
 
 import numpy as np
-from jaxtyping import Bool, Float
+from jaxtyping import Float
 from rich.console import Console
 from rich.progress import track as with_progress
 
 from asp_env.data.cache import get_or_create
 from asp_env.errors import AspEnvError, unknown_name
-from asp_env.files import written_aside
-from asp_env.geometry import box_corners
+from asp_env.files import atomic_folder
+from asp_env.geometry import boxes_overlap
 from scenarios.noise import measure
 from scenarios.sumo.demand import RoadUser, demand
 from scenarios.sumo.motion import FRAME_RATE_HZ, Motion, reconstruct
@@ -26,14 +21,42 @@ from scenarios.sumo.place import METRES_PER_ORTHO_PIXEL, SITES, Place, make_plac
 from scenarios.tables import Meta, Track, write_recording_meta, write_tracks, write_tracks_meta
 
 EVERY_FRAMES = 5
+"""Overlaps are checked at every fifth frame, 5 Hz."""
+
+WARM_UP_S = 80.0
+"""Simulated before the recording starts, so that traffic fills the place by then."""
+
+_AFTER_S = 4.0
+
+_FEWEST_FRAMES = 25
+
+_EDGE_M = 1.0
+
+_MOST_ATTEMPTS = 12
+
+MAX_SECONDS = 24 * 3600.0
+
+RECORDINGS_PER_LOCATION = 3
+"""A split by recording needs at least three recordings of each location."""
+
+_DAYS = ("monday", "tuesday", "wednesday", "thursday", "friday")
+
+SOURCE_RECORDINGS, SOURCE_MINUTES, SOURCE_SEED = 8, 5.0, 90_521
+"""Content of `synthetic:SITE`. The seed is reserved for it."""
+
+SOURCE_VERSION = 2
+"""Raised when the same seed gives other bytes, so that cached folders are not reused."""
 
 
 def overlapping(motions: dict[str, Motion], users: dict[str, RoadUser]) -> set[tuple[str, str]]:
-    """Pairs of names whose boxes overlap at some time; two pedestrians may.
+    """Pairs of agents whose boxes overlap at some time; pedestrians may overlap each other.
+
+    SUMO prevents collisions within lanes, but not between the corners of boxes that cut across
+    lanes.
 
     Args:
-        motions: of all road users, by name.
-        users: size and class of the same names.
+        motions: of all agents, by name.
+        users: size and class, by the same names.
     """
     names = [name for name in sorted(motions) if len(motions[name].xy)]
     rows: list[np.ndarray] = []
@@ -61,48 +84,31 @@ def overlapping(motions: dict[str, Motion], users: dict[str, RoadUser]) -> set[t
         first = np.flatnonzero(near)
         pairs.append(np.column_stack([first, first + apart]))
     a, b = np.concatenate([np.empty((0, 2), dtype=np.int64), *pairs]).T
-    corners = box_corners(table[:, 2:5], table[:, 5:])
-    touching = boxes_overlap(corners[a], corners[b])
+    touching = boxes_overlap(table[a, 2:], table[b, 2:])
     found = {
         (names[int(one)], names[int(other)])
         for one, other in np.column_stack([table[a, 1], table[b, 1]])[touching]
     }
-    feet = "pedestrian"
-    return {(one, other) for one, other in found if {users[one].kind, users[other].kind} != {feet}}
-
-
-def boxes_overlap(
-    a: Float[np.ndarray, "n 4 2"], b: Float[np.ndarray, "n 4 2"]
-) -> Bool[np.ndarray, " n"]:
-    """Whether boxes given by their corners overlap, pair by pair (separating axes)."""
-    overlap = np.ones(len(a), dtype=bool)
-    for box in (a, b):
-        for axis in (box[:, 1] - box[:, 0], box[:, 2] - box[:, 1]):
-            along_a, along_b = (np.einsum("nij,nj->ni", corners, axis) for corners in (a, b))
-            overlap &= along_a.min(axis=1) < along_b.max(axis=1)
-            overlap &= along_b.min(axis=1) < along_a.max(axis=1)
-    return overlap
-
-
-WARM_UP_S = 80.0
-"""Before the recording begins, so that the place is full when it does."""
-_AFTER_S = 4.0
-_FEWEST_FRAMES = 25
-_EDGE_M = 1.0
-_MOST_ATTEMPTS = 12
+    pedestrians = {"pedestrian"}
+    return {pair for pair in found if {users[name].kind for name in pair} != pedestrians}
 
 
 def record(
     rng: np.random.Generator, place: Place, *, num_frames: int
 ) -> tuple[dict[str, Motion], dict[str, RoadUser]]:
-    """Simulates traffic at a place in which nobody touches anybody.
+    """Simulates traffic at a place without overlapping agents.
 
-    SUMO's vehicles follow their lanes with the front bumper; the boxes that roll after may still
-    touch. Then the later of the two stays at home and the same traffic is simulated again, which
-    changes nothing before its departure.
+    SUMO moves the front bumpers of vehicles along their lanes; the reconstructed boxes may still
+    overlap. The agent of each such pair that departs later is removed and the same traffic is
+    simulated again, which changes nothing before its departure.
+
+    Args:
+        rng: draws the demand and SUMO's seed.
+        place: the place.
+        num_frames: length of the recording.
 
     Returns:
-        All motions in the recording's frame, by name, and the road users by name.
+        All motions in the recording's frame and all agents, both by name.
     """
     seconds = WARM_UP_S + num_frames / FRAME_RATE_HZ + _AFTER_S
     wanted = demand(rng, place.site, seconds)
@@ -120,7 +126,7 @@ def record(
         if not late:
             break
         wanted = wanted.without(late)
-    else:  # never seen; whoever still touches somebody is left out of the picture
+    else:  # not observed so far: the agents that still overlap are left out
         motions = {name: motion for name, motion in motions.items() if name not in late}
     return motions, wanted.users
 
@@ -148,14 +154,14 @@ def tracks_in_view(
     num_frames: int,
     noise: np.random.Generator | None = None,
 ) -> list[Track]:
-    """What a camera above the place sees of the motions, by first appearance.
+    """The tracks that a camera above the place sees, in the order of appearance.
 
     Args:
-        place: where.
-        motions: of all road users, by name; frame 0 is the start of the simulation.
-        users: class and size of the same names.
-        num_frames: how long the recording is.
-        noise: draws measurement errors; without it the truth is seen.
+        place: the place.
+        motions: of all agents, by name; frame 0 is the start of the simulation.
+        users: class and size, by the same names.
+        num_frames: length of the recording.
+        noise: draws measurement errors; without it the true tracks are returned.
     """
     tracks: list[tuple[int, str, Track]] = []
     for name in sorted(motions):
@@ -179,7 +185,7 @@ def make_track(
     first_frame: int,
     window: slice,
 ) -> Track:
-    """Derives velocities and accelerations, then keeps the rows of `window`."""
+    """Derives velocities and accelerations of a motion and selects the rows of `window`."""
     velocity = np.gradient(xy, 1.0 / FRAME_RATE_HZ, axis=0)
     acceleration = np.gradient(velocity, 1.0 / FRAME_RATE_HZ, axis=0)
     return Track(
@@ -195,7 +201,7 @@ def make_track(
 
 
 def _seen(motion: Motion, place: Place, num_frames: int) -> slice | None:
-    """The longest time without a gap in which a road user is in the picture."""
+    """The longest uninterrupted span in which a motion is inside the image."""
     frames = motion.first_frame + np.arange(len(motion.xy)) - round(WARM_UP_S * FRAME_RATE_HZ)
     half = np.array(place.site.half_size_m) - _EDGE_M
     seen = np.all(np.abs(motion.xy - place.shift_m) < half, axis=1)
@@ -211,7 +217,7 @@ def _seen(motion: Motion, place: Place, num_frames: int) -> slice | None:
 
 
 def parked_cars(rng: np.random.Generator, place: Place, num_frames: int) -> list[Track]:
-    """Cars that stand in the parking places from the first frame to the last."""
+    """Tracks of parked cars in the parking lots; they stand still in all frames."""
     tracks = []
     still = np.zeros((num_frames, 2))
     for lot in place.parking:
@@ -238,12 +244,6 @@ def parked_cars(rng: np.random.Generator, place: Place, num_frames: int) -> list
     return tracks
 
 
-MAX_SECONDS = 24 * 3600.0
-RECORDINGS_PER_LOCATION = 3
-"""At least so many, where there are enough: a split by recording needs three at each location."""
-_DAYS = ("monday", "tuesday", "wednesday", "thursday", "friday")
-
-
 def synthesize(
     out: Path,
     *,
@@ -256,22 +256,23 @@ def synthesize(
     compress: bool = False,
     progress: bool = False,
 ) -> None:
-    """Writes synthetic traffic in the inD layout.
+    """Generates traffic in the inD layout.
 
     Args:
-        out: folder to make; may exist if it is empty.
+        out: folder to create; may exist if it is empty.
         site: `intersection` or `roundabout`.
-        recordings: how many.
-        minutes: length of each.
-        seed: same seed, same bytes; another seed, other places and other traffic.
-        noise: whether to write measured instead of true tracks; the truth goes to
-            `truth/XX_trueTracks.csv`, which no reader takes for a recording.
-        locations: how many places; by default one for three recordings.
+        recordings: number of recordings.
+        minutes: length of each recording.
+        seed: the same seed gives the same bytes; another seed gives other locations and other
+            traffic.
+        noise: whether to write measured instead of true tracks; the true tracks go to
+            `truth/XX_trueTracks.csv`, which readers ignore.
+        locations: number of locations; by default one for three recordings.
         compress: whether to write tracks as `.csv.gz`.
         progress: whether to show a progress bar.
 
     Raises:
-        AspEnvError: an unknown site, an impossible number, or a folder that cannot be written.
+        AspEnvError: the site is unknown, a number is out of range, or the folder cannot be written.
         MissingExtraError: SUMO is not installed.
     """
     if site not in SITES:
@@ -280,10 +281,10 @@ def synthesize(
     if not 1 <= places <= recordings or not 1.0 <= minutes * 60.0 < MAX_SECONDS or seed < 0:
         raise AspEnvError(
             f"{recordings} recordings of {minutes} minutes at {places} locations with seed {seed} "
-            "cannot be made: at least one recording of a second and more, at least one location "
-            "and no more than recordings, and a seed of 0 or above"
+            "cannot be made: expected at least one recording of a second or more, at least one "
+            "location and no more locations than recordings, and a seed of 0 or more"
         )
-    with written_aside(out) as folder, tempfile.TemporaryDirectory() as scratch:
+    with atomic_folder(out) as folder, tempfile.TemporaryDirectory() as scratch:
         made: dict[int, Place] = {}
         for recording in with_progress(
             range(recordings),
@@ -363,20 +364,14 @@ def _write_recording(
     write_tracks(Path(f"{stem}tracks{suffix}"), recording, seen)
 
 
-SOURCE_RECORDINGS, SOURCE_MINUTES, SOURCE_SEED = 8, 5.0, 90_521
-"""What `synthetic:` consists of. The seed decides the places: one that nobody else takes."""
-SOURCE_VERSION = 2
-"""Raise when other bytes come of the same seed, so that nobody mixes them with cached ones."""
-
-
 def open_source(argument: str) -> Path:
-    """The folder of `synthetic:ARGUMENT`, made on first use in the user's cache folder.
+    """The folder of the source `synthetic:ARGUMENT`, created on first use in the cache folder.
 
     Args:
         argument: `intersection` or `roundabout`.
 
     Raises:
-        AspEnvError: an unknown site, or a cache folder that cannot be written.
+        AspEnvError: the site is unknown, or the cache folder cannot be written.
     """
     if argument not in SITES:
         raise unknown_name("synthetic site", argument, SITES)

@@ -1,9 +1,10 @@
-"""Who comes, when, where to, and how they drive: every road user is a driver of its own."""
+"""Demand: which agents appear, when, on which route, and with which driver parameters."""
 
 from dataclasses import dataclass
 
 import numpy as np
 
+from asp_env.geometry import wrap_scalar
 from scenarios.sumo.sites import Arm, Site
 
 VEHICLES_PER_HOUR = {
@@ -12,7 +13,7 @@ VEHICLES_PER_HOUR = {
     "roundabout": (1000.0, 1350.0),
     "two-lane-roundabout": (1050.0, 1400.0),
 }
-PEOPLE_PER_HOUR = (130.0, 260.0)
+PEDESTRIANS_PER_HOUR = (130.0, 260.0)
 SHARES = {
     "car": 0.74,
     "van": 0.09,
@@ -30,7 +31,7 @@ SIZES_M = {
     "bicycle": ((1.7, 1.9), (0.6, 0.7)),
     "pedestrian": ((0.4, 0.5), (0.5, 0.6)),
 }
-"""Ranges of length and width."""
+"""Ranges of length and width. Chosen by hand, like the rates and shares above."""
 SUMO_CLASSES = {
     "car": "passenger",
     "van": "delivery",
@@ -40,32 +41,32 @@ SUMO_CLASSES = {
     "bicycle": "bicycle",
 }
 SHARPEST_TURN_RAD = {"bus": np.radians(50.0), "truck": np.radians(110.0)}
-"""Long vehicles choose ways on which they need not turn right more sharply than this."""
+"""Routes of long vehicles have no right turn that is sharper than this."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Demand:
-    """Everybody who will appear."""
+    """All agents of a simulation."""
 
     users: dict[str, "RoadUser"]
     """By name."""
     entries: tuple[tuple[float, str, str], ...]
-    """(when, name, as sumo reads it), by time."""
+    """(departure s, name, XML element), by departure."""
 
     def without(self, names: set[str]) -> "Demand":
-        """The same without some."""
+        """The same demand without some agents."""
         entries = tuple(entry for entry in self.entries if entry[1] not in names)
         return Demand(users=self.users, entries=entries)
 
     @property
     def routes(self) -> str:
-        """The content of a routes file."""
+        """The content of SUMO's routes file."""
         return "".join(text for _, _, text in self.entries)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class RoadUser:
-    """One who will appear: class name as in the files, and size."""
+    """Class, as named in the files, and size of an agent."""
 
     kind: str
     length_m: float
@@ -73,7 +74,7 @@ class RoadUser:
 
 
 def demand(rng: np.random.Generator, site: Site, seconds: float) -> Demand:
-    """Draws the traffic of `seconds`."""
+    """Draws the agents that depart within `seconds` at a site."""
     users: dict[str, RoadUser] = {}
     entries: list[tuple[float, str, str]] = []
     hours = seconds / 3600.0
@@ -84,10 +85,10 @@ def demand(rng: np.random.Generator, site: Site, seconds: float) -> Demand:
         name = f"v{number}"
         depart = float(rng.uniform(0.0, seconds))
         kind = str(rng.choice(kinds, p=shares / shares.sum()))
-        begin, end = _way(rng, site.arms, weights, kind)
+        begin, end = _route(rng, site.arms, weights, kind)
         users[name] = _user(rng, kind)
         entries.append((depart, name, _vehicle_xml(rng, name, users[name], depart, begin, end)))
-    for number in range(rng.poisson(hours * rng.uniform(*PEOPLE_PER_HOUR))):
+    for number in range(rng.poisson(hours * rng.uniform(*PEDESTRIANS_PER_HOUR))):
         name = f"p{number}"
         depart = float(rng.uniform(0.0, seconds))
         users[name] = _user(rng, "pedestrian")
@@ -105,16 +106,16 @@ def _user(rng: np.random.Generator, kind: str) -> RoadUser:
 
 
 def right_turn_rad(begin: Arm, end: Arm) -> float:
-    """How far to the right a way from one arm to another turns; negative is left."""
-    return float((begin.angle_rad + np.pi - end.angle_rad + np.pi) % (2.0 * np.pi) - np.pi)
+    """Angle of the turn from one arm to another, right positive, rad."""
+    return float(wrap_scalar(begin.angle_rad + np.pi - end.angle_rad))
 
 
-def _way(
+def _route(
     rng: np.random.Generator, arms: tuple[Arm, ...], weights: np.ndarray, kind: str
 ) -> tuple[Arm, Arm]:
     sharpest = SHARPEST_TURN_RAD.get(kind, np.pi)
-    ways = [(a, b) for a in range(len(arms)) for b in range(len(arms)) if a != b]
-    allowed = [(a, b) for a, b in ways if right_turn_rad(arms[a], arms[b]) <= sharpest]
+    pairs = [(a, b) for a in range(len(arms)) for b in range(len(arms)) if a != b]
+    allowed = [(a, b) for a, b in pairs if right_turn_rad(arms[a], arms[b]) <= sharpest]
     chances = np.array([weights[a] * weights[b] for a, b in allowed])
     begin, end = allowed[int(rng.choice(len(allowed), p=chances / chances.sum()))]
     return arms[begin], arms[end]
@@ -126,7 +127,7 @@ def _vehicle_xml(
     heavy = user.kind in ("truck", "bus")
     top_mps = rng.uniform(4.0, 6.5) if user.kind == "bicycle" else 40.0
     accel = rng.uniform(1.0, 1.5) if heavy or user.kind == "bicycle" else rng.uniform(1.5, 2.8)
-    driver = {
+    parameters = {
         "vClass": SUMO_CLASSES[user.kind],
         "length": user.length_m,
         "width": user.width_m,
@@ -148,12 +149,12 @@ def _vehicle_xml(
         "jmCrossingGap": rng.uniform(2.0, 6.0),
         "impatience": rng.uniform(0.4, 0.8),
     }
-    # Lane 0 is the sidewalk. Who goes round more than half of the ring begins on the left.
+    # Lane 0 is the sidewalk. Vehicles that pass more than half of the ring start on the left.
     far_round = right_turn_rad(begin, end) < -0.3 and not heavy
     lane = begin.lanes if far_round and rng.random() < 0.9 else 1
     attributes = " ".join(
         f'{key}="{value}"' if isinstance(value, str) else f'{key}="{value:.4f}"'
-        for key, value in driver.items()
+        for key, value in parameters.items()
     )
     return (
         f'<vType id="t{name}" {attributes}/>'

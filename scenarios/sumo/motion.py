@@ -1,10 +1,10 @@
-"""From where SUMO says the front bumper was to how a vehicle with two axles moved.
+"""From the front bumper positions of SUMO to the motion of vehicles with two axles.
 
-SUMO moves the middle of the front bumper along the lane and points the body along it, which no
-car does. Here the way is smoothed and kept apart from the progress along it: the front axle
-follows the way, the rear axle rolls after it without slip (a tractrix), and both are then read at
-the smoothed progress. So a vehicle that stands stands exactly still, none moves backwards, and the
-motion is the kinematic bicycle's.
+SUMO moves the centre of the front bumper along the lane and aligns the body with the lane, unlike a
+real car. Here the path is smoothed and separated from the progress along it: the front axle follows
+the path, the rear axle follows without slip (a tractrix), and both are evaluated at the smoothed
+progress. Standing vehicles therefore stand exactly still, no vehicle moves backwards, and the
+motion is that of the kinematic bicycle.
 """
 
 import math
@@ -14,24 +14,26 @@ import numpy as np
 from jaxtyping import Float
 
 from asp_env.dynamics.bicycle import AXLE_SHARE_OF_LENGTH
-from scenarios.polylines import Polyline, arc_lengths
+from asp_env.geometry import arc_lengths, points_at
+from scenarios.polylines import Polyline
 from scenarios.sumo.network import STEP_S
 
 FRAME_RATE_HZ = 25.0
 SPACING_M = 0.2
-"""Between the points of a smoothed way."""
-WAY_SIGMA_M = {"pedestrian": 0.5, "bicycle": 1.2}
-WAY_SIGMA_DEFAULT_M = 1.8
+"""Distance between points of a smoothed path."""
+PATH_SIGMA_M = {"pedestrian": 0.5, "bicycle": 1.2}
+PATH_SIGMA_DEFAULT_M = 1.8
 PROGRESS_SIGMA_S = 0.25
+"""Standard deviations of the smoothing kernels. Chosen by hand."""
 JUMP_M = 2.5
-"""No road user gets so far in a step of the simulation; a change of lanes does."""
+"""Longer steps are lane changes: no agent moves this far in one simulation step."""
 CHANGE_S, CHANGE_M = 2.5, (15.0, 28.0)
-"""A change of lanes takes so long, but no less and no more than these distances."""
+"""Duration of a lane change, and the bounds of the distance that it takes."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Motion:
-    """How one road user moved, frame by frame; the reference point is the middle of its box."""
+    """The motion of one agent, frame by frame; the reference point is the centre of its box."""
 
     first_frame: int
     xy: Float[np.ndarray, "frames 2"]
@@ -40,9 +42,13 @@ class Motion:
 
 
 def gaussian(values: np.ndarray, sigma: float) -> np.ndarray:
-    """Smooths columns along the first axis; beyond the ends they go on as straight lines.
+    """Smooths columns along the first axis; beyond the ends they continue as straight lines.
 
-    A straight line and a constant stay exactly what they are in the inside.
+    Straight lines and constants stay unchanged in the interior.
+
+    Args:
+        values: (n, ...) evenly spaced samples.
+        sigma: standard deviation of the kernel, samples.
     """
     reach = max(1, int(np.ceil(3.0 * sigma)))
     kernel = np.exp(-0.5 * (np.arange(-reach, reach + 1) / sigma) ** 2)
@@ -56,7 +62,12 @@ def gaussian(values: np.ndarray, sigma: float) -> np.ndarray:
 
 
 def catmull_rom(table: Float[np.ndarray, "n k"], at: Float[np.ndarray, " m"]) -> np.ndarray:
-    """Reads an evenly spaced table between its rows, smooth to the first derivative."""
+    """Interpolates an evenly spaced table with a continuous first derivative (Catmull–Rom).
+
+    Args:
+        table: (n, k) rows.
+        at: (m,) fractional row numbers.
+    """
     row = np.clip(at.astype(np.int64), 1, len(table) - 3)
     u = (at - row)[:, None]
     a, b, c, d = (table[row + i] for i in (-1, 0, 1, 2))
@@ -70,23 +81,24 @@ def reconstruct(
     kind: str,
     length_m: float,
 ) -> Motion | None:
-    """The motion of a road user from its front bumper's reported positions.
+    """The motion of an agent from the reported positions of its front bumper.
 
     Args:
-        times_s: when it was reported, evenly spaced.
-        points: where the middle of its front bumper was (pedestrians: the middle).
+        times_s: (n,) times of the reports, evenly spaced.
+        points: (n, 2) centre of the front bumper, m; of pedestrians the centre of the body.
         kind: class name.
-        length_m: its length.
+        length_m: length of the agent.
 
     Returns:
-        The motion at all whole frames between the first and last time; None if it never moved.
+        The motion at all whole frames between the first and last time; None if the agent never
+        moves.
     """
     points = ease_lane_changes(points)
     arc = arc_lengths(points)
     if arc[-1] < 2.0 or len(points) < 4:
         return None
     lead = round((length_m + 6.0) / SPACING_M)
-    way, tangent = _way(points, arc, lead, WAY_SIGMA_M.get(kind, WAY_SIGMA_DEFAULT_M))
+    path, tangent = _smoothed_path(points, arc, lead, PATH_SIGMA_M.get(kind, PATH_SIGMA_DEFAULT_M))
     if kind in ("pedestrian", "bicycle"):
         behind_m, wheelbase_m = 0.5 * length_m, 0.0
         heading = tangent
@@ -102,7 +114,7 @@ def reconstruct(
     )
     progress = np.maximum.accumulate(progress)
     at = lead + (np.clip(progress, 0.0, arc[-1]) - behind_m) / SPACING_M
-    table = catmull_rom(np.column_stack([way, heading]), at)
+    table = catmull_rom(np.column_stack([path, heading]), at)
     ahead = np.stack([np.cos(table[:, 2]), np.sin(table[:, 2])], axis=1)
     return Motion(
         first_frame=first,
@@ -112,19 +124,21 @@ def reconstruct(
 
 
 def ease_lane_changes(points: Polyline) -> Polyline:
-    """Spreads the jumps with which SUMO changes lanes over the metres that follow.
+    """Distributes the jumps of SUMO's lane changes over the following metres.
 
-    The sideways offset from the new lane is taken back along the way, not in time, so that
-    nobody slides sideways while standing.
+    The lateral offset from the new lane decays along the path, not over time, so that no agent
+    moves sideways while it stands.
     """
     steps = np.diff(points, axis=0)
     lengths = np.hypot(*steps.T)
     jumps = np.flatnonzero(lengths > JUMP_M)
-    honest = np.flatnonzero((lengths > 0.02) & (lengths <= JUMP_M))
-    if not len(jumps) or not len(honest):
+    regular = np.flatnonzero((lengths > 0.02) & (lengths <= JUMP_M))
+    if not len(jumps) or not len(regular):
         return points
-    # The direction of travel, also while standing and while jumping, is that of the step before.
-    before = honest[np.clip(np.searchsorted(honest, np.arange(len(points)), "right") - 1, 0, None)]
+    # While standing and in jumps, the direction of travel is that of the last regular step.
+    before = regular[
+        np.clip(np.searchsorted(regular, np.arange(len(points)), "right") - 1, 0, None)
+    ]
     ahead = steps[before] / lengths[before, None]
     left = np.stack([-ahead[:, 1], ahead[:, 0]], axis=1)
     lengths[jumps] = np.sum(steps[jumps] * ahead[jumps], axis=1).clip(0.0, JUMP_M)
@@ -140,30 +154,31 @@ def ease_lane_changes(points: Polyline) -> Polyline:
     return eased
 
 
-def _way(
+def _smoothed_path(
     points: Polyline, arc: np.ndarray, lead: int, sigma_m: float
 ) -> tuple[Polyline, np.ndarray]:
-    """The smoothed way from `lead` steps before the first point, and its direction."""
-    kept = [0]
+    """The smoothed path from `lead` steps before the first point, and its direction."""
+    distinct = [0]
     for i in range(1, len(arc)):
-        if arc[i] - arc[kept[-1]] >= 0.1:
-            kept.append(i)
+        if arc[i] - arc[distinct[-1]] >= 0.1:
+            distinct.append(i)
     at = np.arange(-lead, arc[-1] / SPACING_M + 20.0) * SPACING_M
-    line, along = points[kept], arc[kept]
-    raw = np.stack([np.interp(at, along, line[:, axis]) for axis in (0, 1)], axis=1)
+    line, along = points[distinct], arc[distinct]
+    raw = points_at(line, along, at)
     for outside, end, other in ((at < 0.0, 0, 1), (at > along[-1], -1, -2)):
         slope = (line[end] - line[other]) / (along[end] - along[other])
         raw[outside] = line[end] + slope * (at[outside] - along[end])[:, None]
-    way = gaussian(raw, sigma_m / SPACING_M)
-    steps = np.gradient(way, axis=0)
-    return way, np.unwrap(np.arctan2(steps[:, 1], steps[:, 0]))
+    path = gaussian(raw, sigma_m / SPACING_M)
+    steps = np.gradient(path, axis=0)
+    return path, np.unwrap(np.arctan2(steps[:, 1], steps[:, 0]))
 
 
 def _tractrix(tangent_rad: Float[np.ndarray, " n"], wheelbase_m: float) -> np.ndarray:
-    """Direction of a body whose front axle follows a way and whose rear axle rolls after it.
+    """Direction of a body whose front axle follows a path and whose rear axle has no slip.
 
-    The direction θ obeys dθ/ds = sin(ψ - θ) / wheelbase, ψ the way's direction. For constant ψ
-    tan((ψ - θ)/2) decays exponentially, which makes each step exact for a bend at its middle.
+    The direction θ obeys dθ/ds = sin(ψ - θ) / wheelbase, where ψ is the direction of the path. For
+    constant ψ, tan((ψ - θ)/2) decays exponentially, which makes each step exact for a bend at its
+    middle.
     """
     decay = math.exp(-SPACING_M / wheelbase_m)
     middle = 0.5 * (tangent_rad[1:] + tangent_rad[:-1])

@@ -1,6 +1,6 @@
-"""SUMO as two programs: `netconvert` builds the roads, `sumo` moves those who use them.
+"""SUMO's programs `netconvert`, which builds roads, and `sumo`, which simulates traffic.
 
-MERGED: The road surface as lanelets: strips between a left and a right border, from a network.
+The road surface becomes lanelets: strips between a left and a right border.
 """
 
 import importlib
@@ -16,29 +16,35 @@ import pandas as pd
 from jaxtyping import Float
 
 from asp_env.errors import AspEnvError, MissingExtraError
+from asp_env.geometry import arc_lengths
 from scenarios.lanelet2 import Border, Lanelet, Marking, Subtype
-from scenarios.polylines import Polyline, arc_lengths, dense, offset
+from scenarios.polylines import Polyline, dense, offset
 from scenarios.sumo.sites import Site
 
 STEP_S = 0.1
-"""Step of the simulation; the frames in between are interpolated."""
+"""Simulation step; the frames in between are interpolated."""
+
+WIDENING_M = 1.3
+"""Additional width of a right-angled turn in its middle, on each side. Chosen by hand."""
+
+_MEETS_M = 0.3
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Lane:
-    """One lane as netconvert built it."""
+    """A lane as netconvert builds it."""
 
     edge: str
     shape: Polyline
     width_m: float
-    feet: bool
-    """Whether only pedestrians use it."""
+    pedestrian: bool
+    """Whether only pedestrians may use it."""
     index: int
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Turn:
-    """How traffic gets from one lane to another across a junction."""
+    """A connection from one lane to another across a junction."""
 
     begin: str
     end: str
@@ -47,27 +53,27 @@ class Turn:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Network:
-    """What netconvert made of a site, in metres around its middle."""
+    """The roads of a site as netconvert builds them, in metres around the site's centre."""
 
     lanes: dict[str, Lane]
     """Lanes between junctions."""
     turns: tuple[Turn, ...]
     crossings: tuple[tuple[Polyline, float], ...]
-    """Middle line and width of every zebra crossing."""
+    """Centre line and width of each zebra crossing."""
     corners: tuple[Polyline, ...]
     """Outlines of the pavement at junctions."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Movements:
-    """Where SUMO says that everybody was: rows sorted by road user, then time."""
+    """Positions of all agents that SUMO reports; rows sorted by agent, then by time."""
 
     names: tuple[str, ...]
     starts: np.ndarray
-    """User i has the rows `starts[i]:starts[i + 1]`."""
+    """Agent i has the rows `starts[i]:starts[i + 1]`."""
     times_s: Float[np.ndarray, " rows"]
     points: Float[np.ndarray, "rows 2"]
-    """Middle of the front bumper; for pedestrians the middle of the body."""
+    """Centre of the front bumper; of pedestrians the centre of the body; m."""
 
 
 def _program(name: str) -> tuple[str, dict[str, str]]:
@@ -88,12 +94,12 @@ def _run(name: str, *arguments: str | Path) -> None:
         check=False,
     )
     if done.returncode != 0:
-        said = " ".join(done.stderr.split()) or "nothing"
-        raise AspEnvError(f"{name} ended with status {done.returncode}; it said: {said}")
+        message = " ".join(done.stderr.split()) or "no message"
+        raise AspEnvError(f"{name} ended with status {done.returncode}: {message}")
 
 
 def build_network(site: Site, folder: Path) -> Network:
-    """Has netconvert build the site's roads; leaves `net.xml` in `folder`."""
+    """Builds the roads of a site with netconvert; writes `net.xml` to `folder`."""
     parts = {"nodes": site.nodes, "edges": site.edges, "connections": site.connections}
     for part, text in parts.items():
         (folder / f"plain.{part}.xml").write_text(f"<{part}>{text}</{part}>")
@@ -140,7 +146,7 @@ def _read_network(path: Path) -> Network:
                         edge=edge.attrib["id"],
                         shape=shape,
                         width_m=width,
-                        feet=lane.get("allow") == "pedestrian",
+                        pedestrian=lane.get("allow") == "pedestrian",
                         index=int(lane.attrib["index"]),
                     )
     return Network(
@@ -154,7 +160,7 @@ def _read_network(path: Path) -> Network:
 def _turns(
     root: ElementTree.Element, lanes: dict[str, Lane], inside: dict[str, Polyline]
 ) -> tuple[Turn, ...]:
-    """Joins the pieces of each way across a junction; some wait in its middle."""
+    """Joins the pieces of each connection; some have a waiting position inside the junction."""
     onward = {
         f"{link.attrib['from']}_{link.attrib['fromLane']}": link.get("via")
         for link in root.iter("connection")
@@ -164,7 +170,7 @@ def _turns(
     for link in root.iter("connection"):
         begin = f"{link.attrib['from']}_{link.attrib['fromLane']}"
         via = link.get("via")
-        if begin not in lanes or lanes[begin].feet or via is None:
+        if begin not in lanes or lanes[begin].pedestrian or via is None:
             continue
         pieces = []
         while via is not None:
@@ -177,7 +183,14 @@ def _turns(
 
 
 def simulate(folder: Path, routes: str, *, seconds: float, seed: int) -> Movements:
-    """Has sumo drive `routes` on the network in `folder`."""
+    """Simulates `routes` on the network in `folder` with SUMO.
+
+    Args:
+        folder: holds `net.xml`.
+        routes: content of the routes file.
+        seconds: end of the simulation.
+        seed: of SUMO's random numbers.
+    """
     (folder / "routes.xml").write_text(f"<routes>{routes}</routes>")
     _run(
         "sumo",
@@ -196,7 +209,7 @@ def simulate(folder: Path, routes: str, *, seconds: float, seed: int) -> Movemen
         "--xml-validation", "never",
         "--no-step-log", "true",
     )  # fmt: skip
-    rows = pd.concat([_positions(folder / f"{who}.csv") for who in ("vehicles", "people")])
+    rows = pd.concat([_positions(folder / f"{kind}.csv") for kind in ("vehicles", "people")])
     names, user = np.unique(rows["name"].to_numpy(dtype=str), return_inverse=True)
     rows = rows.iloc[np.lexsort((rows["time"], user))]
     starts = np.concatenate([[0], np.cumsum(np.bincount(user, minlength=len(names)))])
@@ -211,26 +224,21 @@ def simulate(folder: Path, routes: str, *, seconds: float, seed: int) -> Movemen
 def _positions(path: Path) -> pd.DataFrame:
     columns = ["time", "name", "x", "y"]
     with path.open() as lines:
-        nobody = lines.readline().count(";") < len(columns) - 1
-    if nobody:
+        empty = lines.readline().count(";") < len(columns) - 1
+    if empty:
         return pd.DataFrame({column: [] for column in columns})
     return pd.read_csv(path, sep=";", header=0, names=columns).dropna()
 
 
-WIDENING_M = 1.3
-"""How much wider than its lane a right-angled turn is in its middle, on either side."""
-_MEETS_M = 0.3
-
-
 def lanelets(network: Network, half_size_m: tuple[float, float]) -> list[Lanelet]:
-    """All strips of a network that reach into the picture, or little beyond it."""
+    """All lanelets of a network that reach into the image, or up to 14 m beyond it."""
     reach = np.array(half_size_m) + 14.0
-    kept = {
+    visible = {
         name: lane
         for name, lane in network.lanes.items()
         if np.any(np.all(np.abs(lane.shape) < reach, axis=1))
     }
-    strips = {name: _lane_strip(lane, network.lanes, reach) for name, lane in kept.items()}
+    strips = {name: _lane_strip(lane, network.lanes, reach) for name, lane in visible.items()}
     turns = [
         _turn_strip(turn, network, strips)
         for turn in network.turns
@@ -245,8 +253,10 @@ def _lane_strip(lane: Lane, lanes: dict[str, Lane], reach: np.ndarray) -> Lanele
     left, right = offset(lane.shape, half), offset(lane.shape, -half)
     inside = np.flatnonzero(np.all(np.abs(lane.shape) < reach, axis=1))
     part = slice(max(0, inside[0] - 1), inside[-1] + 2)
-    same_edge = [other for other in lanes.values() if other.edge == lane.edge and not other.feet]
-    if lane.feet:
+    same_edge = [
+        other for other in lanes.values() if other.edge == lane.edge and not other.pedestrian
+    ]
+    if lane.pedestrian:
         left_is, right_is = "curb", "virtual"
         subtype: Subtype = "walkway"
     else:
@@ -263,9 +273,9 @@ def _lane_strip(lane: Lane, lanes: dict[str, Lane], reach: np.ndarray) -> Lanele
 
 
 def _faces_traffic(lane: Lane, left: Polyline, lanes: dict[str, Lane]) -> bool:
-    """Whether the lane's left border is also that of a lane of the other direction."""
+    """Whether the left border of the lane is also that of an opposite lane."""
     for other in lanes.values():
-        if other.edge == lane.edge or other.feet or len(other.shape) != len(lane.shape):
+        if other.edge == lane.edge or other.pedestrian or len(other.shape) != len(lane.shape):
             continue
         facing = offset(other.shape, 0.5 * other.width_m)[::-1]
         if np.hypot(*(facing - left)[1:-1].T).max(initial=0.0) < _MEETS_M and (
@@ -310,7 +320,7 @@ def _side(
     border: Callable[[Lanelet], Border],
     sign: float,
 ) -> Marking:
-    """A kerb goes on across a junction along the outermost of the ways that touch it."""
+    """Marking of one side: a kerb continues across a junction along its outermost connection."""
     both = border(strips[turn.begin]).marking, border(strips[turn.end]).marking
     rivals = [t for t in network.turns if t.begin == turn.begin or t.end == turn.end]
     outermost = all(
@@ -323,7 +333,7 @@ def _side(
 
 
 def _starts_inside(turn: Turn, rival: Turn, sign: float) -> bool:
-    """Whether another way to the same lane comes from the inner side."""
+    """Whether another connection to the same lane starts on the inner side."""
     along = turn.shape[-1] - turn.shape[-2]
     offset_m = rival.shape[0] - turn.shape[0]
     cross = along[0] * offset_m[1] - along[1] * offset_m[0]

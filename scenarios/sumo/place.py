@@ -1,7 +1,4 @@
-"""A view of the place from above, drawn from the same strips as the map.
-
-MERGED: A place: its roads as SUMO knows them, its map and its picture, in the recording's frame.
-"""
+"""A place: the roads of a site in a recording's frame, with its map and its background image."""
 
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -18,13 +15,24 @@ from scenarios.sumo.sites import Site, crossroads, roundabout, t_junction, two_l
 
 METRES_PER_ORTHO_PIXEL = 0.01
 DOWNSCALE = 12
-"""The picture is this much coarser than the orthophoto that the metadata speak of."""
+"""The image is coarser by this factor than the orthophoto that the metadata describe."""
 METRES_PER_PIXEL = METRES_PER_ORTHO_PIXEL * DOWNSCALE
 
 _GRASS, _PAVEMENT, _KERB = (104, 148, 118), (176, 178, 180), (205, 207, 208)
 _ASPHALT, _PAINT, _LOT = (98, 94, 92), (235, 238, 238), (128, 124, 122)
 _SUBPIXEL_BITS = 4
 _SHADES = 8
+
+SITES: dict[str, tuple[Callable[[np.random.Generator], Site], ...]] = {
+    "intersection": (crossroads, t_junction),
+    "roundabout": (roundabout, two_lane_roundabout),
+}
+"""Kinds of junction of a site; locations use them in turn."""
+
+JOIN_M = 0.06
+"""Ends of netconvert's lines that are nearer than this belong together."""
+
+_NEAR_AACHEN_UTM_M = (294_000.0, 5_628_000.0)
 
 
 def _pixels(line: np.ndarray) -> np.ndarray:
@@ -40,7 +48,18 @@ def draw(
     *,
     size_m: tuple[float, float],
 ) -> UInt8[np.ndarray, "h w 3"]:
-    """Grass, pavements, kerbs, asphalt and paint; the origin is the top left corner."""
+    """Renders the background image: grass, pavements, kerbs, asphalt and markings.
+
+    Args:
+        lanelets: of the place.
+        corners: outlines of the pavement at junctions.
+        parking: (lots, 4, 2) corners of parking lots, m.
+        trees: (trees, 3) [x, y, radius], m.
+        size_m: (width, height).
+
+    Returns:
+        (h, w, 3) image, BGR; the origin of the frame is the top left corner.
+    """
     width, height = (round(side / METRES_PER_PIXEL) for side in size_m)
     image = np.empty((height, width, 3), dtype=np.uint8)
     image[:] = _GRASS
@@ -95,33 +114,22 @@ def _zebra(image: np.ndarray, lanelet: Lanelet) -> None:
 
 
 def write_picture(path: Path, image: UInt8[np.ndarray, "h w 3"]) -> None:
-    """Writes a small PNG: smoothed edges have few shades, which nobody sees."""
+    """Writes a small PNG: the number of shades is reduced."""
     settings = (cv2.IMWRITE_PNG_COMPRESSION, 9)
     strategy = (cv2.IMWRITE_PNG_STRATEGY, cv2.IMWRITE_PNG_STRATEGY_DEFAULT)
     encoded = cv2.imencode(".png", image // _SHADES * _SHADES, [*settings, *strategy])[1]
     path.write_bytes(encoded.tobytes())
 
 
-SITES: dict[str, tuple[Callable[[np.random.Generator], Site], ...]] = {
-    "intersection": (crossroads, t_junction),
-    "roundabout": (roundabout, two_lane_roundabout),
-}
-"""Kinds of place of a site; locations take them in turn."""
-JOIN_M = 0.06
-"""So near to each other netconvert's lines end that are to meet."""
-
-_NEAR_AACHEN_UTM_M = (294_000.0, 5_628_000.0)
-
-
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Place:
-    """Where recordings are made. The recording's frame has its origin top left, y up."""
+    """A location with its roads. The recording's frame has its origin top left, y up."""
 
     site: Site
     folder: Path
     """Holds `net.xml`."""
     shift_m: Float[np.ndarray, " 2"]
-    """Add this to a point around the site's middle to get the recording's frame."""
+    """Offset from coordinates around the site's centre to the recording's frame."""
     origin_utm_m: tuple[float, float]
     strips: list[Lanelet]
     corners: list[np.ndarray]
@@ -130,19 +138,17 @@ class Place:
 
     @property
     def lat_lon_deg(self) -> tuple[float, float]:
-        """Where in the world its middle is."""
+        """Latitude and longitude of the centre."""
         middle = self.shift_m[None] + np.array(self.origin_utm_m)
         lat, lon = to_degrees(middle)[0]
         return float(lat), float(lon)
 
     def write_picture(self, path: Path) -> None:
-        """Writes the background image."""
         width, height = (2.0 * half for half in self.site.half_size_m)
         image = draw(self.strips, self.corners, self.parking, self.trees, size_m=(width, height))
         write_picture(path, image)
 
     def write_map(self, path: Path) -> None:
-        """Writes the lanelet2 map."""
         lots = [np.concatenate([lot, lot[:1]]) for lot in self.parking]
         areas = [
             Area(subtype="parking", outer=(Border(line=lot, marking="virtual"),)) for lot in lots
@@ -151,7 +157,13 @@ class Place:
 
 
 def make_place(rng: np.random.Generator, site: Site, folder: Path) -> Place:
-    """Builds a site's roads in `folder` and lays them into a recording's frame."""
+    """Builds the roads of a site in `folder` and converts them to a recording's frame.
+
+    Args:
+        rng: draws the UTM origin and the trees.
+        site: the site.
+        folder: folder to create.
+    """
     folder.mkdir(parents=True)
     network = build_network(site, folder)
     shift = np.array([site.half_size_m[0], -site.half_size_m[1]])
@@ -184,7 +196,7 @@ def _moved(strip: Lanelet, shift: np.ndarray, speed_limit_mps: float) -> Lanelet
 def _trees(
     rng: np.random.Generator, strips: list[Lanelet], parking: np.ndarray, size_m: np.ndarray
 ) -> Float[np.ndarray, "trees 3"]:
-    """Trees [x, y, radius] on the grass, clear of roads, pavements and parking."""
+    """Trees [x, y, radius] on the grass, clear of roads, pavements and parking lots."""
     lots = [np.concatenate([lot, lot.mean(axis=0)[None]]) for lot in parking]
     taken = np.concatenate([*(strip.outline for strip in strips), *lots])
     spots = rng.uniform(0.0, 1.0, (60, 2)) * size_m * np.array([1.0, -1.0])

@@ -1,7 +1,7 @@
-"""What a place looks like before anybody drives: roads for netconvert, arms, parking.
+"""Sites: crossroads, T-junctions and roundabouts, drawn by seed, as input of netconvert.
 
-MERGED: Crossroads and T-junctions without signals; the main road has priority.
-MERGED: Roundabouts of one and two lanes; traffic circulates counter-clockwise and has priority.
+Junctions have no signals; the main road has priority. Traffic in roundabouts circulates
+counter-clockwise and has priority.
 """
 
 from dataclasses import dataclass, field
@@ -13,31 +13,42 @@ from scenarios.polylines import Polyline, bezier, clothoid_like, polar
 
 SIDEWALK_M = 2.0
 ARM_LENGTH_M = 130.0
-"""How far the roads reach; vehicles begin and end there, out of the picture."""
+"""Length of the roads; vehicles appear and disappear at their ends, outside the image."""
 
 SIGHT_M = 40.0
-"""From where a driver who must yield sees the others."""
+"""Distance from which a vehicle that must yield sees the others."""
+
+ENTRY_TILT_RAD = np.radians(8.0)
+"""Angle of an entry from the radius towards the direction of travel in the ring."""
+
+SWING_M = 0.8
+"""Additional width of the lanes near the ring, where long vehicles swing out."""
+
+LIMITS_MPS = (11.11, 13.89)
+
+CLOSE_MPS = 9.5
+"""Speed limit between the crossing and the ring."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Arm:
-    """One road that leads to the place."""
+    """A road that leads to a junction."""
 
     angle_rad: float
-    """Direction from the middle in which it leaves."""
+    """Direction from the centre."""
     enter: str
-    """Edge on which vehicles come."""
+    """Edge on which vehicles enter."""
     leave: str
-    """Edge on which they go."""
+    """Edge on which vehicles leave."""
     lanes: int
-    """How many lanes enter."""
+    """Number of lanes that enter."""
     weight: float
-    """How much traffic it has, relative to the others."""
+    """Share of the traffic, relative to the other arms."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Site:
-    """One place: plain XML for netconvert and what the other files need to know."""
+    """A junction with its arms: plain XML for netconvert, and its dimensions."""
 
     kind: str
     """`crossroads`, `t-junction`, `roundabout` or `two-lane-roundabout`."""
@@ -45,25 +56,25 @@ class Site:
     edges: str
     connections: str
     endpoint_shape: bool
-    """Whether the junctions end exactly where the edges' lines do."""
+    """Whether junctions end exactly where the lines of the edges end."""
     arms: tuple[Arm, ...]
     speed_limit_mps: float
     half_size_m: tuple[float, float]
-    """Half the width and half the height of the picture."""
+    """Half the width and half the height of the image."""
     parking: Float[np.ndarray, "lots 4 2"]
-    """Corners of the places for parked cars, beside the pavement."""
+    """Corners of the parking lots, beside the pavement."""
 
 
 def lane_xml(
-    index: int, width_m: float, speed_mps: float, *, feet: bool = False, change: bool = False
+    index: int, width_m: float, speed_mps: float, *, pedestrian: bool = False, change: bool = False
 ) -> str:
-    """One lane of an edge, for pedestrians or for everybody else.
+    """A lane of an edge, for pedestrians or for all other agents.
 
-    Nobody changes to the left; to the right only where `change` says so.
+    Lane changes to the left are not allowed; to the right only with `change`.
     """
-    who = 'allow="pedestrian"' if feet else 'disallow="pedestrian"'
+    access = 'allow="pedestrian"' if pedestrian else 'disallow="pedestrian"'
     stay = 'changeLeft="emergency"' if change else 'changeLeft="emergency" changeRight="emergency"'
-    return f'<lane index="{index}" {who} {stay} width="{width_m:.3f}" speed="{speed_mps:.3f}"/>'
+    return f'<lane index="{index}" {access} {stay} width="{width_m:.3f}" speed="{speed_mps:.3f}"/>'
 
 
 def edge_xml(
@@ -80,25 +91,25 @@ def edge_xml(
 ) -> str:
     """One direction of a road whose left border is `line`, with a sidewalk on its right."""
     shape = " ".join(f"{x:.3f},{y:.3f}" for x, y in line)
-    feet = lane_xml(0, SIDEWALK_M, 2.0, feet=True)
+    sidewalk = lane_xml(0, SIDEWALK_M, 2.0, pedestrian=True)
     drive = [lane_xml(1 + i, width_m, speed_mps, change=change) for i in range(lanes)]
     return (
         f'<edge id="{name}" from="{begin}" to="{end}" priority="{priority}" '
         f'numLanes="{1 + lanes}" speed="{speed_mps:.3f}" spreadType="right" '
-        f'shape="{shape}">{"".join([feet, *drive])}</edge>'
+        f'shape="{shape}">{"".join([sidewalk, *drive])}</edge>'
     )
 
 
 def node_xml(name: str, point: np.ndarray, **attributes: str | float) -> str:
-    """One node; further attributes as netconvert names them."""
+    """A node; further attributes are named as in netconvert."""
     more = "".join(f' {key}="{value}"' for key, value in attributes.items())
     return f'<node id="{name}" x="{point[0]:.3f}" y="{point[1]:.3f}"{more}/>'
 
 
 def connection_xml(begin: str, end: str, lane: int = 1) -> str:
-    """A way from a lane of one edge to the same lane of the next.
+    """A connection from a lane of one edge to the same lane of the next.
 
-    Without a distance of sight SUMO's drivers all but stop before they look for others.
+    Without a visibility distance SUMO's vehicles nearly stop before they check for others.
     """
     return (
         f'<connection from="{begin}" to="{end}" fromLane="{lane}" toLane="{lane}" '
@@ -114,7 +125,14 @@ def crossing_xml(node: str, edges: tuple[str, str]) -> str:
 def parking_lot(
     rng: np.random.Generator, line: Polyline, *, from_m: float, beside_m: float
 ) -> Float[np.ndarray, "4 2"]:
-    """A row of parking places right of an outgoing arm, `beside_m` from its middle."""
+    """Corners of a row of parking spaces to the right of an outgoing arm.
+
+    Args:
+        rng: draws the number of spaces.
+        line: the arm, points 2 m apart.
+        from_m: distance from the centre along the arm.
+        beside_m: distance from the line of the arm.
+    """
     at = int(from_m / 2.0)
     ahead = line[at + 1] - line[at]
     ahead = ahead / np.hypot(*ahead)
@@ -202,20 +220,9 @@ def _junction(
     )
 
 
-ENTRY_TILT_RAD = np.radians(8.0)
-"""How far an entry is turned from the radius towards the direction of travel in the ring."""
-
-
-SWING_M = 0.8
-"""How much wider the lanes are near the ring, where long vehicles swing."""
-LIMITS_MPS = (11.11, 13.89)
-CLOSE_MPS = 9.5
-"""How fast one drives between the crossing and the ring, at most."""
-
-
 @dataclass(frozen=True, slots=True, kw_only=True)
 class _Ring:
-    """The circulating lanes and what all arms have in common."""
+    """The circulating lanes, and what all arms have in common."""
 
     inner_m: float
     lanes: int
@@ -237,7 +244,7 @@ class _Ring:
 
 @dataclass(slots=True, kw_only=True)
 class _Plan:
-    """The parts of a site, as they are drawn."""
+    """The parts of a site while it is built."""
 
     nodes: list[str] = field(default_factory=list)
     edges: list[str] = field(default_factory=list)
@@ -247,7 +254,7 @@ class _Plan:
 
 
 def roundabout(rng: np.random.Generator) -> Site:
-    """One lane in the ring, three to five arms of one lane."""
+    """One lane in the ring; three to five arms of one lane."""
     arms = int(rng.choice([3, 4, 4, 5]))
     ring = _Ring(
         inner_m=rng.uniform(11.5, 14.5) + (3.0 if arms == 5 else 0.0),
@@ -261,7 +268,7 @@ def roundabout(rng: np.random.Generator) -> Site:
 
 
 def two_lane_roundabout(rng: np.random.Generator) -> Site:
-    """Two lanes in the ring; two opposite ones of the four arms enter with two lanes."""
+    """Two lanes in the ring; two opposite arms of the four enter with two lanes."""
     ring = _Ring(
         inner_m=rng.uniform(17.0, 21.0),
         lanes=2,
@@ -298,7 +305,7 @@ def _site(rng: np.random.Generator, kind: str, ring: _Ring) -> Site:
 
 
 def _add_ring_part(plan: _Plan, ring: _Ring, i: int, speed_mps: float) -> None:
-    """The ring from arm `i` to the next, and the ways past the arm."""
+    """Adds the ring from arm `i` to the next arm, and the connections past the arm."""
     arms = len(ring.angles_rad)
     angle, after = ring.angles_rad[i], ring.angles_rad[(i + 1) % arms]
     after = after + (2.0 * np.pi if i == arms - 1 else 0.0)
@@ -323,7 +330,7 @@ def _add_ring_part(plan: _Plan, ring: _Ring, i: int, speed_mps: float) -> None:
 
 
 def _add_arm(rng: np.random.Generator, plan: _Plan, ring: _Ring, i: int) -> None:
-    """Arm `i`: a road to a crossing, and entry and exit between that and the ring."""
+    """Adds arm `i`: a road to a crossing, and entry and exit between the crossing and the ring."""
     angle, outer_m = float(ring.angles_rad[i]), ring.outer_m
     line = clothoid_like(
         heading_rad=angle,
@@ -334,7 +341,7 @@ def _add_arm(rng: np.random.Generator, plan: _Plan, ring: _Ring, i: int) -> None
     split = round((outer_m + 17.0) / 2.0)
     far, near = line[split:], line[split]
     plan.nodes += [node_xml(f"k{i}", near, type="priority"), node_xml(f"e{i}", line[-1])]
-    # The left border of the entry bends towards the direction of the ring, the exit's away.
+    # The left border of the entry bends towards the direction of the ring, that of the exit away.
     mouth = [polar(outer_m + 3.0, angle + side * 2.0 / outer_m) for side in (1.0, -1.0)]
     into = bezier(near, angle + np.pi, mouth[0], angle + np.pi - ENTRY_TILT_RAD)
     away = bezier(mouth[1], angle + ENTRY_TILT_RAD, near, angle)

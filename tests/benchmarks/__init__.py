@@ -1,1 +1,1 @@
-"""Speeds, as ratios to a peer in the same run; run by hand, never as tests."""
+"""Benchmarks, which compare rates within one run. They are started by hand and are not tests."""

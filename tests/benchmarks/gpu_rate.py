@@ -1,8 +1,8 @@
-"""How fast a GPU trains at full size: `python -m tests.benchmarks.gpu_rate`.
+"""Training rate on a GPU at full size: `python -m tests.benchmarks.gpu_rate`.
 
-The `paper` preset of ssp-asp on 12x360x240 rasters, one epoch of Lightning's own loop with each
-precision, drawn by a thread or by processes. What a GPU waits for is the time between the end of a
-step's work there and the arrival of the next batch, told by events on its own clock.
+Trains ssp-asp by the recipe `paper` on 12x360x240 rasters for one epoch of Lightning's loop, with
+each precision and with batches that a thread or processes load. The waiting time of the GPU is the
+time between the end of a step and the arrival of the next batch, measured by CUDA events.
 """
 
 import dataclasses
@@ -23,46 +23,44 @@ from asp_env import registry
 from asp_env.data.snippets import index_snippets
 from asp_env.data.source import open_data
 from asp_env.views import make_view
-from predictors.inference.checkpoint import shape_for
-from predictors.models.network import LearnedPlug
+from predictors.inference.checkpoint import PredictorSpec, shape_for
 from predictors.training.data import Batches
 from predictors.training.data_loading import batch_workers
-from predictors.training.lightning_parts import Fit
+from predictors.training.lightning_parts import TrainingModule
 from predictors.training.recipes import TrainingConfig, recipe
 from predictors.training.trainer import Hardware, make_trainer, quiet
 
 WARM_UP = 20
-"""Steps that do not count."""
+"""Steps that are not measured."""
 
 
-class Clock(pl.Callback):
-    """Marks when each step's batch has come and when its work is done."""
+class StepTimer(pl.Callback):
+    """Records when the batch of each step arrives and when the step ends."""
 
     def __init__(self) -> None:
-        """No marks yet."""
-        self.come: list[Any] = []
-        self.done: list[Any] = []
+        self.starts: list[Any] = []
+        self.ends: list[Any] = []
 
     def on_train_batch_start(self, *args: Any, **kwargs: Any) -> None:
-        """The batch has been asked to be copied."""
+        """Follows the copy of the batch in the CUDA stream."""
         del args, kwargs
-        self.come.append(_mark())
+        self.starts.append(_now())
 
     def on_train_batch_end(self, *args: Any, **kwargs: Any) -> None:
-        """All of the step's work has been asked for."""
+        """Follows the work of the step in the CUDA stream."""
         del args, kwargs
-        self.done.append(_mark())
+        self.ends.append(_now())
 
-    def found(self) -> tuple[float, float]:
-        """Seconds of a step, and of its waiting; means after the warm-up."""
+    def means_s(self) -> tuple[float, float]:
+        """Mean duration of a step and of the waiting in it after the warm-up, s."""
         if torch.cuda.is_available():
             torch.cuda.synchronize()
-        come, done = self.come[WARM_UP:], self.done[WARM_UP:]
-        waits = [_between(*pair) for pair in zip(done[:-1], come[1:], strict=True)]
-        return _between(done[0], done[-1]) / len(waits), float(np.mean(waits))
+        starts, ends = self.starts[WARM_UP:], self.ends[WARM_UP:]
+        waits = [_seconds(*pair) for pair in zip(ends[:-1], starts[1:], strict=True)]
+        return _seconds(ends[0], ends[-1]) / len(waits), float(np.mean(waits))
 
 
-def _mark() -> Any:
+def _now() -> Any:
     if not torch.cuda.is_available():
         return time.perf_counter()
     event = torch.cuda.Event(enable_timing=True)
@@ -70,41 +68,41 @@ def _mark() -> Any:
     return event
 
 
-def _between(first: Any, last: Any) -> float:
+def _seconds(first: Any, last: Any) -> float:
     return first.elapsed_time(last) / 1e3 if torch.cuda.is_available() else last - first
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class GpuRate:
-    """Measures and prints a table."""
+    """Measure the training rate for each precision and number of workers."""
 
     data: Annotated[str, tyro.conf.Positional] = "sample:intersection"
-    """What is learned from."""
+    """DATA to train on."""
     predictor: str = "ssp-asp"
-    """Which one."""
+    """The predictor."""
     view: str = "chauffeurnet"
-    """What it looks at."""
-    preset: str = "paper"
-    """Its recipe."""
+    """The view of the predictor."""
+    recipe: str = "paper"
+    """How the predictor is trained."""
     precisions: tuple[Literal["32-true", "bf16-mixed"], ...] = ("32-true", "bf16-mixed")
-    """Of the encoder."""
-    drawing: tuple[int, ...] = (0, 4)
-    """Processes that draw; 0 is a thread."""
+    """Precisions of the encoder."""
+    num_workers: tuple[int, ...] = (0, 4)
+    """Numbers of processes that load batches; 0 stands for a thread."""
     batch_size: int = 32
-    """Snippets at once."""
+    """Snippets per batch."""
     steps: int = 120
-    """Of each trial, warm-up included."""
+    """Steps of each trial, warm-up included."""
 
     def run(self) -> None:
-        """Prints the rates of all trials."""
+        """Runs all trials and prints a table."""
         torch.set_num_threads(1)
-        told = torch.cuda.get_device_name() if torch.cuda.is_available() else "CPU"
+        device = torch.cuda.get_device_name() if torch.cuda.is_available() else "CPU"
         table = Table(
-            "precision", "drawn by", "samples/s", "ms a step", "waiting",
-            title=f"{self.predictor} {self.preset} {self.view} on {told}",
+            "precision", "loaded by", "samples/s", "ms per step", "waiting",
+            title=f"{self.predictor} {self.recipe} {self.view} on {device}",
         )  # fmt: skip
         for precision in self.precisions:
-            for processes in self.drawing:
+            for processes in self.num_workers:
                 step_s, waiting_s = self._trial(precision, processes)
                 table.add_row(
                     precision,
@@ -116,7 +114,7 @@ class GpuRate:
         Console().print(table)
 
     def _trial(self, precision: Any, processes: int) -> tuple[float, float]:
-        config = recipe(self.predictor, self.preset, view=self.view, horizon_s=3.0)
+        config = recipe(self.predictor, self.recipe, view=self.view, horizon_s=3.0)
         config = dataclasses.replace(
             config,
             precision=precision,
@@ -125,25 +123,27 @@ class GpuRate:
             pretraining_epochs=0,
         )
         training, validation, network = self._parts(config)
-        clock = Clock()
+        timer = StepTimer()
         with (
             tempfile.TemporaryDirectory() as out,
-            batch_workers([training.drawing], processes) as crew,
+            batch_workers([training.source], processes) as crew,
             quiet(),
         ):
             if crew is not None:
-                training = training.drawn_by(crew, 0)
+                training = training.with_workers(crew, 0)
             trainer = make_trainer(
-                config, Hardware(), out=Path(out), started="trial", callbacks=[clock]
+                config, Hardware(), out=Path(out), started="trial", callbacks=[timer]
             )
-            trainer.fit(Fit(network, config=config, training=training, validation=validation))
-        return clock.found()
+            trainer.fit(
+                TrainingModule(network, config=config, training=training, validation=validation)
+            )
+        return timer.means_s()
 
     def _parts(self, config: TrainingConfig) -> tuple[Batches, Batches, Any]:
-        """As many snippets as steps need, some more than once, and a network."""
+        """Batches for training, which may repeat snippets, for validation, and a network."""
         view = make_view(config.view, pixels=config.pixels)
         shape = shape_for(view, history=15, horizon=15, dt_s=0.2, action_range=(4.0, 0.5))
-        plug: LearnedPlug = registry.find("predictors", self.predictor)
+        plug: PredictorSpec = registry.find("predictors", self.predictor)
         network = plug.network(config.network, shape)
         recordings = open_data(self.data)
         index = index_snippets(recordings, dt_s=0.2, horizon_s=3.0)

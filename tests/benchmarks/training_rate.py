@@ -1,7 +1,7 @@
-"""How fast ssp-asp trains on vectors and on pictures: `python -m tests.benchmarks.training_rate`.
+"""Training rate of ssp-asp on vectors and rasters: `python -m tests.benchmarks.training_rate`.
 
-Each step draws its batch (now and at the end of the segment), encodes both, and goes back; batches
-of 32 under bf16, on one thread, in turns within one run.
+A step draws a batch of 32 snippets (at the present and at the end of the segment), then runs the
+forward and the backward pass in bf16 on one thread. The networks take turns within one run.
 """
 
 import dataclasses
@@ -17,9 +17,9 @@ from asp_env import registry
 from asp_env.data.snippets import index_snippets
 from asp_env.data.source import open_data
 from asp_env.views import make_view
-from predictors.inference.checkpoint import shape_for
+from predictors.inference.checkpoint import PredictorSpec, shape_for
 from predictors.models.batch import Batch, Labels
-from predictors.models.network import AbstractNetwork, LearnedPlug, TrainingProgress
+from predictors.models.network import AbstractNetwork, TrainingProgress
 from predictors.training.data import Batches
 from predictors.training.recipes import recipe
 
@@ -36,7 +36,7 @@ TRIALS = (
 
 
 class Trial(NamedTuple):
-    """One network and its data."""
+    """A network with its optimizer and a batch."""
 
     name: str
     network: AbstractNetwork
@@ -44,7 +44,7 @@ class Trial(NamedTuple):
     batches: Batches
 
     def step(self) -> float:
-        """Seconds that one step takes, its drawing included."""
+        """Duration of a training step with data loading, s."""
         begin = time.perf_counter()
         for batch, labels in self.batches:
             self._learn(batch, labels)
@@ -59,11 +59,11 @@ class Trial(NamedTuple):
 
 
 def make_trial(view_name: str, encoder: str, pixels: tuple[int, int] | None) -> Trial:
-    """A network of the small recipe with another encoder, and one batch."""
+    """A network of the recipe `cpu` with a given encoder."""
     config = recipe("ssp-asp", "cpu", view=view_name, horizon_s=3.0)
     view = make_view(view_name, pixels=pixels)
     shape = shape_for(view, history=15, horizon=15, dt_s=0.2, action_range=(4.0, 0.5))
-    plug: LearnedPlug = registry.find("predictors", "ssp-asp")
+    plug: PredictorSpec = registry.find("predictors", "ssp-asp")
     network = plug.network(dataclasses.replace(config.network, encoder=encoder), shape)
     recordings = open_data(DATA)
     index = index_snippets(recordings, dt_s=0.2, horizon_s=3.0)
@@ -81,7 +81,7 @@ def make_trial(view_name: str, encoder: str, pixels: tuple[int, int] | None) -> 
 
 
 def main() -> None:
-    """Prints medians over rounds, and how many times as fast vectors are."""
+    """Prints the median rates, and the rate of vectors relative to each."""
     torch.set_num_threads(1)
     torch.manual_seed(0)
     trials = [make_trial(*trial) for trial in TRIALS]
@@ -89,7 +89,7 @@ def main() -> None:
         trial.step()
     seconds = np.array([[trial.step() for trial in trials] for _ in range(ROUNDS)])
     rates = BATCH / np.median(seconds, axis=0)
-    table = Table("ssp-asp, 3 s", "samples/s", "vectors are … times as fast")
+    table = Table("ssp-asp, 3 s", "samples/s", "vectors / this")
     for trial, rate in zip(trials, rates, strict=True):
         table.add_row(trial.name, f"{rate:,.0f}", f"{rates[0] / rate:.1f}")
     Console().print(table)

@@ -1,1 +1,1 @@
-"""One suite per socket, over everything that its registry knows."""
+"""One suite per socket, over all plugs of its registry."""

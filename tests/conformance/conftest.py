@@ -1,4 +1,4 @@
-"""Predictors by case."""
+"""Fixtures for the suite of predictors."""
 
 from pathlib import Path
 
@@ -10,7 +10,7 @@ from tests.conformance.predictor_cases import Case
 
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Where random weights are kept."""
+    """The folder of runs with random weights."""
     return tmp_path_factory.mktemp("runs")
 
 

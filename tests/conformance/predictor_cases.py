@@ -1,8 +1,8 @@
-"""Every predictor as the conformance suite tries it, and the situations that it is asked about.
+"""The predictors under test, and the situations that they forecast.
 
-Each that can be trained is tried on pictures and on vectors, with random weights, and what chains
-segments with every chaining at 6 s; so are the recipes `ours`, on vectors. A predictor is tried by
-being registered, and in the recipes if it is trained.
+All registered predictors are tested. Trained ones have random weights and read pictures or vectors;
+those that chain segments are tested with every chaining at 6 s. The recipes `ours` are tested on
+vectors.
 """
 
 from functools import cache
@@ -34,28 +34,28 @@ RECORDING = make_recording()
 
 
 class Case(NamedTuple):
-    """One predictor as it is tried."""
+    """One predictor under test."""
 
     name: str
     view: str = ""
-    """Of learned ones."""
+    """View of a trained predictor."""
     chaining: str = ""
-    """Of those that chain segments."""
+    """Chaining of a predictor that chains segments."""
     preset: str = ""
-    """Of those whose recipe is not `cpu`."""
+    """Recipe, by default `cpu`."""
 
     @property
     def horizon(self) -> int:
-        """Ticks that it forecasts."""
+        """Ticks of the forecast."""
         return 2 * SEGMENT if self.chaining else SEGMENT
 
     @property
     def label(self) -> str:
-        """What the test is called."""
+        """Id of the test."""
         return "-".join(part for part in self if part)
 
     def save(self, folder: Path, *, seed: int = 0) -> str:
-        """Its full name, after a folder with random weights is written if it needs one."""
+        """The full name; a folder with random weights is written if the predictor needs one."""
         if not self.view:
             return self.name
         run = folder / self.label
@@ -70,21 +70,21 @@ ONE_SEGMENT = tuple(Case(name, view) for name in RECIPES for view in VIEWS)
 CHAINED = tuple(Case("ssp-asp", "vectors", chaining) for chaining in CHAININGS)
 OURS = tuple(Case(name, "vectors", preset="ours") for name, of in RECIPES.items() if "ours" in of)
 OURS_CHAINED = tuple(Case("ssp-asp", "vectors", chaining, "ours") for chaining in CHAININGS)
-LEARNED = ONE_SEGMENT + CHAINED + OURS + OURS_CHAINED
+TRAINED = ONE_SEGMENT + CHAINED + OURS + OURS_CHAINED
 
 
-def tried(cases: tuple[Case, ...]) -> pytest.MarkDecorator:
-    """Once with each of the cases' predictors."""
+def with_predictors(cases: tuple[Case, ...]) -> pytest.MarkDecorator:
+    """Runs a test once with each predictor."""
     labels = [case.label for case in cases]
     return pytest.mark.parametrize("predictor", cases, ids=labels, indirect=True)
 
 
-every = tried(PHYSICAL + LEARNED)
+every = with_predictors(PHYSICAL + TRAINED)
 
 
 @cache
 def snippets(horizon: int) -> SnippetIndex:
-    """All snippets with so long a future."""
+    """All snippets with a future of this many ticks."""
     return index_snippets([RECORDING], dt_s=0.2, horizon_s=horizon * 0.2)
 
 
@@ -94,8 +94,8 @@ def situations(predictor: Predictor, recording: Recording = RECORDING) -> tuple[
     return gather_scene([recording], index), gather_future([recording], index)
 
 
-def everybody(predictor: Predictor) -> tuple[Scene, Future]:
-    """Scene and future with every slot of every situation as a target, absent ones too."""
+def all_slots(predictor: Predictor) -> tuple[Scene, Future]:
+    """Scene and future with every slot of every situation as a target, also absent agents."""
     scene, _ = situations(predictor)
     targets = np.argwhere(np.ones(scene.ids.shape, dtype=bool))
     states = np.zeros((len(targets), predictor.horizon, 4), dtype=np.float32)
@@ -103,13 +103,13 @@ def everybody(predictor: Predictor) -> tuple[Scene, Future]:
     return scene.with_targets(targets), Future(states=states, valid=valid)
 
 
-def ask(predictor: Predictor, scene: Scene, future: Future) -> Forecast:
-    """The forecast; only privileged predictors are handed a future."""
+def predict(predictor: Predictor, scene: Scene, future: Future) -> Forecast:
+    """The forecast; only privileged predictors get the future."""
     return predictor.predict(scene, future if predictor.privileged else None)
 
 
 def assert_same(one: Forecast, other: Forecast, rows: np.ndarray | None = None) -> None:
-    """Equal bit for bit, where the second one's rows are in another order if given."""
+    """Asserts equal bits; `rows` reorders the first forecast."""
     order = np.arange(len(one.ids)) if rows is None else rows
     for field in ("states", "actions", "actions_valid", "log_probs", "valid", "ids", "tick"):
         np.testing.assert_array_equal(getattr(one, field)[order], getattr(other, field), field)

@@ -1,9 +1,10 @@
-"""What holds of every driver: those of the registry, and tables of several."""
+"""Laws of every driver: those of the registry, tables of several, and one with a network."""
 
 import copy
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cache
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -16,16 +17,17 @@ from asp_env.errors import AspEnvError
 from asp_env.sim.simulation import Simulation
 from asp_env.sim.traffic import Driver, DriverPlug
 from asp_env.sim.traffic.assignment import make_traffic
-from asp_env.sim.traffic.driver import vehicles
-from asp_env.sim.world import ReplayWorld, World, world_of
+from asp_env.sim.traffic.driver import controllable_agents
+from asp_env.sim.world import ReplayWorld, World, world_class
 from tests.builders import make_recording
+from tests.conformance.predictor_cases import Case
 from tests.highway_folders import highway_recordings
-from tests.sim.worlds import DT_S, HISTORY, scenario, simulate
+from tests.sim.worlds import DT_S, HISTORY, replay, scenario, simulate
 
 ARGUMENTS = {
     "predictor": ("constant-turn-rate", "every=3:mode=sampled:constant-velocity", "oracle")
 }
-"""Behind the colon, for drivers that need an argument."""
+"""Arguments of the drivers that need one."""
 
 NAMES = tuple(
     f"{name}:{argument}" if argument else name
@@ -37,17 +39,17 @@ OWN_TABLE = "default=own,3=policy,8=idm,2=log-actions,4=predictor:constant-veloc
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Stage:
-    """Four episodes, and who can drive in them."""
+class DriverCase:
+    """Four episodes in one world."""
 
     recordings: Sequence[Any]
     scenarios: list[Scenario]
-    kind: type[World] = ReplayWorld
+    world_class: type[World] = ReplayWorld
     steps: int = 30
 
 
-def _made_up() -> Stage:
-    return Stage(
+def _synthetic() -> DriverCase:
+    return DriverCase(
         recordings=[make_recording(), make_recording(name="01", seed=1, duration_s=16.0)],
         scenarios=[
             scenario(1, start=15, length=24),
@@ -58,14 +60,14 @@ def _made_up() -> Stage:
     )
 
 
-def _sample() -> Stage:
+def _sample() -> DriverCase:
     recordings = list(open_data("sample:intersection"))
     found = find_scenarios(recordings, source="sample", dt_s=DT_S, history=HISTORY)
-    return Stage(recordings=recordings, scenarios=[found[i] for i in (0, 9, 21, 33)])
+    return DriverCase(recordings=recordings, scenarios=[found[i] for i in (0, 9, 21, 33)])
 
 
-def _highway() -> Stage:
-    return Stage(
+def _highway() -> DriverCase:
+    return DriverCase(
         recordings=highway_recordings("roundabout"),
         scenarios=[
             scenario(7, start=115, length=10),
@@ -73,58 +75,58 @@ def _highway() -> Stage:
             scenario(2, start=20, length=12),
             scenario(9, start=130, length=40, recording=1),
         ],
-        kind=world_of("highway:"),
+        world_class=world_class("highway:"),
         steps=14,
     )
 
 
-STAGES = {"sample": _sample, "highway": _highway, "made up": _made_up}
-"""From larger scenes to smaller ones."""
+DRIVER_CASES = {"sample": _sample, "highway": _highway, "synthetic": _synthetic}
+"""From larger to smaller scenes."""
 
-REFUSED = {"sample": {"own"}, "made up": {"own"}, "highway": {"log", "hybrid"}}
-"""By whom nobody can be driven there."""
+REFUSED = {"sample": {"own"}, "synthetic": {"own"}, "highway": {"log", "hybrid"}}
+"""Drivers that do not fit the world of each case."""
 
 
 @cache
-def _stage(name: str) -> Stage:
-    return STAGES[name]()
+def _case(name: str) -> DriverCase:
+    return DRIVER_CASES[name]()
 
 
-def _traffics(stage: str) -> list[str]:
-    """Everybody who drives there, and a table of several."""
-    table = OWN_TABLE if stage == "highway" else REPLAY_TABLE
-    return [*(name for name in NAMES if name not in REFUSED[stage]), table]
+def _traffics(case: str) -> list[str]:
+    """The drivers that fit the world of a case, and a table of several."""
+    table = OWN_TABLE if case == "highway" else REPLAY_TABLE
+    return [*(name for name in NAMES if name not in REFUSED[case]), table]
 
 
 every = pytest.mark.parametrize(
-    ("traffic", "stages"),
+    ("traffic", "cases"),
     [
         pytest.param(
-            traffic, [stage for stage in STAGES if traffic in _traffics(stage)], id=traffic
+            traffic, [case for case in DRIVER_CASES if traffic in _traffics(case)], id=traffic
         )
         for traffic in (*NAMES, REPLAY_TABLE, OWN_TABLE)
     ],
 )
-anywhere = pytest.mark.parametrize(
-    ("stage", "traffic"),
+every_in_every_case = pytest.mark.parametrize(
+    ("case", "traffic"),
     [
-        pytest.param(stage, traffic, id=f"{stage}-{traffic}")
-        for stage in STAGES
-        for traffic in _traffics(stage)
+        pytest.param(case, traffic, id=f"{case}-{traffic}")
+        for case in DRIVER_CASES
+        for traffic in _traffics(case)
     ],
 )
 
 
-def _begin(stage: Stage, traffic: str | Driver, *numbers: int) -> Simulation:
-    """Some of its episodes, by default all, that have just begun."""
-    scenarios = [stage.scenarios[i] for i in numbers or range(4)]
-    simulation = simulate(stage.recordings, scenarios, traffic, stage.kind)
+def _begin(case: DriverCase, traffic: str | Driver, *numbers: int) -> Simulation:
+    """Some of its episodes, by default all, that have just started."""
+    scenarios = [case.scenarios[i] for i in numbers or range(4)]
+    simulation = simulate(case.recordings, scenarios, traffic, case.world_class)
     simulation.reset(scenarios, [np.random.default_rng(each.ego_id) for each in scenarios])
     return simulation
 
 
 def _action(episode: int, tick: int) -> np.ndarray:
-    """Some egos brake, some swerve, all differently."""
+    """A different action for each ego and tick."""
     rng = np.random.default_rng([episode, tick])
     low, high = np.array([-3.0, -0.1]), np.array([2.0, 0.1])
     return rng.uniform(low, high).astype(np.float32)
@@ -135,16 +137,16 @@ def _step(simulation: Simulation, tick: int, episodes: list[int]) -> None:
     simulation.step(actions, np.ones(len(episodes), dtype=bool))
 
 
-def _told(simulation: Simulation, row: int) -> bytes:
+def _bits(simulation: Simulation, row: int) -> bytes:
     episodes, tick = simulation.world.episodes, int(simulation.world.now[row])
     agents = int((episodes.ids[row] >= 0).sum())
-    kept = episodes.states[row, : tick + 1, :agents], episodes.valid[row, : tick + 1, :agents]
-    return b"".join(each.tobytes() for each in kept)
+    arrays = episodes.states[row, : tick + 1, :agents], episodes.valid[row, : tick + 1, :agents]
+    return b"".join(each.tobytes() for each in arrays)
 
 
 @pytest.mark.parametrize("name", registry.names("drivers"))
-def test_the_registry_holds_plugs_of_drivers(name):
-    """Each makes a driver from its name, and refuses an argument that makes no sense."""
+def test_is_a_driver_plug(name):
+    """Each creates a driver from its name, and refuses an invalid argument."""
     plug: DriverPlug = registry.find("drivers", name)
     assert isinstance(plug, DriverPlug)
     for argument in ARGUMENTS.get(name, ("",)):
@@ -154,105 +156,140 @@ def test_the_registry_holds_plugs_of_drivers(name):
 
 
 @pytest.mark.parametrize(
-    ("stage", "traffic"), [(stage, name) for stage in STAGES for name in sorted(REFUSED[stage])]
+    ("case", "traffic"), [(case, name) for case in DRIVER_CASES for name in sorted(REFUSED[case])]
 )
-def test_who_cannot_drive_there_is_refused(stage, traffic):
-    """In one line that names who can; so are tables that leave somebody to it."""
+def test_drivers_that_do_not_fit_the_world_are_refused(case, traffic):
+    """In one line that names drivers that fit; also within a table."""
     for spec in (traffic, f"default=idm,car={traffic}"):
         with pytest.raises(AspEnvError, match=rf"^traffic {traffic}: [^\n]* use [^\n]*idm[^\n]*$"):
-            _begin(_stage(stage), spec)
+            _begin(_case(case), spec)
 
 
-@anywhere
-def test_a_driver_says_nothing_of_others(stage, traffic):
-    """Its actions are finite and within limits, 0 for whom it does not drive, and its own alone."""
-    simulation = _begin(_stage(stage), traffic)
+@every_in_every_case
+def test_controls_are_valid(case, traffic):
+    """Actions are finite and within limits, and zero for agents that are not controlled."""
+    simulation = _begin(_case(case), traffic)
     world, limits = simulation.world, np.array([5.0, np.pi / 4]) + 1e-6
-    logged = traffic.startswith("log-actions") or "log-actions" in traffic
-    for tick in range(_stage(stage).steps):
+    recorded = "log-actions" in traffic
+    for tick in range(_case(case).steps):
         control = copy.deepcopy(simulation.driver).control(world)
         assert control.actions.shape == (*world.episodes.ids.shape, 2)
         assert control.actions.dtype == np.float32
         assert np.isfinite(control.actions).all()
-        assert logged or (np.abs(control.actions) <= limits).all()
-        assert not control.actions[~control.driven & ~control.leaving].any()
-        assert not (control.driven & control.leaving).any()
-        assert not ((control.driven | control.leaving) & ~vehicles(world)).any()
+        assert recorded or (np.abs(control.actions) <= limits).all()
+        assert not control.actions[~control.controlled & ~control.leaving].any()
+        assert not (control.controlled & control.leaving).any()
+        assert not ((control.controlled | control.leaving) & ~controllable_agents(world)).any()
         _step(simulation, tick, [0, 1, 2, 3])
     assert np.isfinite(world.episodes.states).all()
 
 
-@anywhere
-def test_episodes_do_not_know_of_each_other(stage, traffic):
-    """Five at once are bit for bit the five alone."""
+@every_in_every_case
+def test_episodes_are_independent(case, traffic):
+    """Five episodes in a batch are bit for bit the same as each on its own."""
     order = [0, 1, 2, 3, 0]
-    together = _begin(_stage(stage), traffic, *order)
-    alone = [_begin(_stage(stage), traffic, i) for i in order]
-    for tick in range(_stage(stage).steps):
+    together = _begin(_case(case), traffic, *order)
+    alone = [_begin(_case(case), traffic, i) for i in order]
+    for tick in range(_case(case).steps):
         _step(together, tick, order)
         for single, number in zip(alone, order, strict=True):
             _step(single, tick, [number])
     for row, single in enumerate(alone):
-        assert _told(together, row) == _told(single, 0)
+        assert _bits(together, row) == _bits(single, 0)
 
 
-@anywhere
-def test_a_reset_of_some_disturbs_no_others(stage, traffic):
-    """Row 1 begins anew with a scenario of another size; it is then as if it were alone."""
-    scenarios = _stage(stage).scenarios
-    disturbed, left_alone = (_begin(_stage(stage), traffic, 2, 0, 1) for _ in range(2))
-    fresh = _begin(_stage(stage), traffic, 3)
-    for tick in range(_stage(stage).steps):
+@every_in_every_case
+def test_a_reset_touches_only_the_chosen_rows(case, traffic):
+    """Row 1 restarts with a scenario of another size, and equals a new episode of it."""
+    scenarios = _case(case).scenarios
+    partly_reset, undisturbed = (_begin(_case(case), traffic, 2, 0, 1) for _ in range(2))
+    fresh = _begin(_case(case), traffic, 3)
+    for tick in range(_case(case).steps):
         if tick == 7:
-            where = np.array([False, True, False])
+            reset_mask = np.array([False, True, False])
             rngs = [np.random.default_rng(scenarios[3].ego_id)] * 3
-            disturbed.reset([scenarios[0], scenarios[3], scenarios[0]], rngs, where)
-        _step(left_alone, tick, [2, 0, 1])
-        _step(disturbed, tick, [2, 0 if tick < 7 else 3, 1])
+            partly_reset.reset([scenarios[0], scenarios[3], scenarios[0]], rngs, reset_mask)
+        _step(undisturbed, tick, [2, 0, 1])
+        _step(partly_reset, tick, [2, 0 if tick < 7 else 3, 1])
         if tick >= 7:
             _step(fresh, tick, [3])
-    assert _told(disturbed, 0) == _told(left_alone, 0)
-    assert _told(disturbed, 2) == _told(left_alone, 2)
-    assert _told(disturbed, 1) == _told(fresh, 0)
+    assert _bits(partly_reset, 0) == _bits(undisturbed, 0)
+    assert _bits(partly_reset, 2) == _bits(undisturbed, 2)
+    assert _bits(partly_reset, 1) == _bits(fresh, 0)
 
 
-@anywhere
-def test_a_snapshot_brings_back_what_a_driver_remembers(stage, traffic):
-    """Taken amid the episodes and restored twice, another reset in between: the same bits."""
-    scenarios = _stage(stage).scenarios
-    simulation = _begin(_stage(stage), traffic)
+@every_in_every_case
+def test_a_snapshot_restores_the_memory_of_a_driver(case, traffic):
+    """Restored twice, with a reset in between: the same bits."""
+    scenarios = _case(case).scenarios
+    simulation = _begin(_case(case), traffic)
     for tick in range(8):
         _step(simulation, tick, [0, 1, 2, 3])
     snapshot = simulation.snapshot()
     runs = []
     for _ in range(3):
-        for tick in range(8, _stage(stage).steps):
+        for tick in range(8, _case(case).steps):
             _step(simulation, tick, [0, 1, 2, 3])
-        runs.append([_told(simulation, row) for row in range(4)])
-        where = np.array([True, False, False, True])
-        simulation.reset([scenarios[1]] * 4, [np.random.default_rng(5)] * 4, where)
+        runs.append([_bits(simulation, row) for row in range(4)])
+        reset_mask = np.array([True, False, False, True])
+        simulation.reset([scenarios[1]] * 4, [np.random.default_rng(5)] * 4, reset_mask)
         simulation.restore(snapshot)
     assert runs[0] == runs[1] == runs[2]
 
 
 @every
-def test_a_driver_can_go_on_to_another_world(traffic, stages):
-    """What it remembers of a larger one, or of one that reacts, does not show."""
+def test_a_driver_can_be_used_in_another_world(traffic, cases):
+    """Its memory of other worlds has no effect."""
     driver = make_traffic(traffic)
-    for stage in (*stages, stages[0]):
-        used, fresh = _begin(_stage(stage), driver), _begin(_stage(stage), traffic)
+    for case in (*cases, cases[0]):
+        used, fresh = _begin(_case(case), driver), _begin(_case(case), traffic)
         for tick in range(10):
             _step(used, tick, [0, 1, 2, 3])
             _step(fresh, tick, [0, 1, 2, 3])
-        assert [_told(used, row) for row in range(4)] == [_told(fresh, row) for row in range(4)]
+        assert [_bits(used, row) for row in range(4)] == [_bits(fresh, row) for row in range(4)]
 
 
 @every
-def test_a_copy_shares_what_never_changes(traffic, stages):
-    """Neither recordings nor predictors nor paths are copied: no object of theirs is met."""
-    simulation = _begin(_stage(stages[-1]), traffic)
+def test_a_copy_shares_what_never_changes(traffic, cases):
+    """Recordings, predictors and paths are not copied."""
+    simulation = _begin(_case(cases[-1]), traffic)
     memo: dict[int, object] = {}
     copy.deepcopy(simulation.driver, memo)
     kinds = {type(each).__name__ for each in memo.values()}
     assert not kinds & {"Recording", "RoadMap", "Paths", "Conflicts", "Recordings"}
     assert not {kind for kind in kinds if "Velocity" in kind or "Turn" in kind or kind == "Oracle"}
+
+
+NETWORK_SCENARIOS = [scenario(1, start=20, length=20), scenario(3, start=30, length=20)]
+
+
+def _run_network(traffic: str, scenarios: list) -> np.ndarray:
+    simulation = Simulation(
+        [make_recording()],
+        make_traffic(traffic),
+        num_episodes=len(scenarios),
+        dt_s=DT_S,
+        history=HISTORY,
+    )
+    simulation.reset(scenarios, [np.random.default_rng(3) for _ in scenarios])
+    replay(simulation, 19)
+    snapshot = simulation.snapshot()
+    replay(simulation, 1)
+    after = simulation.world.episodes.states.copy()
+    simulation.restore(snapshot)
+    replay(simulation, 1)
+    assert simulation.world.episodes.states.tobytes() == after.tobytes()
+    return after
+
+
+def test_a_driver_with_a_network(folder: Path):
+    """Random weights: finite and repeatable; alone and in a batch the same within 1 cm."""
+    name = Case("ffw-asp", "vectors").save(folder)
+    traffic = f"default=log,car=predictor:every=3:mode=sampled:{name}"
+    together = _run_network(traffic, NETWORK_SCENARIOS)
+    assert np.isfinite(together).all()
+    assert together.tobytes() == _run_network(traffic, NETWORK_SCENARIOS).tobytes()
+    for row, each in enumerate(NETWORK_SCENARIOS):
+        alone = _run_network(traffic, [each])
+        difference = together[row, :, : alone.shape[2], :2] - alone[0, :, :, :2]
+        assert np.abs(difference).max() < 0.01

@@ -1,4 +1,4 @@
-"""What holds of every planner that is registered."""
+"""Laws of every registered planner."""
 
 import dataclasses
 
@@ -13,7 +13,7 @@ from asp_env.dynamics import MAX_ACCELERATION_MPS2, MAX_STEERING_RAD, rollout
 from asp_env.errors import AspEnvError
 from asp_env.planning.planner import Plan, Planner, load_planner
 from tests.builders import make_recording
-from tests.planning.situations import STEPS, straight_on
+from tests.planning.situations import STEPS, straight_ahead
 from tests.sim.worlds import drive, scenario, simulate
 
 PLANNERS = [name for name in registry.names("planners") if not load_planner(name).privileged]
@@ -22,17 +22,17 @@ EGOS = [scenario(1), scenario(2, start=40), scenario(3, start=25), scenario(4, r
 
 @pytest.fixture(scope="module")
 def scene() -> Scene:
-    """Four situations of a busy crossing in two recordings, a few steps into their episodes."""
+    """Four situations in two recordings, a few steps after their start."""
     simulation = simulate([make_recording(), make_recording(name="01", seed=3)], EGOS)
     drive(simulation, [(0.5, 0.01)] * 4)
     return simulation.world.scene()
 
 
 def _situation(scene: Scene, b: int) -> Scene:
-    """One of the situations alone, without padding that only the others need."""
+    """One situation on its own, without the padding of the others."""
     agents = int(np.flatnonzero(scene.valid[b].any(axis=-1)).max()) + 1
     points = int(scene.route_valid[b].sum())
-    mine = scene.targets[scene.targets[:, 0] == b] * [0, 1]
+    targets = scene.targets[scene.targets[:, 0] == b] * [0, 1]
     return dataclasses.replace(
         scene,
         **{
@@ -40,7 +40,7 @@ def _situation(scene: Scene, b: int) -> Scene:
             for name in ("states", "actions", "valid", "sizes", "classes", "ids")
         },
         tick=scene.tick[b : b + 1],
-        targets=mine,
+        targets=targets,
         route=scene.route[b : b + 1, :points],
         route_valid=scene.route_valid[b : b + 1, :points],
         map_index=scene.map_index[b : b + 1],
@@ -54,7 +54,6 @@ def _equal(first: Plan, second: Plan) -> bool:
 
 @pytest.mark.parametrize("name", registry.names("planners"))
 def test_is_a_planner(name):
-    """Has what the socket asks for, and the name it is registered under."""
     planner = load_planner(name)
     assert isinstance(planner, Planner)
     assert planner.name == name
@@ -63,16 +62,15 @@ def test_is_a_planner(name):
 
 
 @pytest.mark.parametrize("name", set(registry.names("planners")) - set(PLANNERS))
-def test_privileged_planners_are_never_asked(name, scene):
-    """Whoever follows the log is not given one, and refuses to plan in one line."""
+def test_privileged_planners_refuse_to_plan(name, scene):
     with pytest.raises(AspEnvError, match="does not plan"):
-        load_planner(name).plan(scene, straight_on(scene))
+        load_planner(name).plan(scene, straight_ahead(scene))
 
 
 @pytest.mark.parametrize("name", PLANNERS)
 def test_plans_are_finite_and_within_limits(name, scene):
     """A plan for every situation over the forecast's ticks; ±5 m/s² and ±π/4."""
-    plan = load_planner(name).plan(scene, straight_on(scene))
+    plan = load_planner(name).plan(scene, straight_ahead(scene))
     assert plan.actions.shape == (4, STEPS, 2)
     assert plan.states.shape == (4, STEPS, 4)
     assert np.isfinite(plan.actions).all()
@@ -82,108 +80,106 @@ def test_plans_are_finite_and_within_limits(name, scene):
 
 
 @pytest.mark.parametrize("name", PLANNERS)
-def test_states_are_what_the_actions_lead_to(name, scene):
-    """The bicycle model makes the planned states of the planned actions, to 1 mm."""
-    plan = load_planner(name).plan(scene, straight_on(scene))
-    made = rollout(scene.states[:, 0, -1], plan.actions, scene.sizes[:, 0, 0], scene.dt_s)
-    assert plan.states[..., :2] == pytest.approx(made[..., :2], abs=1e-3)
-    assert plan.states[..., 3] == pytest.approx(made[..., 3], abs=1e-3)
+def test_states_are_the_rollout_of_the_actions(name, scene):
+    """Under the bicycle model, to 1 mm."""
+    plan = load_planner(name).plan(scene, straight_ahead(scene))
+    states = rollout(scene.states[:, 0, -1], plan.actions, scene.sizes[:, 0, 0], scene.dt_s)
+    assert plan.states[..., :2] == pytest.approx(states[..., :2], abs=1e-3)
+    assert plan.states[..., 3] == pytest.approx(states[..., 3], abs=1e-3)
 
 
 @pytest.mark.parametrize("name", PLANNERS)
-def test_situations_do_not_know_of_each_other(name, scene):
-    """Four at once are bit for bit the four alone, whatever the planner was asked before."""
+def test_situations_are_independent(name, scene):
+    """Four in a batch are bit for bit the same as each on its own, for a used and a new planner."""
     planner = load_planner(name)
-    together = planner.plan(scene, straight_on(scene))
+    together = planner.plan(scene, straight_ahead(scene))
     for b in range(len(scene.tick)):
         alone = _situation(scene, b)
-        for asked in (planner, load_planner(name)):
-            single = asked.plan(alone, straight_on(alone))
+        for each in (planner, load_planner(name)):
+            single = each.plan(alone, straight_ahead(alone))
             assert single.actions.tobytes() == together.actions[b : b + 1].tobytes()
             assert single.states.tobytes() == together.states[b : b + 1].tobytes()
-    assert _equal(planner.plan(scene, straight_on(scene)), together)
+    assert _equal(planner.plan(scene, straight_ahead(scene)), together)
 
 
 @pytest.mark.parametrize("name", PLANNERS)
 def test_the_order_of_slots_does_not_matter(name, scene):
-    """The others in reverse order, forecast in reverse order: the same plan."""
+    """Other agents in reverse order, and forecasts likewise, yield the same plan."""
     agents = scene.ids.shape[1]
     order = np.concatenate([[0], np.arange(agents - 1, 0, -1)])
-    place = np.argsort(order)
-    turned = dataclasses.replace(
+    slots = np.argsort(order)
+    reordered = dataclasses.replace(
         scene,
         **{
             field: getattr(scene, field)[:, order]
             for field in ("states", "actions", "valid", "sizes", "classes", "ids")
         },
-        targets=np.stack([scene.targets[:, 0], place[scene.targets[:, 1]]], axis=-1)[::-1],
+        targets=np.stack([scene.targets[:, 0], slots[scene.targets[:, 1]]], axis=-1)[::-1],
     )
     planner = load_planner(name)
-    first, second = (planner.plan(each, straight_on(each)) for each in (scene, turned))
+    first, second = (planner.plan(each, straight_ahead(each)) for each in (scene, reordered))
     assert second.actions == pytest.approx(first.actions, abs=1e-6)
     assert second.states == pytest.approx(first.states, abs=1e-4)
 
 
 @pytest.mark.parametrize("name", PLANNERS)
-def test_the_absent_do_not_matter(name, scene):
-    """Whatever stands in the rows of agents that are not there, the plan is the same bits."""
+def test_rows_of_absent_agents_do_not_matter(name, scene):
+    """Their content does not change the bits of the plan."""
     absent = ~scene.valid[..., -1]
     assert absent.any()
     states, sizes = scene.states.copy(), scene.sizes.copy()
     states[absent] = scene.states[0, 0]
     sizes[absent] = (4.5, 1.8)
-    haunted = dataclasses.replace(scene, states=states, sizes=sizes)
+    filled = dataclasses.replace(scene, states=states, sizes=sizes)
     planner = load_planner(name)
     assert _equal(
-        planner.plan(haunted, straight_on(haunted)), planner.plan(scene, straight_on(scene))
+        planner.plan(filled, straight_ahead(filled)), planner.plan(scene, straight_ahead(scene))
     )
 
 
 @pytest.mark.parametrize("name", PLANNERS)
-def test_arguments_are_not_written_to(name, scene):
-    """Scene and forecast are as they were, down to the bit."""
-    forecast = straight_on(scene)
+def test_arguments_are_not_modified(name, scene):
+    forecast = straight_ahead(scene)
     before = _bits(scene) | _bits(forecast)
     load_planner(name).plan(scene, forecast)
     assert _bits(scene) | _bits(forecast) == before
 
 
 @pytest.mark.parametrize("name", PLANNERS)
-def test_says_whether_forecasts_matter(name, scene):
-    """One that uses no forecasts plans the same with everybody forecast 12 m ahead of the ego."""
-    forecast = straight_on(scene)
-    wild = dataclasses.replace(forecast, states=forecast.states.copy())
-    blocked = scene.states[scene.targets[:, 0], 0, -1]
-    blocked[:, :2] += 12 * np.stack([np.cos(blocked[:, 2]), np.sin(blocked[:, 2])], axis=-1)
-    wild.states[:] = blocked[:, None, None]
+def test_uses_forecasts_is_correct(name, scene):
+    """With all agents forecast 12 m ahead of the ego, only planners that use forecasts differ."""
+    forecast = straight_ahead(scene)
+    blocking = dataclasses.replace(forecast, states=forecast.states.copy())
+    ahead = scene.states[scene.targets[:, 0], 0, -1]
+    ahead[:, :2] += 12 * np.stack([np.cos(ahead[:, 2]), np.sin(ahead[:, 2])], axis=-1)
+    blocking.states[:] = ahead[:, None, None]
     planner = load_planner(name)
-    same = _equal(planner.plan(scene, forecast), planner.plan(scene, wild))
+    same = _equal(planner.plan(scene, forecast), planner.plan(scene, blocking))
     assert same == (not planner.uses_forecasts)
 
 
 @pytest.mark.parametrize("name", PLANNERS)
 def test_a_scene_without_a_route_is_refused(name):
-    """Scenes of snippets have no route: one line, no plan out of nowhere."""
+    """Scenes of snippets have no routes."""
     recordings = [make_recording()]
     index = index_snippets(recordings, dt_s=0.2, horizon_s=3.0)
     scene = gather_scene(recordings, index.select(np.arange(3)))
     with pytest.raises(AspEnvError, match="route"):
-        load_planner(name).plan(scene, straight_on(scene))
+        load_planner(name).plan(scene, straight_ahead(scene))
 
 
 @pytest.mark.parametrize("name", PLANNERS)
-def test_nobody_around_is_fine(name, scene):
-    """A scene without targets, and so a forecast without rows, still gets a plan."""
-    nobody = scene.with_targets(np.zeros((0, 2), dtype=np.int64))
+def test_plans_without_other_agents(name, scene):
+    """The scene has no targets, the forecast no rows."""
+    alone = scene.with_targets(np.zeros((0, 2), dtype=np.int64))
     valid = scene.valid.copy()
     valid[:, 1:] = False
-    empty = dataclasses.replace(nobody, valid=valid)
-    plan = load_planner(name).plan(empty, straight_on(empty))
+    empty = dataclasses.replace(alone, valid=valid)
+    plan = load_planner(name).plan(empty, straight_ahead(empty))
     assert np.isfinite(plan.states).all()
 
 
 def test_an_unknown_planner_is_refused():
-    """The error lists those there are."""
     with pytest.raises(AspEnvError, match=r"unknown planner 'sampeling' \(did you mean 'sampling'"):
         load_planner("sampeling")
 

@@ -1,4 +1,4 @@
-"""What predictors may know: neither the future, nor where the world lies."""
+"""Laws on the input of predictors: neither the future nor the frame of the recording matters."""
 
 import dataclasses
 from pathlib import Path
@@ -16,24 +16,24 @@ from asp_env.geometry import wrap_angle
 from predictors.models.chaining import CHAININGS
 from tests.builders import DRIVES, Drive, make_recording
 from tests.conformance.predictor_cases import (
-    LEARNED,
     PHYSICAL,
     RECORDING,
+    TRAINED,
     Case,
-    ask,
     assert_same,
     every,
+    predict,
     situations,
     snippets,
-    tried,
+    with_predictors,
 )
 
-turning = tried(PHYSICAL + tuple(case for case in LEARNED if case.view == "vectors"))
+equivariant = with_predictors(PHYSICAL + tuple(case for case in TRAINED if case.view == "vectors"))
 
 
 @every
 def test_unprivileged_predictors_read_no_future(predictor: Predictor) -> None:
-    """Handed a false future, a predictor that is not privileged forecasts the same."""
+    """A wrong future does not change the forecast of a predictor that is not privileged."""
     scene, future = situations(predictor)
     false = Future(states=future.states + 50, valid=future.valid)
     if predictor.privileged:
@@ -44,29 +44,29 @@ def test_unprivileged_predictors_read_no_future(predictor: Predictor) -> None:
 
 
 @every
-def test_what_is_recorded_later_changes_nothing(predictor: Predictor) -> None:
-    """With another recording from the next frame on, forecasts are the same bit for bit.
+def test_later_frames_change_nothing(predictor: Predictor) -> None:
+    """A recording that differs from the next frame on yields the same bits.
 
-    Everybody is elsewhere then, one leaves at once and another one comes. Who is privileged
-    forecasts something else.
+    In it all agents move elsewhere, one leaves and another one appears. Privileged predictors
+    forecast something else.
     """
     index = snippets(predictor.horizon)
     index = index.select(index.tick == 30)
     assert len(index) > 3
     other = with_another_future(RECORDING, frame=30 * 5)
-    here, there = (
-        ask(predictor, gather_scene([r], index), gather_future([r], index))
+    before, after = (
+        predict(predictor, gather_scene([r], index), gather_future([r], index))
         for r in (RECORDING, other)
     )
     if predictor.privileged:
-        assert not np.array_equal(here.states, there.states)
+        assert not np.array_equal(before.states, after.states)
     else:
-        assert_same(here, there)
+        assert_same(before, after)
 
 
 @pytest.mark.parametrize("chaining", CHAININGS)
-def test_only_chaining_by_oracle_is_privileged(chaining: str, folder: Path) -> None:
-    """It says so, and is refused without a future; beam, top-1 and full need none."""
+def test_only_the_chaining_oracle_is_privileged(chaining: str, folder: Path) -> None:
+    """It needs a future; beam, top-1 and full need none."""
     case = Case("ssp-asp", "vectors", chaining)
     predictor = load_predictor(case.save(folder), horizon=case.horizon, dt_s=0.2)
     assert predictor.privileged == (chaining == "oracle")
@@ -76,36 +76,38 @@ def test_only_chaining_by_oracle_is_privileged(chaining: str, folder: Path) -> N
             predictor.predict(situations(predictor)[0])
 
 
-@turning
-def test_moving_the_world_moves_the_forecast(predictor: Predictor) -> None:
-    """Turned by 1 rad and shifted by (30, -20) m, the forecast is turned and shifted, to 1e-4."""
-    uneven = without_symmetry(RECORDING)
-    scene, future = situations(predictor, uneven)
-    there, there_future = situations(predictor, moved(uneven, angle_rad=1.0, shift_m=(30.0, -20.0)))
-    here = ask(predictor, scene, future)
-    expected = move(here.states, angle_rad=1.0, shift_m=(30.0, -20.0))
-    found = ask(predictor, there, there_future)
+@equivariant
+def test_forecasts_are_equivariant(predictor: Predictor) -> None:
+    """Rotating the world by 1 rad and shifting it by (30, -20) m does the same to the forecast."""
+    recording = without_symmetry(RECORDING)
+    scene, future = situations(predictor, recording)
+    moved_scene, moved_future = situations(
+        predictor, moved(recording, angle_rad=1.0, shift_m=(30.0, -20.0))
+    )
+    forecast = predict(predictor, scene, future)
+    expected = move(forecast.states, angle_rad=1.0, shift_m=(30.0, -20.0))
+    found = predict(predictor, moved_scene, moved_future)
     np.testing.assert_allclose(found.states[..., :2], expected[..., :2], atol=1e-4)
     np.testing.assert_allclose(wrap_angle(found.states[..., 2] - expected[..., 2]), 0, atol=1e-4)
     np.testing.assert_allclose(found.states[..., 3], expected[..., 3], atol=1e-4)
-    np.testing.assert_allclose(found.log_probs, here.log_probs, atol=1e-4)
+    np.testing.assert_allclose(found.log_probs, forecast.log_probs, atol=1e-4)
 
 
 def with_another_future(recording: Recording, *, frame: int) -> Recording:
-    """The same up to a frame; then all are elsewhere, the first is gone and one more has come."""
-    comes = Drive(kind=AgentClass.CAR, start=(5.0, 5.0, 1.0, 3.0), appears_s=(frame + 1) / 25)
+    """Equal up to a frame; then all agents are elsewhere, the first has left, one has appeared."""
+    added = Drive(kind=AgentClass.CAR, start=(5.0, 5.0, 1.0, 3.0), appears_s=(frame + 1) / 25)
     first = dataclasses.replace(DRIVES[0], leaves_s=frame / 25)
-    other = make_recording(drives=(first, *DRIVES[1:], comes), road_map=recording.road_map)
+    other = make_recording(drives=(first, *DRIVES[1:], added), road_map=recording.road_map)
     lengths = np.diff(other.starts)
     rows = np.arange(len(other.states)) - np.repeat(other.starts[:-1], lengths)
-    at = np.repeat(other.first_frames, lengths) + rows
+    frames = np.repeat(other.first_frames, lengths) + rows
     states = other.states.copy()
-    states[at > frame] += np.float32(40.0)
+    states[frames > frame] += np.float32(40.0)
     return dataclasses.replace(other, states=states)
 
 
 def move(states: np.ndarray, *, angle_rad: float, shift_m: tuple[float, float]) -> np.ndarray:
-    """States [x, y, heading, speed] of a world that is turned about the origin, then shifted."""
+    """States [x, y, heading, speed] rotated about the origin, then shifted."""
     heading = wrap_angle(states[..., 2] + angle_rad)
     xy = move_points(states[..., :2], angle_rad=angle_rad, shift_m=shift_m)
     return np.concatenate([xy, heading[..., None], states[..., 3:]], axis=-1).astype(states.dtype)
@@ -114,7 +116,7 @@ def move(states: np.ndarray, *, angle_rad: float, shift_m: tuple[float, float]) 
 def move_points(
     points: np.ndarray, *, angle_rad: float, shift_m: tuple[float, float]
 ) -> np.ndarray:
-    """Points of that world."""
+    """Points [x, y] rotated about the origin, then shifted."""
     cos, sin = np.cos(angle_rad), np.sin(angle_rad)
     x = cos * points[..., 0] - sin * points[..., 1] + shift_m[0]
     y = sin * points[..., 0] + cos * points[..., 1] + shift_m[1]
@@ -122,7 +124,7 @@ def move_points(
 
 
 def without_symmetry(recording: Recording) -> Recording:
-    """The same with lines a little aside: of two that are equally near, rounding picks one."""
+    """The recording with shifted lines, so that no two are equally near."""
     lines = recording.road_map.lines
     lines = dataclasses.replace(lines, points=lines.points + np.array([0.13, 0.07]))
     return dataclasses.replace(
@@ -131,7 +133,7 @@ def without_symmetry(recording: Recording) -> Recording:
 
 
 def moved(recording: Recording, *, angle_rad: float, shift_m: tuple[float, float]) -> Recording:
-    """The same recording in a world that is turned and shifted, with its map."""
+    """The recording and its map rotated about the origin, then shifted."""
 
     def turned(ragged: Ragged) -> Ragged:
         points = move_points(ragged.points, angle_rad=angle_rad, shift_m=shift_m)

@@ -1,4 +1,4 @@
-"""What holds of every world, whoever drives its traffic."""
+"""Laws of every world under every driver."""
 
 import dataclasses
 
@@ -8,7 +8,7 @@ import pytest
 from asp_env import registry
 from asp_env.sim.simulation import Simulation
 from asp_env.sim.world import ReplayWorld, World
-from tests.conformance.places import PLACES, every_traffic, everywhere
+from tests.conformance.world_cases import WORLD_CASES, every_traffic, every_world
 from tests.sim.worlds import DT_S, HISTORY
 
 
@@ -18,58 +18,55 @@ def _actions(number: int, steps: int = 26) -> np.ndarray:
     return rng.uniform(low, high, (steps, 2)).astype(np.float32)
 
 
-def _step(simulation: Simulation, actions: np.ndarray, driven: np.ndarray | None = None) -> None:
-    everybody = np.ones(len(simulation.world), dtype=bool)
-    simulation.step(actions, everybody if driven is None else driven)
+def _step(simulation: Simulation, actions: np.ndarray) -> None:
+    simulation.step(actions, np.ones(len(simulation.world), dtype=bool))
 
 
-def _told(simulation: Simulation, episode: int, agents: int) -> dict[str, bytes]:
-    """Everything that a world tells of one episode, without padding."""
+def _bits(simulation: Simulation, episode: int, agents: int) -> dict[str, bytes]:
+    """The scene and the events of one episode as bytes, without padding."""
     scene, events = simulation.world.scene(), simulation.world.events()
     assert not scene.valid[episode, agents:].any()
     assert (scene.ids[episode, agents:] == -1).all()
-    mine = scene.targets[scene.targets[:, 0] == episode, 1]
+    targets = scene.targets[scene.targets[:, 0] == episode, 1]
     route = scene.route[episode, scene.route_valid[episode]]
-    told = {"targets": mine.tobytes(), "route": route.tobytes()}
+    bits = {"targets": targets.tobytes(), "route": route.tobytes()}
     for name in ("states", "actions", "valid", "sizes", "classes", "ids"):
-        told[name] = getattr(scene, name)[episode, :agents].tobytes()
-    told["tick"] = scene.tick[episode].tobytes()
-    told["map"] = scene.maps[int(scene.map_index[episode])].name.encode()
-    told["contacts"] = events.contacts[episode, :agents].tobytes()
+        bits[name] = getattr(scene, name)[episode, :agents].tobytes()
+    bits["tick"] = scene.tick[episode].tobytes()
+    bits["map"] = scene.maps[int(scene.map_index[episode])].name.encode()
+    bits["contacts"] = events.contacts[episode, :agents].tobytes()
     for field in dataclasses.fields(events):
         if field.name != "contacts":
-            told[field.name] = getattr(events, field.name)[episode].tobytes()
-    return told
+            bits[field.name] = getattr(events, field.name)[episode].tobytes()
+    return bits
 
 
-def test_every_world_of_the_registry_is_here():
-    """And the one that replays, which data have that no package registers a world for."""
-    assert {place.data for place in PLACES.values()} == {None, *registry.names("worlds")}
-    for place in PLACES.values():
-        expected = ReplayWorld if place.data is None else registry.find("worlds", place.data)
-        assert place.kind() is expected
+def test_every_registered_world_and_the_replay_world_are_tested():
+    assert {case.data for case in WORLD_CASES.values()} == {None, *registry.names("worlds")}
+    for case in WORLD_CASES.values():
+        expected = ReplayWorld if case.data is None else registry.find("worlds", case.data)
+        assert case.world_class() is expected
 
 
-@everywhere
-def test_it_is_a_world(place):
-    """The plug has all that the socket asks for; its first traffic is that of nobody else."""
-    world = place.kind()(place.recordings(), num_episodes=1, dt_s=DT_S, history=HISTORY)
-    assert world.traffic == place.traffics[0]
+@every_world
+def test_is_a_world(case):
+    world = case.world_class()(case.recordings(), num_episodes=1, dt_s=DT_S, history=HISTORY)
+    assert world.traffic == case.traffics[0]
     assert isinstance(world, World)
 
 
 @every_traffic
-def test_episodes_side_by_side_equal_episodes_alone(place, traffic):
-    """Four episodes at once are bit for bit the four on their own, over ends and padding."""
-    scenarios = place.scenarios()
-    together = place.simulate(scenarios, traffic)
-    alone = [place.simulate(each, traffic) for each in scenarios]
+def test_episodes_side_by_side_equal_episodes_alone(case, traffic):
+    """Bit for bit, in spite of padding and of episodes that are over."""
+    scenarios = case.scenarios()
+    together = case.simulate(scenarios, traffic)
+    alone = [case.simulate(each, traffic) for each in scenarios]
     actions = np.stack([_actions(b) for b in range(len(scenarios))])
-    for k in range(place.steps + 1):
+    for k in range(case.steps + 1):
         for b, single in enumerate(alone):
             agents = single.world.episodes.ids.shape[1]
-            assert _told(together, b, agents) == _told(single, 0, agents), (k, b)
-        if k < place.steps:
+            assert _bits(together, b, agents) == _bits(single, 0, agents), (k, b)
+        if k < case.steps:
             _step(together, actions[:, k])
             for b, single in enumerate(alone):
                 _step(single, actions[b : b + 1, k])
@@ -78,35 +75,35 @@ def test_episodes_side_by_side_equal_episodes_alone(place, traffic):
 
 
 @every_traffic
-def test_a_reset_touches_only_the_chosen_rows(place, traffic):
-    """Row 1 begins anew with more agents and a longer scenario; rows 0 and 2 never notice."""
-    scenarios = place.scenarios()
+def test_a_reset_touches_only_the_chosen_rows(case, traffic):
+    """Row 1 restarts with more agents and a longer scenario; rows 0 and 2 do not change."""
+    scenarios = case.scenarios()
     first = [scenarios[2], scenarios[0], scenarios[1]]
-    disturbed, left_alone = (place.simulate(first, traffic) for _ in range(2))
-    sizes = [each.world.episodes.ids.shape[1] for each in map(place.simulate, first)]
-    fresh = place.simulate(scenarios[3], traffic)
+    partly_reset, undisturbed = (case.simulate(first, traffic) for _ in range(2))
+    sizes = [each.world.episodes.ids.shape[1] for each in map(case.simulate, first)]
+    fresh = case.simulate(scenarios[3], traffic)
     agents = fresh.world.episodes.ids.shape[1]
     actions = np.stack([_actions(b) for b in range(3)])
     for k in range(12):
         if k == 5:
-            where = np.array([False, True, False])
+            reset_mask = np.array([False, True, False])
             rngs = [np.random.default_rng(9)] * 3
-            disturbed.reset([scenarios[0], scenarios[3], scenarios[0]], rngs, where)
-            assert _told(disturbed, 1, agents) == _told(fresh, 0, agents)
-        for simulation in (disturbed, left_alone):
+            partly_reset.reset([scenarios[0], scenarios[3], scenarios[0]], rngs, reset_mask)
+            assert _bits(partly_reset, 1, agents) == _bits(fresh, 0, agents)
+        for simulation in (partly_reset, undisturbed):
             _step(simulation, actions[:, k])
         if k >= 5:
             _step(fresh, actions[1:2, k])
-            assert _told(disturbed, 1, agents) == _told(fresh, 0, agents)
+            assert _bits(partly_reset, 1, agents) == _bits(fresh, 0, agents)
         for b in (0, 2):
-            assert _told(disturbed, b, sizes[b]) == _told(left_alone, b, sizes[b])
+            assert _bits(partly_reset, b, sizes[b]) == _bits(undisturbed, b, sizes[b])
 
 
-@everywhere
-def test_a_snapshot_brings_everything_back(place):
-    """States, scenarios and generators after restore are those of the snapshot, bit for bit."""
-    scenarios = place.scenarios()
-    simulation = place.simulate(scenarios)
+@every_world
+def test_restore_returns_to_a_snapshot(case):
+    """States, scenarios and generators are those of the snapshot, bit for bit."""
+    scenarios = case.scenarios()
+    simulation = case.simulate(scenarios)
     actions = np.stack([_actions(b) for b in range(len(scenarios))])
     for k in range(4):
         _step(simulation, actions[:, k])
@@ -118,58 +115,56 @@ def test_a_snapshot_brings_everything_back(place):
     for _ in range(2):
         for k in range(4, 12):
             _step(simulation, actions[:, k])
-        runs.append([_told(simulation, b, agents) for b in range(len(scenarios))])
-        where = np.array([True, False, False, True])
-        simulation.reset([scenarios[1]] * 4, [np.random.default_rng(5)] * 4, where)
+        runs.append([_bits(simulation, b, agents) for b in range(len(scenarios))])
+        reset_mask = np.array([True, False, False, True])
+        simulation.reset([scenarios[1]] * 4, [np.random.default_rng(5)] * 4, reset_mask)
         world.restore(snapshot)
         assert [rng.random() for rng in world.rngs] == drawn
     assert runs[0] == runs[1]
     assert world.scenarios == scenarios
 
 
-@everywhere
-def test_a_snapshot_can_be_restored_twice(place):
-    """What happens after a restore does not write into the snapshot."""
-    simulation = place.simulate(place.scenarios()[:2])
+@every_world
+def test_a_snapshot_can_be_restored_twice(case):
+    """Steps after a restore do not change the snapshot."""
+    simulation = case.simulate(case.scenarios()[:2])
     world = simulation.world
     agents = world.episodes.ids.shape[1]
-    told = _told(simulation, 0, agents)
+    before = _bits(simulation, 0, agents)
     snapshot = world.snapshot()
     for _ in range(2):
         _step(simulation, np.ones((2, 2), dtype=np.float32))
         world.restore(snapshot)
-        assert _told(simulation, 0, agents) == told
+        assert _bits(simulation, 0, agents) == before
 
 
 @every_traffic
-def test_every_found_scenario_can_be_driven_to_its_end(place, traffic):
-    """Whatever the table of scenarios offers starts, runs its length, and stays finite.
+def test_every_found_scenario_runs_to_its_end(case, traffic):
+    """States stay finite; the egos are uncontrolled.
 
-    Nobody drives the egos: where they are replayed or all is left to the world they end where
-    their logs do.
+    They reach their goals where they replay, and where the world moves all other agents as well.
     """
-    found = place.found()
-    if traffic != place.traffics[0] and place.data is not None:
+    found = case.found()
+    if traffic != case.traffics[0] and case.data is not None:
         found = found[::3]
-    simulation = place.simulate(found, traffic)
+    simulation = case.simulate(found, traffic)
     longest = max(each.length for each in found)
-    nobody = np.zeros(len(found), dtype=bool)
+    uncontrolled = np.zeros(len(found), dtype=bool)
     for _ in range(longest):
-        simulation.step(np.zeros((len(found), 2), dtype=np.float32), nobody)
+        simulation.step(np.zeros((len(found), 2), dtype=np.float32), uncontrolled)
     events = simulation.world.events()
     assert events.elapsed.tolist() == [each.length for each in found]
-    if place.data is None or traffic == place.traffics[0]:
+    if case.data is None or traffic == case.traffics[0]:
         assert events.route_m == pytest.approx(events.goal_m, abs=0.05)
     assert np.isfinite(simulation.world.episodes.states).all()
 
 
-@everywhere
-def test_a_generator_per_episode(place):
-    """Each episode keeps the generator it was given; the world itself draws nothing."""
-    scenarios = place.scenarios()
-    simulation = place.simulate(scenarios)
+@every_world
+def test_every_episode_has_its_generator_and_the_world_draws_nothing(case):
+    scenarios = case.scenarios()
+    simulation = case.simulate(scenarios)
     states = [rng.bit_generator.state for rng in simulation.world.rngs]
     assert len({id(rng) for rng in simulation.world.rngs}) == len(scenarios)
-    for _ in range(place.steps):
+    for _ in range(case.steps):
         _step(simulation, np.zeros((4, 2), dtype=np.float32))
     assert [rng.bit_generator.state for rng in simulation.world.rngs] == states

@@ -1,1 +1,1 @@
-"""Nouns, clock, readers and files."""
+"""Tests of `asp_env.data`."""

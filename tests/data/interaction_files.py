@@ -1,4 +1,4 @@
-"""Writes folders in the INTERACTION layout: road users that move as they may, over two lanes."""
+"""Writes folders in the INTERACTION layout: agents on a road of two lanes."""
 
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
@@ -13,13 +13,13 @@ from tests.data.levelx_files import two_lane_road
 LENGTH_M, WIDTH_M = 4.5, 1.8
 PLACE = "DR_ABC_Road_X"
 LATITUDE_DEG, LONGITUDE_DEG = 49.0053, 8.4374
-"""Where `meta_data.csv` has its origin."""
+"""The origin in `meta_data.csv`."""
 
 
-def places(
+def attributes_in_degrees(
     latitude_deg: float = 0.0, longitude_deg: float = 0.0
 ) -> Callable[[np.ndarray], list[str]]:
-    """What map nodes say of their place, about an origin in degrees."""
+    """A function that formats the positions of map nodes, relative to an origin in degrees."""
     zone = int((longitude_deg + 180) // 6) + 1
     utm = Transformer.from_crs(4326, 32600 + zone, always_xy=True)
     back = Transformer.from_crs(32600 + zone, 4326, always_xy=True)
@@ -33,15 +33,15 @@ def places(
     return write
 
 
-def in_metres(points: np.ndarray) -> list[str]:
-    """What nodes of an `.osm_xy` say of their place."""
+def attributes_in_metres(points: np.ndarray) -> list[str]:
+    """Formats the positions of nodes of an `.osm_xy` file."""
     return [f"x='{x:.6f}' y='{y:.6f}'" for x, y in points.tolist()]
 
 
 def drive(
     start: Sequence[float], actions: Sequence[tuple[float, float, float]], rate_hz: float
 ) -> np.ndarray:
-    """States (frames, 4) of a bicycle that holds each (seconds, acceleration, steering)."""
+    """States (frames, 4) of the bicycle model with each (seconds, acceleration, steering) held."""
     held = np.concatenate(
         [
             np.tile([float(a), steering], (round(seconds * rate_hz), 1))
@@ -61,7 +61,7 @@ def rows(
     rate_hz: float = 10.0,
     kind: str = "car",
 ) -> pd.DataFrame:
-    """A vehicle's rows as a faithful file has them."""
+    """A vehicle's rows of an exact file."""
     frames = first_frame + np.arange(len(states))
     return pd.DataFrame(
         {
@@ -83,15 +83,15 @@ def rows(
 def walk(
     track: str, start: tuple[float, float], velocity: tuple[float, float], count: int
 ) -> pd.DataFrame:
-    """A pedestrian's rows at 10 Hz: no heading, no size."""
+    """A pedestrian's rows at 10 Hz, without heading and size."""
     table = rows(0, np.zeros((count, 4)), kind="pedestrian/bicycle")
-    way = np.outer(np.arange(count) / 10, velocity) + start
-    table["track_id"], table["x"], table["y"] = track, way[:, 0], way[:, 1]
+    path = np.outer(np.arange(count) / 10, velocity) + start
+    table["track_id"], table["x"], table["y"] = track, path[:, 0], path[:, 1]
     return table.drop(columns=["psi_rad", "length", "width"])
 
 
 def some_cars() -> pd.DataFrame:
-    """Three cars on the road of `two_lane_road`: one passes, one brakes, one waits, then goes."""
+    """Three cars on the road of `two_lane_road`: one passes, one brakes, one waits, then drives."""
     return pd.concat(
         [
             rows(1, drive((5, -21.75, 0, 8), [(9, 0, 0)], 10)),
@@ -109,29 +109,29 @@ def write_recording(
     vehicles: pd.DataFrame | None = None,
     pedestrians: pd.DataFrame | None = None,
 ) -> Path:
-    """Writes one recording as INTERACTION has it, and returns the location's folder."""
-    there = folder / "recorded_trackfiles" / place
-    there.mkdir(parents=True, exist_ok=True)
+    """Writes one recording as in INTERACTION, and returns the location's folder."""
+    location = folder / "recorded_trackfiles" / place
+    location.mkdir(parents=True, exist_ok=True)
     table = some_cars() if vehicles is None else vehicles
-    table.to_csv(there / f"vehicle_tracks_{number}.csv", index=False)
+    table.to_csv(location / f"vehicle_tracks_{number}.csv", index=False)
     if pedestrians is not None:
-        pedestrians.to_csv(there / f"pedestrian_tracks_{number}.csv", index=False)
-    return there
+        pedestrians.to_csv(location / f"pedestrian_tracks_{number}.csv", index=False)
+    return location
 
 
 def write_map(
     folder: Path, *, place: str = PLACE, suffix: str = ".osm", text: str | None = None
 ) -> Path:
-    """Writes a map where INTERACTION has it."""
+    """Writes a map as in INTERACTION."""
     path = folder / "maps" / f"{place}{suffix}"
     path.parent.mkdir(parents=True, exist_ok=True)
-    about = in_metres if suffix == ".osm_xy" else places()
-    path.write_text(two_lane_road(about) if text is None else text)
+    attributes = attributes_in_metres if suffix == ".osm_xy" else attributes_in_degrees()
+    path.write_text(two_lane_road(attributes) if text is None else text)
     return path
 
 
 def write_folder(folder: Path, *, recordings: int = 1, place: str = PLACE) -> Path:
-    """Writes some recordings of one location, and its map."""
+    """Writes recordings of one location, and its map."""
     for number in range(recordings):
         write_recording(folder, number=f"{number:03d}", place=place)
     write_map(folder, place=place)
@@ -139,11 +139,11 @@ def write_folder(folder: Path, *, recordings: int = 1, place: str = PLACE) -> Pa
 
 
 def write_taf_bw(folder: Path, *, place: str = "k1_2020", **meta: object) -> Path:
-    """Writes a recording as TAF-BW has it, and returns its location's folder."""
-    there = folder / place
-    there.mkdir(parents=True)
-    some_cars().to_csv(there / "vehicle_tracks_004.csv", index=False)
-    said: Mapping[str, object] = {
+    """Writes one recording as in TAF-BW, and returns the location's folder."""
+    location = folder / place
+    location.mkdir(parents=True)
+    some_cars().to_csv(location / "vehicle_tracks_004.csv", index=False)
+    row: Mapping[str, object] = {
         "id": "004",
         "frameRate_hz": 10,
         "locationId": "k1",
@@ -152,6 +152,8 @@ def write_taf_bw(folder: Path, *, place: str = "k1_2020", **meta: object) -> Pat
         "originLon": LONGITUDE_DEG,
         **meta,
     }
-    pd.DataFrame([said]).to_csv(there / "meta_data.csv", index=False)
-    write_map(folder, place=place, text=two_lane_road(places(LATITUDE_DEG, LONGITUDE_DEG)))
-    return there
+    pd.DataFrame([row]).to_csv(location / "meta_data.csv", index=False)
+    write_map(
+        folder, place=place, text=two_lane_road(attributes_in_degrees(LATITUDE_DEG, LONGITUDE_DEG))
+    )
+    return location

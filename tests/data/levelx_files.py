@@ -1,4 +1,4 @@
-"""Writes folders in the inD layout: cars on sine curves over a lanelet2 map of two lanes."""
+"""Writes folders in the inD layout: agents on sine curves on a road of two lanes."""
 
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
@@ -8,7 +8,7 @@ import pandas as pd
 from pyproj import Transformer
 
 ORIGIN_M = (300_000.0, 5_600_000.0)
-"""UTM zone 32; near Aachen, at the zone's edge."""
+"""Easting and northing in UTM zone 32: near Aachen, at the zone's edge."""
 
 ROAD_LENGTH_M = 120.0
 
@@ -20,8 +20,8 @@ def to_degrees(points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     return np.asarray(latitudes), np.asarray(longitudes)
 
 
-def in_degrees(points: np.ndarray) -> list[str]:
-    """What nodes at local points (n, 2) say of their place."""
+def attributes_in_degrees(points: np.ndarray) -> list[str]:
+    """Formats the positions of map nodes at local points (n, 2)."""
     latitudes, longitudes = to_degrees(points)
     return [
         f"lat='{latitude:.12f}' lon='{longitude:.12f}'"
@@ -32,11 +32,14 @@ def in_degrees(points: np.ndarray) -> list[str]:
 def osm(
     ways: Mapping[str, tuple[Sequence[tuple[float, float]], Mapping[str, str]]],
     lanelets: Mapping[str, tuple[Mapping[str, str], Mapping[str, str]]],
-    places: Callable[[np.ndarray], list[str]] = in_degrees,
+    attributes: Callable[[np.ndarray], list[str]] = attributes_in_degrees,
 ) -> str:
-    """A map: ways by id as (local points, tags), relations by id as (way by role, tags).
+    """The text of a map.
 
-    Points at the same place become one node; `places` writes where nodes are.
+    Args:
+        ways: (local points, tags) by id. Equal points become one node.
+        lanelets: (way by role, tags) by id.
+        attributes: formats the positions of nodes.
     """
     numbers: dict[tuple[float, float], int] = {}
     lines = ["<?xml version='1.0' encoding='UTF-8'?>", "<osm version='0.6'>"]
@@ -44,8 +47,8 @@ def osm(
         for point in points:
             numbers.setdefault((float(point[0]), float(point[1])), len(numbers) + 1)
     points = np.array(list(numbers), dtype=np.float64)
-    for number, place in zip(numbers.values(), places(points), strict=True):
-        lines.append(f"<node id='{number}' {place} />")
+    for number, position in zip(numbers.values(), attributes(points), strict=True):
+        lines.append(f"<node id='{number}' {position} />")
     for name, (points, tags) in ways.items():
         nodes = "".join(f"<nd ref='{numbers[float(x), float(y)]}' />" for x, y in points)
         lines.append(f"<way id='{name}'>{nodes}{_tags(tags)}</way>")
@@ -57,7 +60,9 @@ def osm(
     return "\n".join([*lines, "</osm>"])
 
 
-def two_lane_road(places: Callable[[np.ndarray], list[str]] = in_degrees) -> str:
+def two_lane_road(
+    attributes: Callable[[np.ndarray], list[str]] = attributes_in_degrees,
+) -> str:
     """A straight road along +x: one lane each way, 3.5 m wide, between y = -23.5 and -16.5."""
     edges = {"south": -23.5, "middle": -20.0, "north": -16.5}
     kinds = {
@@ -73,11 +78,11 @@ def two_lane_road(places: Callable[[np.ndarray], list[str]] = in_degrees) -> str
         "101": ({"left": "middle", "right": "south"}, road),
         "102": ({"left": "middle", "right": "north"}, road),
     }
-    return osm(ways, lanelets, places)
+    return osm(ways, lanelets, attributes)
 
 
 def track_rows(track: int, frames: np.ndarray, rate_hz: float, kind: str = "car") -> pd.DataFrame:
-    """The rows of a track on a sine curve, its kinematics exact derivatives."""
+    """The rows of a track on a sine curve, with exact derivatives."""
     time = frames / rate_hz
     omega, amplitude, speed = 0.4, 1.0, 4.0 + track % 5
     x = 5.0 + speed * (time - time[0]) % (ROAD_LENGTH_M - 10)
@@ -88,7 +93,7 @@ def track_rows(track: int, frames: np.ndarray, rate_hz: float, kind: str = "car"
     heading = np.degrees(np.arctan2(v_y, v_x)) % 360
     vehicle = kind not in ("pedestrian", "bicycle")
     along = np.hypot(v_x, v_y)
-    nothing = np.zeros_like(x)
+    zeros = np.zeros_like(x)
     return pd.DataFrame(
         {
             "recordingId": 0,
@@ -97,15 +102,15 @@ def track_rows(track: int, frames: np.ndarray, rate_hz: float, kind: str = "car"
             "trackLifetime": frames - frames[0],
             "xCenter": x.round(5),
             "yCenter": y.round(5),
-            "heading": heading.round(5) if vehicle else nothing,
+            "heading": heading.round(5) if vehicle else zeros,
             "width": 1.8 if vehicle else 0.0,
             "length": 4.5 if vehicle else 0.0,
             "xVelocity": v_x.round(5),
             "yVelocity": v_y.round(5),
-            "xAcceleration": nothing,
+            "xAcceleration": zeros,
             "yAcceleration": a_y.round(5),
             "lonVelocity": along.round(5),
-            "latVelocity": nothing,
+            "latVelocity": zeros,
             "lonAcceleration": (v_y * a_y / along).round(5),
             "latAcceleration": (v_x * a_y / along).round(5),
         }
@@ -125,7 +130,7 @@ def write_recording(
 ) -> Path:
     """Writes one recording's three tables into `folder/data` and returns that folder.
 
-    `tracks` replaces the rows that are made up; `suffix` may be `.gz`.
+    `tracks` replaces the default rows; `suffix` may be `.gz`.
     """
     data = folder / "data"
     data.mkdir(parents=True, exist_ok=True)
@@ -177,7 +182,7 @@ def write_recording(
 
 
 def write_map(folder: Path, *, location: int = 1, text: str | None = None) -> Path:
-    """Writes a map where the inD layout has it."""
+    """Writes a map as in the inD layout."""
     path = folder / "maps" / "lanelets" / f"{location:02d}_place" / f"location{location}.osm"
     path.parent.mkdir(parents=True, exist_ok=True)
     path.write_text(two_lane_road() if text is None else text)
@@ -185,7 +190,7 @@ def write_map(folder: Path, *, location: int = 1, text: str | None = None) -> Pa
 
 
 def write_folder(folder: Path, *, recordings: int = 1, location: int = 1) -> Path:
-    """Writes some recordings of one location, and its map."""
+    """Writes recordings of one location, and its map."""
     for number in range(recordings):
         write_recording(folder, number=number, location=location)
     write_map(folder, location=location)

@@ -1,4 +1,4 @@
-"""Arrays kept on disk: exact, read-only, safe against damage and against one another."""
+"""The cache: exact, read-only arrays, safe against damage and simultaneous writers."""
 
 import threading
 from pathlib import Path
@@ -23,10 +23,10 @@ STAMP = [["format", 1, 0], ["a.csv", 10, 20]]
         ),
     )
 )
-def test_round_trip(
+def test_arrays_and_facts_are_loaded_as_saved(
     tmp_path_factory: pytest.TempPathFactory, arrays: dict[str, np.ndarray]
 ) -> None:
-    """What is loaded is bit for bit what was saved, of any shape, and nobody can write to it."""
+    """Bit for bit, of any shape, and read-only."""
     path = tmp_path_factory.mktemp("cache") / "a.bin"
     facts = {"repairs": ["gemä\u00dfigt"], "scale": 0.12, "none": None}
     cache.save(path, STAMP, facts, arrays)
@@ -41,8 +41,7 @@ def test_round_trip(
 
 
 @pytest.mark.parametrize("cut", [0, 5, 12, 100, 300, -1])
-def test_truncated_counts_as_absent(tmp_path: Path, cut: int) -> None:
-    """A file that ends early, wherever, is as good as none."""
+def test_a_truncated_file_counts_as_absent(tmp_path: Path, cut: int) -> None:
     path = tmp_path / "a.bin"
     cache.save(path, STAMP, {}, {"states": np.arange(100.0)})
     path.write_bytes(path.read_bytes()[:cut])
@@ -52,15 +51,14 @@ def test_truncated_counts_as_absent(tmp_path: Path, cut: int) -> None:
 @pytest.mark.parametrize(
     "content", [b"", b"asp-env\0", b"asp-env\0" + b"\xff" * 64, b"PK\3\4" * 99]
 )
-def test_garbage_counts_as_absent(tmp_path: Path, content: bytes) -> None:
-    """So is a file of something else."""
+def test_another_kind_of_file_counts_as_absent(tmp_path: Path, content: bytes) -> None:
     path = tmp_path / "a.bin"
     path.write_bytes(content)
     assert cache.load(path, STAMP) is None
 
 
 def test_another_stamp_counts_as_absent(tmp_path: Path) -> None:
-    """Made from files of another size, time or reader version: as good as none."""
+    """Made from files of another size or time, or by another version of the readers."""
     path = tmp_path / "a.bin"
     cache.save(path, STAMP, {}, {})
     assert cache.load(path, STAMP) is not None
@@ -68,8 +66,8 @@ def test_another_stamp_counts_as_absent(tmp_path: Path) -> None:
         assert cache.load(path, other) is None
 
 
-def test_stamp_changes_with_the_file(tmp_path: Path) -> None:
-    """Size and time of change both count; a file that is gone is an error of one line."""
+def test_the_stamp_changes_with_the_file(tmp_path: Path) -> None:
+    """With its size and its modification time; a missing file is an error of one line."""
     path = tmp_path / "a.csv"
     path.write_text("1")
     before = cache.stamp([path])
@@ -80,8 +78,7 @@ def test_stamp_changes_with_the_file(tmp_path: Path) -> None:
         cache.stamp([path])
 
 
-def test_failed_save_leaves_nothing(tmp_path: Path) -> None:
-    """A save that fails midway keeps the old file and no half of the new one."""
+def test_a_failed_save_leaves_the_old_file(tmp_path: Path) -> None:
     path = tmp_path / "a.bin"
     cache.save(path, STAMP, {"old": True}, {})
     with pytest.raises(TypeError):
@@ -95,8 +92,7 @@ def test_failed_save_leaves_nothing(tmp_path: Path) -> None:
     assert found[0] == {"old": True}
 
 
-def test_writers_at_once(tmp_path: Path) -> None:
-    """While two save again and again, whoever loads gets one or the other, never a mixture."""
+def test_readers_see_one_of_two_simultaneous_writers(tmp_path: Path) -> None:
     path = tmp_path / "a.bin"
     arrays = [np.full(10_000, value) for value in (1.0, 2.0)]
     cache.save(path, STAMP, {}, {"states": arrays[0]})
@@ -108,19 +104,19 @@ def test_writers_at_once(tmp_path: Path) -> None:
     threads = [threading.Thread(target=write, args=(number,)) for number in (0, 1)]
     for thread in threads:
         thread.start()
-    seen = set()
+    values = set()
     while any(thread.is_alive() for thread in threads):
         found = cache.load(path, STAMP)
         assert found is not None
         assert len(np.unique(found[1]["states"])) == 1
-        seen.add(float(found[1]["states"][0]))
+        values.add(float(found[1]["states"][0]))
     for thread in threads:
         thread.join()
-    assert seen <= {1.0, 2.0}
+    assert values <= {1.0, 2.0}
     assert len(list(tmp_path.iterdir())) == 1
 
 
-def test_folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_cache_folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """ASP_ENV_CACHE, else asp-env in XDG_CACHE_HOME, else in the home's .cache."""
     monkeypatch.setenv("HOME", str(tmp_path / "home"))
     monkeypatch.delenv("ASP_ENV_CACHE", raising=False)
@@ -133,8 +129,8 @@ def test_folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     assert (tmp_path / "named").is_dir()
 
 
-def test_unwritable_folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """A folder that cannot be made is one line that names it and the way out."""
+def test_an_unwritable_cache_folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """One line that names the folder and the variable to set."""
     (tmp_path / "file").write_text("")
     monkeypatch.setenv("ASP_ENV_CACHE", str(tmp_path / "file" / "below"))
     with pytest.raises(DataError, match=r"file/below: .*set ASP_ENV_CACHE") as caught:
@@ -142,8 +138,7 @@ def test_unwritable_folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> N
     assert "\n" not in str(caught.value)
 
 
-def test_entries_differ(tmp_path: Path) -> None:
-    """The same name in two folders, or made with another salt, is another file."""
+def test_sources_and_salts_have_different_files(tmp_path: Path) -> None:
     paths = [tmp_path / "a" / "00_tracks.csv", tmp_path / "b" / "00_tracks.csv"]
-    names = {cache.entry(tmp_path, path, salt) for path in paths for salt in ("x", "y")}
+    names = {cache.entry_path(tmp_path, path, salt) for path in paths for salt in ("x", "y")}
     assert len(names) == 4

@@ -1,4 +1,4 @@
-"""Several processes fill the cache at once: each gets what is right, and one copy is left."""
+"""Several processes fill the cache at the same time: all read the same, and one copy remains."""
 
 import json
 import os
@@ -13,6 +13,7 @@ import pytest
 from asp_env.data import cache
 from asp_env.data.causal import causal_histories
 from asp_env.data.source import open_data
+from asp_env.files import leftovers
 from tests.data import interaction_files, levelx_files
 
 READER = """
@@ -23,13 +24,13 @@ from asp_env.data.source import open_data
 print("ready", flush=True)
 sys.stdin.readline()
 recordings = open_data(sys.argv[1])
-told = {}
+digests = {}
 for recording, causal in zip(recordings, causal_histories(recordings), strict=True):
     digest = hashlib.sha256(recording.states.tobytes())
     digest.update(recording.road_map.lanes.points.tobytes())
     digest.update(causal.states.tobytes())
-    told[recording.name] = digest.hexdigest()
-print(json.dumps([told, recordings.data_hash()]))
+    digests[recording.name] = digest.hexdigest()
+print(json.dumps([digests, recordings.data_hash()]))
 """
 
 WRITER = """
@@ -46,7 +47,7 @@ while True:
 
 
 def start(code: str, *arguments: Path) -> subprocess.Popen[str]:
-    """A process that has imported all it needs and waits for a line."""
+    """Starts a process and waits until it has imported everything."""
     command = [sys.executable, "-W", "error", "-c", code, *map(str, arguments)]
     process = subprocess.Popen(
         command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
@@ -56,15 +57,15 @@ def start(code: str, *arguments: Path) -> subprocess.Popen[str]:
     return process
 
 
-def test_readers_at_once(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Three that begin in the same moment read both layouts alike, and leave one file of each."""
-    kept = tmp_path / "cache"
-    monkeypatch.setenv("ASP_ENV_CACHE", str(kept))
+def test_three_processes_read_alike(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """They start at the same time; both layouts are read, and each file is cached once."""
+    cache_folder = tmp_path / "cache"
+    monkeypatch.setenv("ASP_ENV_CACHE", str(cache_folder))
     folder = tmp_path / "data"
     levelx_files.write_folder(folder / "inD", recordings=2)
     interaction_files.write_folder(folder / "INTERACTION", recordings=2)
     readers = [start(READER, folder) for _ in range(3)]
-    assert not kept.exists()
+    assert not cache_folder.exists()
     for reader in readers:
         assert reader.stdin is not None
         reader.stdin.write("go\n")
@@ -73,15 +74,15 @@ def test_readers_at_once(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Non
     assert [(reader.returncode, err) for reader, (_, err) in zip(readers, ends, strict=True)] == [
         (0, "")
     ] * 3
-    told = [json.loads(out) for out, _ in ends]
-    assert all(each == told[0] for each in told)
+    results = [json.loads(out) for out, _ in ends]
+    assert all(each == results[0] for each in results)
 
-    entries = sorted(kept.iterdir())
+    entries = sorted(cache_folder.iterdir())
     assert len(entries) == 4 * 3 + 2  # tracks, hash and causal states of each recording; two maps
     assert not [path for path in entries if path.name.startswith(".") or path.suffix != ".bin"]
     before = [(path.stat().st_ino, path.stat().st_mtime_ns) for path in entries]
     recordings = open_data(folder)
-    assert recordings.data_hash() == told[0][1]
+    assert recordings.data_hash() == results[0][1]
     assert len(list(causal_histories(recordings))) == 4
     assert [(path.stat().st_ino, path.stat().st_mtime_ns) for path in entries] == before
 
@@ -90,21 +91,20 @@ def test_readers_at_once(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Non
         assert np.array_equal(recording.states, alone.states)
 
 
-def test_killed_writer(tmp_path: Path) -> None:
-    """Whatever moment a writer is killed in: a whole file or none, and no rest stays for good."""
+def test_a_killed_writer_leaves_a_complete_file_or_none(tmp_path: Path) -> None:
+    """Its temporary files are removed by a later writer once they are old; newer ones stay."""
     path = tmp_path / "a.bin"
     stamp = [["format", 1, 0]]
     for _ in range(3):
         writer = start(WRITER, path)
-        while not any(tmp_path.glob(".a.bin-*")):
+        while not leftovers(path):
             assert writer.poll() is None
         writer.send_signal(signal.SIGKILL)
         writer.communicate()
         found = cache.load(path, stamp)
         assert found is None or (found[1]["states"] == 1).all()
-    left = list(tmp_path.glob(".a.bin-*"))
-    for rest in left:
-        os.utime(rest, ns=(1, 1))
-    (tmp_path / ".a.bin-of-one-that-lives").write_text("")
+    for partial in leftovers(path):
+        os.utime(partial, ns=(1, 1))
+    (tmp_path / ".a.bin.01234567.partial").write_text("")
     cache.save(path, stamp, {}, {"states": np.zeros(3)})
-    assert sorted(each.name for each in tmp_path.iterdir()) == [".a.bin-of-one-that-lives", "a.bin"]
+    assert sorted(each.name for each in tmp_path.iterdir()) == [".a.bin.01234567.partial", "a.bin"]

@@ -1,4 +1,4 @@
-"""Classes of road users by the names that files use."""
+"""Classes of agents and their names in files."""
 
 import pytest
 
@@ -20,26 +20,22 @@ from asp_env.errors import DataError
         ("unknown", AgentClass.OTHER),
     ],
 )
-def test_aliases(name: str, kind: AgentClass) -> None:
-    """Names of inD, rounD and INTERACTION in any case."""
+def test_names_in_files(name: str, kind: AgentClass) -> None:
     assert parse_class(name) is kind
 
 
-def test_every_class_has_its_own_name() -> None:
-    """The lower-cased name of each class means that class."""
+def test_lower_case_class_names_are_known() -> None:
     assert all(ALIASES[kind.name.lower()] is kind for kind in AgentClass)
 
 
-def test_unknown_class() -> None:
-    """The error is one line that lists the known names."""
+def test_unknown_class_lists_the_known_names() -> None:
     with pytest.raises(DataError) as caught:
         parse_class("hovercraft")
     (line,) = str(caught.value).splitlines()
     assert line.startswith("unknown class 'hovercraft': known are animal, bicycle, bike, bus, ")
 
 
-def test_stored_numbers() -> None:
-    """Caches and rollouts hold these numbers."""
+def test_stored_numbers_never_change() -> None:
     assert [kind.name for kind in sorted(AgentClass)] == [
         *("CAR", "VAN", "TRUCK", "BUS", "TRUCK_BUS", "TRAILER", "MOTORCYCLE", "BICYCLE"),
         *("PEDESTRIAN", "ANIMAL", "OTHER"),
@@ -47,16 +43,15 @@ def test_stored_numbers() -> None:
     assert sorted(AgentClass) == list(range(11))
 
 
-def test_footprints() -> None:
-    """Each class has one, in m, longer than wide or square; a bus is longer than a car."""
+def test_default_footprints() -> None:
+    """Every class has one, at least as long as wide; a bus is longer than a car."""
     assert FOOTPRINTS_M.shape == (11, 2)
     assert (FOOTPRINTS_M > 0).all()
     assert (FOOTPRINTS_M[:, 0] >= FOOTPRINTS_M[:, 1]).all()
     assert FOOTPRINTS_M[AgentClass.BUS, 0] > FOOTPRINTS_M[AgentClass.CAR, 0]
 
 
-def test_predicted() -> None:
-    """Every class but bicycles, pedestrians, animals and trailers."""
+def test_predicted_classes() -> None:
     left_out = set(AgentClass) - PREDICTED
     assert left_out == {
         *(AgentClass.BICYCLE, AgentClass.PEDESTRIAN, AgentClass.ANIMAL, AgentClass.TRAILER)

@@ -1,4 +1,4 @@
-"""Forecasts of a made-up crossing, filled in where a predictor keeps silent."""
+"""Forecasts at the crossing, and how missing ones are filled in."""
 
 import dataclasses
 import math
@@ -15,10 +15,10 @@ STEPS = 5
 
 
 def scene_of(*slots: int) -> Scene:
-    """The crossing at tick 15, 3 s in, with some slots as targets.
+    """The crossing at tick 15, 3 s, with some slots as targets.
 
     Slot 0 drives along +x at 8 m/s from -90 m, slot 1 along -x and brakes, slot 5 circles, slot 6
-    is a bicycle at 4 m/s from -70 m, slot 9 nobody.
+    is a bicycle at 4 m/s from -70 m, and slot 9 is empty.
     """
     recording = make_recording()
     index = index_snippets([recording], dt_s=0.2, horizon_s=3.0)
@@ -27,7 +27,7 @@ def scene_of(*slots: int) -> Scene:
 
 
 def forecast_of(scene: Scene, valid: list[bool], *, modes: int = 3) -> Forecast:
-    """Modes that say 7 for everything, and that the first one is the most probable."""
+    """Modes with all states 7, the first mode being the most probable."""
     shape = (len(valid), modes, STEPS)
     weights = np.arange(modes, 0, -1) / np.arange(1, modes + 1).sum()
     return make_forecast(
@@ -40,7 +40,7 @@ def forecast_of(scene: Scene, valid: list[bool], *, modes: int = 3) -> Forecast:
 
 
 def test_constant_velocity() -> None:
-    """After 3 s slot 0 is at -90 + 24 = -66 m; from there each 0.2 s are 1.6 m straight on."""
+    """After 3 s slot 0 is at -90 + 24 = -66 m, and then drives 1.6 m per tick."""
     states = constant_velocity(scene_of(0, 6), steps=STEPS)
     ahead = np.arange(1, STEPS + 1)
     np.testing.assert_allclose(states[0, :, 0], -66 + 1.6 * ahead, atol=1e-3)
@@ -52,7 +52,6 @@ def test_constant_velocity() -> None:
 
 
 def test_constant_velocity_backwards() -> None:
-    """Who drives backwards goes on backwards."""
     scene = scene_of(0)
     scene.states[0, 0, -1] = (10.0, 5.0, math.pi / 2, -2.0)
     states = constant_velocity(scene, steps=2)
@@ -60,7 +59,7 @@ def test_constant_velocity_backwards() -> None:
 
 
 def test_make_forecast() -> None:
-    """Rows know whom and when they speak of; those without a word are zeros."""
+    """Rows have the ids and ticks of their targets; invalid rows are zeros."""
     scene = scene_of(5, 6)
     forecast = forecast_of(scene, [True, False])
     assert forecast.ids.tolist() == [6, 9]
@@ -74,8 +73,7 @@ def test_make_forecast() -> None:
     np.testing.assert_allclose(forecast.probabilities[0], [3 / 6, 2 / 6, 1 / 6], rtol=1e-6)
 
 
-def test_actions_count_only_where_forecast() -> None:
-    """With actions given they are valid for the targets that are, zero for the others."""
+def test_actions_are_valid_where_the_forecast_is() -> None:
     scene = scene_of(5, 6)
     forecast = make_forecast(
         scene,
@@ -90,14 +88,14 @@ def test_actions_count_only_where_forecast() -> None:
 
 
 def test_most_probable() -> None:
-    """The highest probability; the first of equals."""
+    """Of equally probable modes it is the first."""
     forecast = forecast_of(scene_of(0, 1), [True, True])
     log_probs = np.log(np.array([(0.2, 0.5, 0.3), (0.4, 0.2, 0.4)], dtype=np.float32))
     assert dataclasses.replace(forecast, log_probs=log_probs).most_probable.tolist() == [1, 0]
 
 
 def test_fill_missing() -> None:
-    """The bicycle gets constant velocity in all modes alike; what was said of others stays."""
+    """The bicycle gets constant velocity in equally probable modes; other rows do not change."""
     scene = scene_of(0, 6, 9)
     filled = fill_missing(forecast_of(scene, [True, False, False]), scene)
     assert filled.valid.tolist() == [True, True, False]
@@ -105,13 +103,12 @@ def test_fill_missing() -> None:
     straight = constant_velocity(scene, steps=STEPS)[1]
     for mode in range(3):
         np.testing.assert_array_equal(filled.states[1, mode], straight)
-    assert not filled.states[2].any()  # nobody is there
+    assert not filled.states[2].any()  # an empty slot
     np.testing.assert_allclose(filled.probabilities[:2], [[1 / 2, 1 / 3, 1 / 6], [1 / 3] * 3], 1e-6)
     assert not filled.actions_valid.any()
 
 
-def test_nothing_to_fill() -> None:
-    """A forecast of everybody is returned as it is."""
+def test_complete_forecast_is_returned_unchanged() -> None:
     scene = scene_of(0, 1)
     forecast = forecast_of(scene, [True, True])
     assert fill_missing(forecast, scene) is forecast
@@ -119,10 +116,10 @@ def test_nothing_to_fill() -> None:
 
 @pytest.mark.parametrize("modes", [1, 3])
 def test_filled_probabilities_sum_to_one(modes: int) -> None:
-    """Even where a predictor left the probabilities of those it does not forecast at zero."""
+    """Even if the predictor left the log-probabilities of other targets at zero."""
     scene = scene_of(0, 6)
-    silent = dataclasses.replace(
+    empty = dataclasses.replace(
         forecast_of(scene, [False, False], modes=modes),
         log_probs=np.zeros((2, modes), dtype=np.float32),
     )
-    np.testing.assert_allclose(fill_missing(silent, scene).probabilities.sum(axis=1), 1, rtol=1e-6)
+    np.testing.assert_allclose(fill_missing(empty, scene).probabilities.sum(axis=1), 1, rtol=1e-6)

@@ -1,4 +1,4 @@
-"""Folders in the INTERACTION layout: what is found in them, and in which frame the maps lie."""
+"""Opening folders in the INTERACTION layout: names, maps and their frames, and the cache."""
 
 import shutil
 from collections.abc import Callable
@@ -23,23 +23,23 @@ from tests.data.interaction_files import (
 
 
 @pytest.fixture(autouse=True)
-def kept(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-    """A cache folder of the test's own."""
+def cache_folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """An empty cache folder."""
     monkeypatch.setenv("ASP_ENV_CACHE", str(tmp_path / "cache"))
     return tmp_path / "cache"
 
 
-def edges(lanes: np.ndarray) -> tuple[float, float, float, float]:
+def extent(lanes: np.ndarray) -> tuple[float, float, float, float]:
     """Smallest and largest x, smallest and largest y."""
     return (*lanes.min(axis=0)[:1], *lanes.max(axis=0)[:1], lanes[:, 1].min(), lanes[:, 1].max())
 
 
 ROAD = (0.0, 120.0, -21.75, -18.25)
-"""Where the lanes of `two_lane_road` lie."""
+"""Extent of the lanes of `two_lane_road`."""
 
 
-def test_interaction(tmp_path: Path) -> None:
-    """Recordings beside maps about (0, 0): names, places, clock and lanes are as written."""
+def test_recordings_and_maps_about_0_degrees(tmp_path: Path) -> None:
+    """Names, locations, frame rate and lanes are as written."""
     recordings = open_data(write_folder(tmp_path / "data", recordings=2))
     assert recordings.names == (f"{PLACE}/000", f"{PLACE}/001")
     first, second = recordings
@@ -47,50 +47,50 @@ def test_interaction(tmp_path: Path) -> None:
     assert (first.speed_limit_mps, first.background) == (None, None)
     assert first.road_map is second.road_map
     assert first.road_map.name == PLACE
-    assert edges(first.road_map.lanes.points) == pytest.approx(ROAD, abs=1e-3)
+    assert extent(first.road_map.lanes.points) == pytest.approx(ROAD, abs=1e-3)
 
 
-def test_taf_bw(tmp_path: Path) -> None:
-    """Places beside maps, with origin and speed limit of their own."""
+def test_recordings_with_metadata(tmp_path: Path) -> None:
+    """Origin and speed limit are those of `meta_data.csv`."""
     write_taf_bw(tmp_path / "data")
     (recording,) = open_data(tmp_path / "data")
     assert (recording.name, recording.location) == ("k1_2020/004", "k1_2020")
     assert recording.speed_limit_mps == pytest.approx(50 / 3.6)
-    assert edges(recording.road_map.lanes.points) == pytest.approx(ROAD, abs=1e-3)
+    assert extent(recording.road_map.lanes.points) == pytest.approx(ROAD, abs=1e-3)
 
 
-def test_map_in_local_metres(tmp_path: Path) -> None:
-    """An `.osm_xy` serves where there is no `.osm`."""
+def test_a_map_in_local_metres(tmp_path: Path) -> None:
+    """An `.osm_xy` file is used where there is no `.osm` file."""
     write_recording(tmp_path / "data")
     write_map(tmp_path / "data", suffix=".osm_xy")
     (recording,) = open_data(tmp_path / "data")
-    assert edges(recording.road_map.lanes.points) == pytest.approx(ROAD, abs=1e-5)
+    assert extent(recording.road_map.lanes.points) == pytest.approx(ROAD, abs=1e-5)
     write_map(tmp_path / "data", suffix=".osm_xy", text="spoilt")
     write_map(tmp_path / "data")
     assert len(open_data(tmp_path / "data")[0].road_map.lanes) == 2
 
 
 @pytest.mark.parametrize(
-    "given", [".", "recorded_trackfiles", f"recorded_trackfiles/{PLACE}", "../data/./maps/.."]
+    "opened", [".", "recorded_trackfiles", f"recorded_trackfiles/{PLACE}", "../data/./maps/.."]
 )
-def test_any_folder_of_it(tmp_path: Path, given: str) -> None:
-    """The whole, or its tracks, or those of one place: the map is found."""
+def test_maps_are_found_from_inner_folders(tmp_path: Path, opened: str) -> None:
+    """The whole folder, its tracks, or those of one location."""
     write_folder(tmp_path / "data")
-    (recording,) = open_data(tmp_path / "data" / given)
+    (recording,) = open_data(tmp_path / "data" / opened)
     assert recording.name == f"{PLACE}/000"
     assert len(recording.road_map.lanes) == 2
 
 
-def test_map_called_as_the_location_is(tmp_path: Path) -> None:
-    """A map that has the name in `meta_data.csv` serves where none has the folder's."""
-    there = write_taf_bw(tmp_path / "data", locationId="K1")
+def test_a_map_named_by_the_metadata(tmp_path: Path) -> None:
+    """It is used where no map has the folder's name."""
+    location = write_taf_bw(tmp_path / "data", locationId="K1")
     maps = tmp_path / "data" / "maps"
-    (maps / f"{there.name}.osm").rename(maps / "k1.osm")
+    (maps / f"{location.name}.osm").rename(maps / "k1.osm")
     assert open_data(tmp_path / "data")[0].road_map.name == "k1"
 
 
-def test_places_of_one_name(tmp_path: Path) -> None:
-    """Each has the map that is nearest, a name and a location of its own."""
+def test_locations_of_one_name_have_their_own_maps(tmp_path: Path) -> None:
+    """The nearest map, and names that include the path."""
     for year in ("2019", "2020"):
         write_folder(tmp_path / "data" / year)
     write_map(
@@ -103,11 +103,10 @@ def test_places_of_one_name(tmp_path: Path) -> None:
     locations = [f"{year}/recorded_trackfiles/{PLACE}" for year in ("2019", "2020")]
     assert recordings.names == tuple(f"{location}/000" for location in locations)
     assert [recording.location for recording in recordings] == locations
-    assert len({edges(recording.road_map.lanes.points) for recording in recordings}) == 2
+    assert len({extent(recording.road_map.lanes.points) for recording in recordings}) == 2
 
 
-def test_beside_levelx(tmp_path: Path) -> None:
-    """A folder of both layouts holds the recordings of both."""
+def test_a_folder_of_both_layouts(tmp_path: Path) -> None:
     levelx_files.write_folder(tmp_path / "data" / "inD")
     write_folder(tmp_path / "data" / "INTERACTION")
     recordings = open_data(tmp_path / "data")
@@ -116,8 +115,7 @@ def test_beside_levelx(tmp_path: Path) -> None:
     assert len(set(recordings.hashes())) == 2
 
 
-def test_names_that_clash(tmp_path: Path) -> None:
-    """Two recordings of one name are refused, since nobody could tell which is meant."""
+def test_two_recordings_of_one_name_are_refused(tmp_path: Path) -> None:
     for folder in ("x", "y"):
         levelx_files.write_folder(tmp_path / "data" / folder)
     write_recording(tmp_path, number="00", place="x")
@@ -128,33 +126,32 @@ def test_names_that_clash(tmp_path: Path) -> None:
         open_data(tmp_path / "data")
 
 
-def test_hash_and_cache_follow_every_file(tmp_path: Path, kept: Path) -> None:
-    """Tracks, pedestrians, origin and map: each is seen when it changes."""
+def test_a_change_of_any_file_is_noticed(tmp_path: Path, cache_folder: Path) -> None:
+    """Of tracks, pedestrians, origin or map: the hash and the recording change."""
     folder = tmp_path / "data"
-    there = write_taf_bw(folder)
-    seen = {open_data(folder).data_hash()}
+    location = write_taf_bw(folder)
+    hashes = {open_data(folder).data_hash()}
     assert len(open_data(folder)[0]) == 3
-    entries = len(list(kept.iterdir()))
+    entries = len(list(cache_folder.iterdir()))
 
-    def again(change: Callable[[], object]) -> None:
+    def after(change: Callable[[], object]) -> None:
         change()
-        seen.add(open_data(folder).data_hash())
+        hashes.add(open_data(folder).data_hash())
 
-    again(lambda: walk("P1", (0, 0), (0, 1), 20).to_csv(there / "pedestrian_tracks_004.csv"))
+    after(lambda: walk("P1", (0, 0), (0, 1), 20).to_csv(location / "pedestrian_tracks_004.csv"))
     assert len(open_data(folder)[0]) == 4
-    tracks, meta = there / "vehicle_tracks_004.csv", there / "meta_data.csv"
-    again(lambda: tracks.write_text(tracks.read_text().replace("car", "bus")))
+    tracks, meta = location / "vehicle_tracks_004.csv", location / "meta_data.csv"
+    after(lambda: tracks.write_text(tracks.read_text().replace("car", "bus")))
     assert open_data(folder)[0].classes.tolist()[:3] == [3, 3, 3]
-    again(lambda: meta.write_text(meta.read_text().replace("49.0053", "49.0054")))
+    after(lambda: meta.write_text(meta.read_text().replace("49.0053", "49.0054")))
     assert open_data(folder)[0].road_map.lanes.points[:, 1].max() == pytest.approx(-29.4, abs=0.1)
     path = folder / "maps" / "k1_2020.osm"
-    again(lambda: path.write_text(path.read_text() + "\n"))
-    assert len(seen) == 5
-    assert len(list(kept.iterdir())) == entries + 1
+    after(lambda: path.write_text(path.read_text() + "\n"))
+    assert len(hashes) == 5
+    assert len(list(cache_folder.iterdir())) == entries + 1
 
 
-def test_from_the_cache(tmp_path: Path) -> None:
-    """The second time all is equal, mapped and read-only."""
+def test_the_cache_returns_equal_read_only_arrays(tmp_path: Path) -> None:
     folder = write_folder(tmp_path / "data")
     before, after = open_data(folder)[0], open_data(folder)[0]
     for name in ("track_ids", "classes", "sizes", "first_frames", "starts", "states"):
@@ -163,13 +160,13 @@ def test_from_the_cache(tmp_path: Path) -> None:
     assert after.frame_rate_hz == before.frame_rate_hz
 
 
-def test_commands(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    """The table, both kinds of evaluation: all take it as they take any other DATA."""
+def test_commands_take_this_layout(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """`inspect`, `evaluate` and `drive`."""
     folder = str(write_folder(tmp_path / "data", recordings=2))
     assert main(["inspect", folder]) == 0
-    told = capsys.readouterr().out
-    assert f"{PLACE}/000" in told
-    assert "Faults: none" in told
+    output = capsys.readouterr().out
+    assert f"{PLACE}/000" in output
+    assert "Faults: none" in output
     evaluate = ["evaluate", folder, "--predictors", "constant-velocity", "--out"]
     assert main([*evaluate, str(tmp_path / "open")]) == 0
     drive = ["drive", folder, "--predictors", "constant-velocity", "--out"]

@@ -1,4 +1,4 @@
-"""The tables of a recording against what they were made from."""
+"""Tables of recordings and maps against the drives from which they were made."""
 
 import dataclasses
 
@@ -15,7 +15,7 @@ STANDING = (50.0, 0.0, 0.0, 0.0)
 
 
 def test_frames_of_a_recording() -> None:
-    """20 s at 25 Hz are 501 frames; the seventh comes at frame 100 and leaves after frame 350."""
+    """20 s at 25 Hz are 501 frames; the seventh track spans frames 100 to 350."""
     recording = make_recording()
     assert len(recording) == 10
     assert recording.num_frames == 501
@@ -25,8 +25,7 @@ def test_frames_of_a_recording() -> None:
     assert recording.track(6)[0, 1] == -80
 
 
-def test_frame_index() -> None:
-    """Every frame shows exactly the tracks that span it, in their order."""
+def test_frame_index_lists_the_tracks_of_each_frame() -> None:
     recording = make_recording(duration_s=6.0)
     starts, tracks = recording.frame_index
     assert len(starts) == recording.num_frames + 1
@@ -42,15 +41,15 @@ def test_frame_index() -> None:
     [(0, 0, [1, 3]), (10, 10, [1, 3, 2]), (30, 40, [1, 3]), (26, 40, [1, 3]), (25, 40, [1, 3, 2])],
 )
 def test_tracks_between(first: int, last: int, ids: list[int]) -> None:
-    """By first appearance, then id: track 2 is there from frame 10 to frame 25."""
+    """Sorted by first frame, then id; track 2 is present from frame 10 to frame 25."""
     late = Drive(kind=AgentClass.CAR, start=MOVING, appears_s=1.0, leaves_s=2.5)
-    here = Drive(kind=AgentClass.CAR, start=MOVING)
-    recording = make_recording(drives=(here, late, here), duration_s=5.0, frame_rate_hz=10.0)
+    always = Drive(kind=AgentClass.CAR, start=MOVING)
+    recording = make_recording(drives=(always, late, always), duration_s=5.0, frame_rate_hz=10.0)
     assert recording.track_ids[recording.tracks_between(first, last)].tolist() == ids
 
 
 def test_parked() -> None:
-    """Parked: there from the first frame to the last, and within 1 m of where it started."""
+    """Present from the first to the last frame, and always within 1 m of the first position."""
     creep = Drive(kind=AgentClass.CAR, start=STANDING, phases=((1.0, 0.45, 0.0), (1.0, -0.45, 0.0)))
     drives = (
         Drive(kind=AgentClass.CAR, start=STANDING),
@@ -66,14 +65,12 @@ def test_parked() -> None:
     assert recording.predicted.tolist() == [False, False, True, True, True, False, True]
 
 
-def test_parked_round_the_block() -> None:
-    """Who comes back to where it started was not parked."""
+def test_vehicle_that_returns_to_its_start_is_not_parked() -> None:
     circle = Drive(kind=AgentClass.CAR, start=MOVING, phases=((60.0, 0.0, 0.3),))
     assert not make_recording(drives=(circle,), duration_s=20.0).parked.any()
 
 
-def test_without_tracks() -> None:
-    """A recording may hold nobody."""
+def test_recording_without_tracks() -> None:
     recording = dataclasses.replace(
         make_recording(),
         track_ids=np.zeros(0, dtype=np.int64),
@@ -89,15 +86,14 @@ def test_without_tracks() -> None:
     assert len(recording.tracks_between(0, 500)) == 0
 
 
-def test_tables_that_do_not_fit() -> None:
-    """Rows that nobody's track explains are refused in a line that names the recording."""
+def test_columns_of_different_lengths_are_rejected() -> None:
     recording = make_recording(name="07")
     with pytest.raises(DataError, match=r"recording 07: .*differ in length"):
         dataclasses.replace(recording, states=recording.states[:-1])
 
 
-def test_ragged() -> None:
-    """Sequences come out as they went in, from either end, and no further."""
+def test_ragged_arrays_return_their_sequences() -> None:
+    """By positive and negative index, within the bounds only."""
     sequences = [np.ones((2, 2)), np.zeros((0, 2)), np.full((3, 2), 7.0)]
     packed = Ragged.pack(sequences)
     assert len(packed) == 3
@@ -112,7 +108,7 @@ def test_ragged() -> None:
 
 
 def test_map_extent() -> None:
-    """The crossing reaches 100 m each way; a map of nothing still has an extent."""
+    """The crossing extends 100 m in each direction; an empty map has an extent, too."""
     assert make_map().extent_m == (-100, -100, 100, 100)
     nothing = Ragged.pack([])
     empty = dataclasses.replace(
@@ -121,8 +117,7 @@ def test_map_extent() -> None:
     assert empty.extent_m == (0, 0, 1, 1)
 
 
-def test_maps_that_do_not_fit() -> None:
-    """Line types and successors must belong to lines and lanes."""
+def test_map_with_wrong_counts_is_rejected() -> None:
     road_map = make_map()
     with pytest.raises(DataError, match="map crossing: 8 lines but 7 line types"):
         dataclasses.replace(road_map, line_types=road_map.line_types[:-1])

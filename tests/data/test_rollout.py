@@ -1,4 +1,4 @@
-"""Rollouts come back as they were saved, or not at all."""
+"""Rollout files: round trips and damaged files."""
 
 import dataclasses
 import json
@@ -15,7 +15,7 @@ from asp_env.errors import DataError
 
 
 def make_rollout() -> Rollout:
-    """Three ticks of two agents, two plans, and three forecasts."""
+    """Three ticks of two agents, two plans and three forecasts."""
     rng = np.random.default_rng(0)
     return Rollout(
         scenario=Scenario(
@@ -47,8 +47,8 @@ def make_rollout() -> Rollout:
     )
 
 
-def refused(path: Path) -> str:
-    """What is said of a file that is no rollout: one line that names it."""
+def error_of(path: Path) -> str:
+    """The error of a file that is no rollout: one line that begins with its path."""
     with pytest.raises(DataError) as caught:
         Rollout.load(path)
     (line,) = str(caught.value).splitlines()
@@ -57,22 +57,21 @@ def refused(path: Path) -> str:
 
 
 def test_round_trip(tmp_path: Path) -> None:
-    """Every field comes back, bit for bit and of its type; nothing else is left in the folder."""
+    """All fields are equal, with their dtypes; the folder contains no other file."""
     rollout, path = make_rollout(), tmp_path / "0.npz"
     rollout.save(path)
-    again = Rollout.load(path)
+    loaded = Rollout.load(path)
     for field in dataclasses.fields(Rollout):
-        mine, its = getattr(rollout, field.name), getattr(again, field.name)
-        if isinstance(mine, np.ndarray):
-            assert mine.dtype == its.dtype
-            np.testing.assert_array_equal(mine, its)
+        before, after = getattr(rollout, field.name), getattr(loaded, field.name)
+        if isinstance(before, np.ndarray):
+            assert before.dtype == after.dtype
+            np.testing.assert_array_equal(before, after)
         else:
-            assert mine == its
+            assert before == after
     assert list(tmp_path.iterdir()) == [path]
 
 
 def test_without_plans_and_forecasts(tmp_path: Path) -> None:
-    """An episode in which nobody planned or forecast keeps its empty arrays."""
     rollout = dataclasses.replace(
         make_rollout(),
         plans=np.zeros((0, 0, 2), dtype=np.float32),
@@ -85,10 +84,9 @@ def test_without_plans_and_forecasts(tmp_path: Path) -> None:
     assert Rollout.load(tmp_path / "0.npz").plans.shape == (0, 0, 2)
 
 
-def test_saving_again(tmp_path: Path) -> None:
-    """The same rollout gives the same bytes, and replaces what stood there."""
+def test_saving_replaces_the_file_with_the_same_bytes(tmp_path: Path) -> None:
     path = tmp_path / "0.npz"
-    path.write_text("something older")
+    path.write_text("an older file")
     make_rollout().save(path)
     first = path.read_bytes()
     make_rollout().save(path)
@@ -96,7 +94,6 @@ def test_saving_again(tmp_path: Path) -> None:
 
 
 def test_header_is_plain_json(tmp_path: Path) -> None:
-    """The header can be read without this package."""
     make_rollout().save(tmp_path / "0.npz")
     with np.load(tmp_path / "0.npz", allow_pickle=False) as file:
         header = json.loads(file["header"].tobytes())
@@ -123,15 +120,15 @@ def _pickle(path: Path) -> None:
 
 
 def _header(**changes: object) -> Callable[[Path], None]:
-    """Damage to the header: a field changed, or left out where the change is None."""
+    """Changes fields of the header, or removes those whose new value is None."""
 
     def write(path: Path) -> None:
         make_rollout().save(path)
         with np.load(path) as file:
             arrays = {name: file[name] for name in file.files}
         header = {**json.loads(arrays.pop("header").tobytes()), **changes}
-        kept = {name: value for name, value in header.items() if value is not None}
-        text = np.frombuffer(json.dumps(kept).encode(), dtype=np.uint8)
+        fields = {name: value for name, value in header.items() if value is not None}
+        text = np.frombuffer(json.dumps(fields).encode(), dtype=np.uint8)
         np.savez_compressed(path, header=text, **arrays)
 
     return write
@@ -161,15 +158,15 @@ def _missing_array(path: Path) -> None:
         _header(scenario={"tags": [], "colour": "red"}),
     ],
 )
-def test_what_is_no_rollout(tmp_path: Path, write: Callable[[Path], None]) -> None:
-    """An empty file, a folder, a table, other arrays, pickles, a header with holes."""
+def test_other_files_are_rejected(tmp_path: Path, write: Callable[[Path], None]) -> None:
+    """An empty file, a folder, a table, other arrays, pickles, an incomplete header."""
     path = tmp_path / "0.npz"
     write(path)
-    assert "not a rollout that can be read" in refused(path)
+    assert "not a readable rollout" in error_of(path)
 
 
 @pytest.mark.parametrize(
-    ("changes", "what"),
+    ("changes", "message"),
     [
         ({"valid": np.ones((4, 2), dtype=bool)}, "valid: 4 along 'ticks', expected 3"),
         ({"sizes": np.ones((3, 2), dtype=np.float32)}, "sizes: 3 along 'a', expected 2"),
@@ -184,36 +181,35 @@ def test_what_is_no_rollout(tmp_path: Path, write: Callable[[Path], None]) -> No
     ],
     ids=lambda value: next(iter(value)) if isinstance(value, dict) else None,
 )
-def test_parts_that_do_not_fit(tmp_path: Path, changes: dict[str, Any], what: str) -> None:
-    """Made or read: one line that names the part."""
+def test_inconsistent_arrays_are_rejected(
+    tmp_path: Path, changes: dict[str, Any], message: str
+) -> None:
     path = tmp_path / "0.npz"
     rollout = make_rollout()
     for name, value in changes.items():
         object.__setattr__(rollout, name, value)
     rollout.save(path)
-    assert what in refused(path)
+    assert message in error_of(path)
 
 
-def test_missing(tmp_path: Path) -> None:
-    """A file that is not there is named."""
-    assert "No such file" in refused(tmp_path / "0.npz")
+def test_missing_file(tmp_path: Path) -> None:
+    assert "No such file" in error_of(tmp_path / "0.npz")
 
 
-def test_other_format(tmp_path: Path) -> None:
-    """A rollout of another format says which."""
+def test_other_format_version(tmp_path: Path) -> None:
     path = tmp_path / "0.npz"
     _header(format=2)(path)
-    assert refused(path) == f"{path}: rollout format 2, expected 1"
+    assert error_of(path) == f"{path}: rollout format 2, expected 1"
 
 
-def test_cut_and_flipped(tmp_path: Path) -> None:
-    """A file cut short is refused; with any one bit wrong it is refused or reads as a rollout."""
+def test_truncated_files_and_flipped_bits(tmp_path: Path) -> None:
+    """A truncated file is rejected; one with a wrong bit is rejected or read as a rollout."""
     path = tmp_path / "0.npz"
     make_rollout().save(path)
     content = path.read_bytes()
     for length in range(0, len(content), 97):
         path.write_bytes(content[:length])
-        refused(path)
+        error_of(path)
     results = set()
     for at in range(0, len(content), 11):
         path.write_bytes(content[:at] + bytes([content[at] ^ 1 << at % 8]) + content[at + 1 :])

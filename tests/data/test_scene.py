@@ -1,4 +1,4 @@
-"""What a scene holds: whose slot is whose, and nothing of the future."""
+"""Contents of scenes: slots, padding, actions, and no future."""
 
 import dataclasses
 import math
@@ -24,18 +24,18 @@ def scene_at(tick: int, recording: Recording = RECORDING) -> Scene:
     return gather_scene([recording], INDEX.select(INDEX.tick == tick))
 
 
-def same(scene: Scene, other: Scene) -> None:
-    """Every array of two scenes agrees to the last bit."""
+def assert_equal(scene: Scene, other: Scene) -> None:
+    """All arrays of two scenes are equal."""
     for field in dataclasses.fields(Scene):
         if field.name not in ("maps", "dt_s"):
-            mine, its = getattr(scene, field.name), getattr(other, field.name)
-            np.testing.assert_array_equal(mine, its, err_msg=field.name)
+            one, two = getattr(scene, field.name), getattr(other, field.name)
+            np.testing.assert_array_equal(one, two, err_msg=field.name)
 
 
-def test_slots() -> None:
-    """The first target, then the others by first appearance, then id; at tick 36 all are there.
+def test_order_of_slots() -> None:
+    """The first target, then the others by first frame, then id; at tick 36 all are present.
 
-    8 came at 2 s, 7 at 4 s, all others were there from the start.
+    Track 8 appears at 2 s and track 7 at 4 s; all others are present from the start.
     """
     scene = scene_at(36)
     assert scene.ids.tolist() == [[1, 2, 3, 4, 5, 6, 9, 10, 8, 7]]
@@ -44,38 +44,36 @@ def test_slots() -> None:
     np.testing.assert_allclose(scene.sizes[0, 9], [2.2, 0.8])
 
 
-def test_one_situation_alone() -> None:
-    """Of two ticks side by side the second is what it is by itself, but for padding."""
+def test_situation_equals_a_scene_of_its_tick() -> None:
+    """Except for padding."""
     both = gather_scene([RECORDING], INDEX.select(np.isin(INDEX.tick, (36, 60))))
     alone, expected = both.situation(1), scene_at(60)
     names = ("states", "actions", "valid", "sizes", "classes", "ids")
     agents = expected.ids.shape[1]
     trimmed = {name: getattr(alone, name)[:, :agents] for name in names}
-    same(dataclasses.replace(alone, **trimmed), expected)
+    assert_equal(dataclasses.replace(alone, **trimmed), expected)
     assert len(alone.targets) < len(both.targets)
 
 
-def test_first_target_is_first() -> None:
-    """An index that starts with another track puts that one into slot 0."""
+def test_first_target_is_the_ego() -> None:
+    """The first track of the index is in slot 0."""
     at = INDEX.select(INDEX.tick == 36)
     scene = gather_scene([RECORDING], at.select(np.array([6, 3])))
     assert scene.ids.tolist() == [[7, 1, 2, 3, 4, 5, 6, 9, 10, 8]]
     assert scene.targets.tolist() == [[0, 0], [0, 4]]
 
 
-def test_ids_decide_among_equals() -> None:
-    """Of those who came together the lower id comes first, wherever it stands in the table."""
+def test_tracks_that_appear_together_are_sorted_by_id() -> None:
     ids = np.array([70, 60, 50, 40, 30, 20, 10, 9, 8, 7])
     scene = scene_at(36, dataclasses.replace(RECORDING, track_ids=ids))
     assert scene.ids.tolist() == [[70, 7, 8, 20, 30, 40, 50, 60, 9, 10]]
 
 
-def test_those_who_left_and_those_to_come() -> None:
-    """Whoever was seen within the history has a slot, whoever comes later has none."""
-    gone = Drive(kind=AgentClass.CAR, start=(0.0, 9.0, 0.0, 5.0), leaves_s=4.0)  # tick 20
-    late = Drive(kind=AgentClass.CAR, start=(0.0, 18.0, 0.0, 5.0), appears_s=7.0)  # tick 35
-    here = Drive(kind=AgentClass.CAR, start=(0.0, 0.0, 0.0, 5.0))
-    recording = make_recording(drives=(gone, late, here))
+def test_agents_have_slots_if_present_within_the_history() -> None:
+    leaves = Drive(kind=AgentClass.CAR, start=(0.0, 9.0, 0.0, 5.0), leaves_s=4.0)  # tick 20
+    appears = Drive(kind=AgentClass.CAR, start=(0.0, 18.0, 0.0, 5.0), appears_s=7.0)  # tick 35
+    always = Drive(kind=AgentClass.CAR, start=(0.0, 0.0, 0.0, 5.0))
+    recording = make_recording(drives=(leaves, appears, always))
 
     def slots(tick: int) -> tuple[list[int], list[int]]:
         index = index_snippets([recording], dt_s=0.2, horizon_s=3.0)
@@ -86,8 +84,7 @@ def test_those_who_left_and_those_to_come() -> None:
     assert slots(36) == ([3, 2], [16, 2])  # ticks 21 to 36: track 2 at 35, 36
 
 
-def test_situations_and_padding() -> None:
-    """One situation a tick; slots that nobody has are zeros with id -1."""
+def test_empty_slots_are_zeros_with_id_minus_one() -> None:
     scene = gather_scene([RECORDING], INDEX.select((INDEX.tick == 15) | (INDEX.tick == 36)))
     assert scene.tick.tolist() == [15, 36]
     assert scene.ids[0].tolist() == [1, 2, 3, 4, 5, 6, 9, 10, 8, -1]
@@ -96,8 +93,7 @@ def test_situations_and_padding() -> None:
     assert not scene.states[~scene.valid].any()
 
 
-def test_targets_in_any_order() -> None:
-    """Targets keep the order of the index, and name the tracks that it names."""
+def test_targets_are_in_the_order_of_the_index() -> None:
     some = INDEX.select(np.random.default_rng(3).permutation(len(INDEX))[:40])
     scene = gather_scene([RECORDING], some)
     at = (scene.targets[:, 0], scene.targets[:, 1])
@@ -112,7 +108,7 @@ def test_targets_in_any_order() -> None:
 @settings(max_examples=10)
 @given(tick=st.integers(5, 28).map(lambda k: 3 * k), seed=st.integers(0, 99))
 def test_no_future(tick: int, seed: int) -> None:
-    """Whatever happens after now, and whoever comes then, the scene stays the same."""
+    """A scene does not depend on later states, or on agents that appear later."""
     states = RECORDING.states.copy()
     rng = np.random.default_rng(seed)
     for track in range(len(RECORDING)):
@@ -121,7 +117,7 @@ def test_no_future(tick: int, seed: int) -> None:
             RECORDING.starts[track + 1],
         )
         states[later] = rng.normal(scale=50, size=states[later].shape)
-    newcomer = rng.normal(size=(10, 4)).astype(np.float32)
+    late_track = rng.normal(size=(10, 4)).astype(np.float32)
     other = dataclasses.replace(
         RECORDING,
         track_ids=np.append(RECORDING.track_ids, 0),
@@ -129,14 +125,14 @@ def test_no_future(tick: int, seed: int) -> None:
         sizes=np.concatenate([RECORDING.sizes, RECORDING.sizes[:1]]),
         first_frames=np.append(RECORDING.first_frames, 5 * tick + 1),
         starts=np.append(RECORDING.starts, len(states) + 10),
-        states=np.concatenate([states, newcomer]),
+        states=np.concatenate([states, late_track]),
     )
     assert not np.array_equal(states, RECORDING.states)
-    same(scene_at(tick, other), scene_at(tick))
+    assert_equal(scene_at(tick, other), scene_at(tick))
 
 
 def test_actions() -> None:
-    """They are what the cars did: braking by 1.5 m/s², circling at 0.18 rad, going straight."""
+    """Inferred actions are those of the drives: none, braking by 1.5 m/s², steering 0.18 rad."""
     scene = scene_at(18)  # 0.6 s to 3.6 s, slots in the order of ids up to 6
     assert scene.actions.shape[2] == scene.history == 15
     for slot, action in ((0, (0, 0)), (1, (-1.5, 0)), (5, (0, 0.18))):
@@ -144,35 +140,35 @@ def test_actions() -> None:
         np.testing.assert_allclose(scene.actions[0, slot], expected, atol=1e-3)
 
 
-def test_actions_need_both_ends() -> None:
-    """No action leads into or out of an unseen tick, not even for an agent without a size."""
+def test_actions_need_both_states() -> None:
+    """They are zero next to an absent tick; an absent agent may have size 0."""
     states = np.zeros((1, 4, 4), dtype=np.float32)
     states[0, :, 3] = [1, 2, 3, 5]
     valid = np.array([[False, True, True, True]])
     actions = infer_actions(states, valid, np.array([4.0], dtype=np.float32), 0.5)
     np.testing.assert_allclose(actions, [[(0, 0), (2, 0), (4, 0)]])
-    nobody = infer_actions(states, ~valid & False, np.zeros(1, dtype=np.float32), 0.5)
-    assert not nobody.any()
-    assert nobody.dtype == np.float32
+    absent = infer_actions(states, ~valid & False, np.zeros(1, dtype=np.float32), 0.5)
+    assert not absent.any()
+    assert absent.dtype == np.float32
 
 
 def test_maps() -> None:
-    """Recordings of one place share a map; each situation knows its own."""
-    here = make_map()
+    """Recordings of one place share a map, which each situation refers to."""
+    shared = make_map()
     recordings = [
-        make_recording(name="00", road_map=here),
+        make_recording(name="00", road_map=shared),
         make_recording(name="01", road_map=make_map()),
-        make_recording(name="02", road_map=here),
+        make_recording(name="02", road_map=shared),
     ]
     index = index_snippets(recordings, dt_s=0.2, horizon_s=3.0)
     scene = gather_scene(recordings, index.select(index.tick == 15))
     assert len(scene.maps) == 2
     assert scene.map_index.tolist() == [0, 1, 0]
-    assert scene.maps[0] is here
+    assert scene.maps[0] is shared
 
 
 def test_predictable() -> None:
-    """A car seen throughout is; one seen late, a bicycle and an empty slot are not."""
+    """A car that is always present is; one that appears late, and other classes, are not."""
     scene = scene_at(15).with_targets(np.array([(0, 0), (0, 6), (0, 8)]))
     assert scene.predictable.tolist() == [True, False, False]  # car, bicycle, pedestrian
     late = SnippetIndex(
@@ -181,15 +177,14 @@ def test_predictable() -> None:
         tick=np.array([30]),
         dt_s=0.2,
         history=15,
-        horizon=15,
+        horizon_ticks=15,
     )
-    assert gather_scene([RECORDING], late).predictable.tolist() == [False]  # comes at tick 20
+    assert gather_scene([RECORDING], late).predictable.tolist() == [False]  # from tick 20 on
 
 
-def test_time_step() -> None:
-    """A predictor made for another time step is refused, one for the same is not."""
+def test_check_of_the_time_step() -> None:
     scene = scene_at(15)
-    scene.check_dt(0.2, "it")
-    scene.check_dt(math.nextafter(0.2, 1), "it")
-    with pytest.raises(AspEnvError, match=r"it was made for a time step of 0\.1 s.* has 0\.2 s"):
-        scene.check_dt(0.1, "it")
+    scene.check_dt(0.2, "mtp")
+    scene.check_dt(math.nextafter(0.2, 1), "mtp")
+    with pytest.raises(AspEnvError, match=r"mtp was made for a time step of 0\.1 s.* has 0\.2 s"):
+        scene.check_dt(0.1, "mtp")

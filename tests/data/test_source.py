@@ -1,4 +1,4 @@
-"""DATA: what it may be, and recordings that are opened late and once."""
+"""Sources of data, and the recordings that they open lazily."""
 
 import os
 import struct
@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from asp_env import registry
-from asp_env.data.readers import folders, opening
+from asp_env.data.readers import layout, opening
 from asp_env.data.recording import Recording
 from asp_env.data.source import Recordings, load, open_data
 from asp_env.errors import AspEnvError, DataError
@@ -17,40 +17,40 @@ from tests.data.levelx_files import write_folder, write_map, write_recording
 
 
 @pytest.fixture
-def kept(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-    """A cache folder of the test's own."""
+def cache_folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """A cache folder for one test."""
     monkeypatch.setenv("ASP_ENV_CACHE", str(tmp_path / "cache"))
     return tmp_path / "cache"
 
 
 @pytest.fixture
-def folder(tmp_path: Path, kept: Path) -> Path:
-    """A folder of three recordings at one place, and a cache of its own."""
-    assert not kept.exists()
+def folder(tmp_path: Path, cache_folder: Path) -> Path:
+    """A folder of three recordings at one place, with an empty cache."""
+    assert not cache_folder.exists()
     return write_folder(tmp_path / "folder", recordings=3)
 
 
 @pytest.fixture
 def reads(monkeypatch: pytest.MonkeyPatch) -> list[str]:
-    """The files that were read rather than found in the cache, in order."""
-    seen: list[str] = []
-    read_tracks, read_lanelet2 = opening.read_tracks, opening.read_lanelet2
+    """The files that are read instead of their cache entries, in order."""
+    names: list[str] = []
+    read_levelx, read_lanelet2 = opening.read_levelx, opening.read_lanelet2
 
     def tracks(files):
-        seen.append(files.tracks.name)
-        return read_tracks(files)
+        names.append(files.tracks.name)
+        return read_levelx(files)
 
     def lanelets(path, origin):
-        seen.append(path.name)
+        names.append(path.name)
         return read_lanelet2(path, origin)
 
-    monkeypatch.setattr(opening, "read_tracks", tracks)
+    monkeypatch.setattr(opening, "read_levelx", tracks)
     monkeypatch.setattr(opening, "read_lanelet2", lanelets)
-    return seen
+    return names
 
 
 def equal(recording: Recording, other: Recording) -> bool:
-    """Whether two recordings hold the same, bit for bit."""
+    """Whether two recordings have equal tracks and maps."""
     return all(
         np.array_equal(getattr(recording, name), getattr(other, name))
         for name in ("track_ids", "classes", "sizes", "first_frames", "starts", "states")
@@ -62,8 +62,7 @@ def equal(recording: Recording, other: Recording) -> bool:
     )
 
 
-def test_opened_late_and_once(folder: Path, reads: list[str]) -> None:
-    """Listing reads nothing; a recording is read when asked for, its map with it, both once."""
+def test_recordings_and_maps_are_read_at_first_access(folder: Path, reads: list[str]) -> None:
     recordings = open_data(folder)
     assert (len(recordings), recordings.names) == (3, ("00", "01", "02"))
     assert recordings.source == str(folder)
@@ -79,20 +78,28 @@ def test_opened_late_and_once(folder: Path, reads: list[str]) -> None:
         recordings[3]
 
 
-def test_from_the_cache(folder: Path, kept: Path, reads: list[str]) -> None:
-    """The second time nothing is read, all is equal, mapped and read-only; disk use is smaller."""
+def test_second_time_comes_from_the_cache(
+    folder: Path, cache_folder: Path, reads: list[str]
+) -> None:
+    """The arrays are equal and read-only, and smaller on disk than the files."""
     before = open_data(folder)[0]
     del reads[:]
-    after = load(folder)[0]
+    after = open_data(folder)[0]
     assert reads == []
     assert equal(before, after)
     assert (after.num_frames, after.frame_rate_hz, after.location) == (250, 25.0, "1")
     for array in (after.states, after.starts, after.road_map.lanes.points):
         assert not array.flags.writeable
     sources = [path for path in folder.rglob("*") if path.is_file() and path.name[:2] not in "0102"]
-    assert sum(path.stat().st_size for path in kept.iterdir()) < sum(
+    assert sum(path.stat().st_size for path in cache_folder.iterdir()) < sum(
         path.stat().st_size for path in sources
     )
+
+
+def test_load_is_deprecated(folder: Path) -> None:
+    with pytest.warns(DeprecationWarning, match=r"use asp_env\.open_data"):
+        recordings = load(folder)
+    assert recordings.names == open_data(folder).names
 
 
 @pytest.mark.parametrize(
@@ -105,35 +112,36 @@ def test_from_the_cache(folder: Path, kept: Path, reads: list[str]) -> None:
         ("location1.osm", ["location1.osm"]),
     ],
 )
-def test_renewed_when_files_change(
-    folder: Path, kept: Path, reads: list[str], name: str, read_again: list[str]
+def test_changed_files_are_read_again(
+    folder: Path, cache_folder: Path, reads: list[str], name: str, read_again: list[str]
 ) -> None:
-    """A file touched since makes what came from it be read anew, in place of the old."""
+    """The cache entries are replaced."""
     open_data(folder)[0]
-    entries = sorted(kept.iterdir())
+    entries = sorted(cache_folder.iterdir())
     del reads[:]
     (path,) = folder.rglob(name)
     os.utime(path, ns=(1, 1))
     open_data(folder)[0]
     assert reads == read_again
-    assert sorted(kept.iterdir()) == entries
+    assert sorted(cache_folder.iterdir()) == entries
 
 
-def test_changed_content_is_seen(folder: Path) -> None:
-    """A position that is changed in the file is what is read next."""
+def test_changed_content_is_read(folder: Path) -> None:
     before = open_data(folder)[0].states[0, 0]
     path = folder / "data" / "00_tracks.csv"
     path.write_text(path.read_text().replace(",5.0,", ",6.5,", 1))
     assert open_data(folder)[0].states[0, 0] == before + 1.5
 
 
-def test_damaged_cache_is_made_anew(folder: Path, kept: Path, reads: list[str]) -> None:
-    """Truncated entries are read anew without a word."""
+def test_damaged_cache_entries_are_replaced(
+    folder: Path, cache_folder: Path, reads: list[str]
+) -> None:
+    """Without a warning."""
     before = open_data(folder)[0]
     states = before.states.copy()
-    for path in kept.iterdir():
+    for path in cache_folder.iterdir():
         content = path.read_bytes()
-        path.unlink()  # a mapping of the old file stays whole
+        path.unlink()  # so that the mapping of the old file remains valid
         path.write_bytes(content[: len(content) // 2])
     del reads[:]
     assert np.array_equal(open_data(folder)[0].states, states)
@@ -143,12 +151,12 @@ def test_damaged_cache_is_made_anew(folder: Path, kept: Path, reads: list[str]) 
 def test_without_a_cache(
     folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, reads: list[str]
 ) -> None:
-    """Where nothing can be kept a warning says so, and recordings are read all the same."""
+    """If nothing can be cached, a warning is issued and recordings are read anyway."""
     before = open_data(folder)[0]
     (tmp_path / "file").write_text("")
     monkeypatch.setenv("ASP_ENV_CACHE", str(tmp_path / "file" / "below"))
     del reads[:]
-    with pytest.warns(UserWarning, match="nothing is kept for next time: cache folder"):
+    with pytest.warns(UserWarning, match="results are not cached: cache folder"):
         after = open_data(folder)[0]
     assert reads == ["location1.osm", "00_tracks.csv"]
     assert equal(before, after)
@@ -156,7 +164,7 @@ def test_without_a_cache(
 
 
 def test_full_disk(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """A cache that cannot be written in the end is no fault of the recording either."""
+    """A recording opens even if its cache entry cannot be written."""
 
     def refuse(*_: object) -> None:
         raise OSError(28, "No space left on device")
@@ -166,8 +174,7 @@ def test_full_disk(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
         assert len(open_data(folder)[0]) == 3
 
 
-def test_one_bad_among_good(folder: Path) -> None:
-    """A recording that cannot be read is so alone; the others open."""
+def test_damaged_recording_does_not_affect_the_others(folder: Path) -> None:
     (folder / "data" / "01_tracks.csv").write_text("")
     recordings = open_data(folder)
     assert [recordings[number].name for number in (0, 2)] == ["00", "02"]
@@ -176,7 +183,7 @@ def test_one_bad_among_good(folder: Path) -> None:
 
 
 def test_subset(folder: Path, reads: list[str]) -> None:
-    """Some of the recordings, in the order asked for, sharing those that are open."""
+    """A subset has the given order and shares open recordings."""
     recordings = open_data(folder)
     first = recordings[2]
     some = recordings.subset([2, 0])
@@ -190,8 +197,7 @@ def test_subset(folder: Path, reads: list[str]) -> None:
     assert some.hashes() == (recordings.hashes()[2], recordings.hashes()[0])
 
 
-def test_origin_of_each_recording(folder: Path) -> None:
-    """Recordings of one place with other origins see its map from there."""
+def test_recordings_with_another_origin_have_a_map_of_their_own(folder: Path) -> None:
     path = folder / "data" / "01_recordingMeta.csv"
     path.write_text(path.read_text().replace("300000.0", "300010.0"))
     maps = [recording.road_map for recording in open_data(folder)]
@@ -201,38 +207,37 @@ def test_origin_of_each_recording(folder: Path) -> None:
 
 
 def test_background(folder: Path) -> None:
-    """A picture comes with its scale: 120 m of road need 0.06 m of 0.01 m/px in 2,100 pixels."""
+    """The scale is inferred: 120 m of road in 2,100 pixels need 0.06 m/px."""
     head = b"\x89PNG\r\n\x1a\n" + struct.pack(">I4sII", 13, b"IHDR", 2_100, 900)
     (folder / "data" / "00_background.png").write_bytes(head)
-    (folder / "data" / "01_background.png").write_bytes(b"no picture")
+    (folder / "data" / "01_background.png").write_bytes(b"no image")
     recordings = open_data(folder)
     background = recordings[0].background
     assert background is not None
     assert background.path.name == "00_background.png"
     assert background.metres_per_pixel == pytest.approx(0.06)
     assert recordings[1].background is None
-    assert recordings[1].repairs == ("01_background.png left out: its scale cannot be told",)
+    assert recordings[1].repairs == ("01_background.png left out: its scale is unknown",)
     assert recordings[2].background is None
 
 
-def test_hashes_are_of_content(folder: Path, tmp_path: Path) -> None:
-    """The same files elsewhere hash alike, recordings differ, and every file counts."""
+def test_hashes_depend_on_content_alone(folder: Path, tmp_path: Path) -> None:
+    """Not on the folder; recordings differ, and every file counts."""
     recordings = open_data(folder)
     assert len(set(recordings.hashes())) == 3
     moved = tmp_path / "elsewhere"
     write_folder(moved, recordings=3)
     assert open_data(moved).data_hash() == recordings.data_hash()
-    seen = {recordings.data_hash()}
+    hashes = {recordings.data_hash()}
     for name in ("02_tracks.csv", "02_tracksMeta.csv", "02_recordingMeta.csv", "location1.osm"):
         (path,) = moved.rglob(name)
         path.write_text(path.read_text() + "\n")
-        seen.add(open_data(moved).data_hash())
-    assert len(seen) == 5
+        hashes.add(open_data(moved).data_hash())
+    assert len(hashes) == 5
     assert open_data(moved).hashes()[0] != recordings.hashes()[0]
 
 
-def test_hash_is_kept(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """The second time no file is read for its hash."""
+def test_hashes_are_cached(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     expected = open_data(folder).data_hash()
 
     def refuse(path: Path) -> str:
@@ -243,7 +248,7 @@ def test_hash_is_kept(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 def test_folders_are_searched_once(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Opening and hashing three recordings looks through each folder as often as one does."""
+    """Opening and hashing three recordings searches no folder more often than opening one."""
     searched: list[Path] = []
     walk = os.walk
 
@@ -251,7 +256,7 @@ def test_folders_are_searched_once(folder: Path, monkeypatch: pytest.MonkeyPatch
         searched.append(root)
         return walk(root, followlinks=followlinks)
 
-    monkeypatch.setattr(folders.os, "walk", counted)
+    monkeypatch.setattr(layout.os, "walk", counted)
     recordings = open_data(folder)
     assert recordings[0].road_map is recordings[1].road_map
     once = len(searched)
@@ -262,17 +267,17 @@ def test_folders_are_searched_once(folder: Path, monkeypatch: pytest.MonkeyPatch
 
 
 def test_registered_source(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """A scheme that a package registers is called with what follows the colon."""
-    given: list[str] = []
+    """The registered function is called with the text behind the colon."""
+    arguments: list[str] = []
 
     def source(argument: str) -> Path:
-        given.append(argument)
+        arguments.append(argument)
         return folder
 
     monkeypatch.setattr(registry, "names", lambda _: ("made-up",))
     monkeypatch.setattr(registry, "find", lambda *_: source)
     recordings = open_data("made-up:place:7")
-    assert given == ["place:7"]
+    assert arguments == ["place:7"]
     assert recordings.source == "made-up:place:7"
     assert len(recordings) == 3
 
@@ -288,10 +293,9 @@ def test_registered_source(folder: Path, monkeypatch: pytest.MonkeyPatch) -> Non
         ("file", "is a file; expected a folder"),
     ],
 )
-def test_bad_data(
-    tmp_path: Path, kept: Path, monkeypatch: pytest.MonkeyPatch, data: str, expected: str
+def test_unusable_data_are_rejected(
+    tmp_path: Path, cache_folder: Path, monkeypatch: pytest.MonkeyPatch, data: str, expected: str
 ) -> None:
-    """What is no DATA is refused with one line that says what would be."""
     monkeypatch.chdir(tmp_path)
     (tmp_path / "empty").mkdir()
     (tmp_path / "file").write_text("")
@@ -299,20 +303,21 @@ def test_bad_data(
         open_data(data)
     assert expected in str(caught.value)
     assert "\n" not in str(caught.value)
-    assert not kept.exists()
+    assert not cache_folder.exists()
 
 
-def test_colon_in_a_folder(tmp_path: Path, kept: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """A folder that exists is that folder, even if its name looks like a scheme."""
+def test_existing_folder_whose_name_looks_like_a_scheme(
+    tmp_path: Path, cache_folder: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.chdir(tmp_path)
     write_recording(tmp_path / "run:1")
     write_map(tmp_path / "run:1")
     assert open_data("run:1")[0].name == "00"
-    assert kept.exists()
+    assert cache_folder.exists()
 
 
 def test_from_inside_the_data_folder(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Standing in `data`, `.` finds the recordings there and the maps beside it."""
+    """In `data`, `.` stands for the recordings there, with the maps beside it."""
     monkeypatch.chdir(folder / "data")
     recordings = open_data(".")
     assert recordings.source == "."

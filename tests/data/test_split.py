@@ -1,4 +1,4 @@
-"""Splits: shares, no overlap in time, the same every time."""
+"""Splits: shares, separation in time, reproducibility."""
 
 import hypothesis.strategies as st
 import numpy as np
@@ -10,7 +10,7 @@ from asp_env.errors import AspEnvError
 
 
 def snippets(lengths: list[int], span: int, every: int) -> tuple[np.ndarray, ...]:
-    """(recording, first, last) of all snippets of `span` ticks, every so many ticks."""
+    """(recording, first, last) of snippets of `span` ticks that start every `every` ticks."""
     rows = [
         (number, first, first + span - 1)
         for number, length in enumerate(lengths)
@@ -20,14 +20,13 @@ def snippets(lengths: list[int], span: int, every: int) -> tuple[np.ndarray, ...
     return table[:, 0], table[:, 1], table[:, 2]
 
 
-def test_ten_equal_recordings() -> None:
-    """Ten recordings of as many snippets: eight, one and one."""
+def test_ten_equal_recordings_are_split_8_1_1() -> None:
     parts = split_by_recording(np.full(10, 7), ["1"] * 10)
     assert sorted(parts) == ["test"] + ["train"] * 8 + ["validation"]
 
 
 def test_shares_are_of_snippets() -> None:
-    """Where counts allow it exactly, test and validation get a tenth of the snippets each."""
+    """If the counts allow it, test and validation get exactly a tenth of the snippets each."""
     counts = np.array([400, 300, 100, 50, 50, 60, 40])
     parts = np.array(split_by_recording(counts, ["1"] * 7))
     assert counts[parts == "test"].sum() == 100
@@ -35,7 +34,7 @@ def test_shares_are_of_snippets() -> None:
 
 
 def test_each_location_is_split() -> None:
-    """Every location with three recordings gives one to test; one with two is trained on."""
+    """A location with three recordings has one test recording; one with two has none."""
     locations = ["4", "4", "4", "1", "1", "1", "2", "2"]
     parts = split_by_recording(np.full(8, 5), locations)
     for place in (slice(0, 3), slice(3, 6)):
@@ -43,8 +42,8 @@ def test_each_location_is_split() -> None:
     assert parts[6:] == ("train", "train")
 
 
-def test_recordings_without_snippets() -> None:
-    """They are left out, and do not count towards the three that a location needs."""
+def test_recordings_without_snippets_are_left_out() -> None:
+    """They do not count towards the three recordings that a location needs."""
     parts = split_by_recording(np.array([9, 0, 9, 9, 0]), ["1"] * 5)
     assert [part == "none" for part in parts] == [False, True, False, False, True]
     with pytest.raises(AspEnvError, match=r"at most 2 recordings .* use --split blocks"):
@@ -52,15 +51,14 @@ def test_recordings_without_snippets() -> None:
 
 
 @pytest.mark.parametrize("counts", [[], [0, 0, 0]])
-def test_nothing_to_split(counts: list[int]) -> None:
-    """Without snippets there is nothing to test on, and the error names the way out."""
+def test_no_snippets_to_split(counts: list[int]) -> None:
     with pytest.raises(AspEnvError, match="--split blocks"):
         split_by_recording(np.array(counts, dtype=np.int64), ["1"] * len(counts))
 
 
 @given(counts=st.lists(st.integers(1, 900), min_size=3, max_size=20), seed=st.integers(0, 99))
 def test_by_recording_laws(counts: list[int], seed: int) -> None:
-    """Every part has a recording, most snippets train, and the same seed splits alike."""
+    """Every part has a recording, and the split is reproducible."""
     table = np.array(counts)
     parts = split_by_recording(table, ["1"] * len(counts), seed=seed)
     assert set(parts) == {"train", "validation", "test"}
@@ -73,25 +71,26 @@ def test_by_recording_laws(counts: list[int], seed: int) -> None:
     every=st.integers(1, 5),
     seed=st.integers(0, 200),
 )
-def test_block_laws(lengths: list[int], span: int, every: int, seed: int) -> None:
-    """Between two snippets of different parts of a recording lies at least a whole snippet."""
+def test_parts_are_at_least_one_snippet_apart(
+    lengths: list[int], span: int, every: int, seed: int
+) -> None:
     recording, first, last = snippets(lengths, span, every)
     parts = split_blocks(recording, first, last, lengths=np.array(lengths), seed=seed)
     assert set(parts) <= {"train", "validation", "test", "none"}
     for number in range(len(lengths)):
-        here = recording == number
+        own = recording == number
         for part in ("train", "validation", "test"):
-            mine = here & (parts == part)
-            others = here & (parts != part) & (parts != "none")
-            if mine.any() and others.any():
+            inside = own & (parts == part)
+            others = own & (parts != part) & (parts != "none")
+            if inside.any() and others.any():
                 between = np.maximum(
-                    first[others] - last[mine][:, None], first[mine][:, None] - last[others]
+                    first[others] - last[inside][:, None], first[inside][:, None] - last[others]
                 )
                 assert between.min() - 1 >= span
 
 
 def test_block_shares() -> None:
-    """A long recording gives test nearly a tenth of its snippets, and training most."""
+    """Of a long recording, test and validation get nearly a tenth of the snippets each."""
     lengths = [6_000]
     parts = split_blocks(*snippets(lengths, 31, 3), lengths=np.array(lengths))
     share = {part: float((parts == part).mean()) for part in ("train", "validation", "test")}
@@ -100,8 +99,7 @@ def test_block_shares() -> None:
     assert share["train"] > 0.75
 
 
-def test_blocks_do_not_depend_on_company() -> None:
-    """A recording's blocks lie at the same place whatever others are split with it."""
+def test_blocks_do_not_depend_on_other_recordings() -> None:
     recording, first, last = snippets([700, 500], 31, 3)
     both = split_blocks(recording, first, last, lengths=np.array([700, 500]))
     alone = split_blocks(*snippets([500], 31, 3), lengths=np.array([500]))
@@ -110,7 +108,7 @@ def test_blocks_do_not_depend_on_company() -> None:
 
 @pytest.mark.parametrize("seed", [42, 0, 1, 2])
 def test_one_block_of_each(seed: int) -> None:
-    """Single ticks as snippets show the blocks: of ten one tests, one validates, none adjoining."""
+    """Snippets of one tick show the blocks: one each for test and validation, not adjoining."""
     parts = split_blocks(*snippets([1_000], 1, 1), lengths=np.array([1_000]), seed=seed)
     test, validation = (np.flatnonzero(parts == part) for part in ("test", "validation"))
     assert len(test) == len(validation) == 100

@@ -1,4 +1,4 @@
-"""Ticks by hand, and what is said to a rate that does not divide."""
+"""Ticks as whole numbers of frames, and durations as whole numbers of ticks."""
 
 import math
 import re
@@ -13,7 +13,6 @@ from asp_env.errors import AspEnvError
 
 @pytest.mark.parametrize(("rate_hz", "frames"), [(25.0, 5), (10.0, 2), (30.0, 6), (15.0, 3)])
 def test_default_tick(rate_hz: float, frames: int) -> None:
-    """0.2 s are 5 frames at 25 Hz, 2 at 10, 6 at 30, 3 at 15."""
     assert DEFAULT_DT_S == 0.2
     assert frames_per_tick(rate_hz) == frames
 
@@ -22,7 +21,6 @@ def test_default_tick(rate_hz: float, frames: int) -> None:
     ("rate_hz", "dt_s", "frames"), [(25.0, 0.04, 1), (10.0, 1.0, 10), (29.97, 1001 / 5000, 6)]
 )
 def test_other_ticks(rate_hz: float, dt_s: float, frames: int) -> None:
-    """One frame, many frames, and the rate of films."""
     assert frames_per_tick(rate_hz, dt_s) == frames
 
 
@@ -34,8 +32,9 @@ def test_other_ticks(rate_hz: float, dt_s: float, frames: int) -> None:
         (10.0, 0.05, "0.1, 0.2, 0.3"),  # half a frame: 1 to 3 of them
     ],
 )
-def test_refusal(rate_hz: float, dt_s: float, nearby: str) -> None:
-    """A tick that is no whole number of frames is refused with those near it that are."""
+def test_other_time_steps_are_rejected_with_suggestions(
+    rate_hz: float, dt_s: float, nearby: str
+) -> None:
     with pytest.raises(AspEnvError) as caught:
         frames_per_tick(rate_hz, dt_s)
     assert str(caught.value) == (
@@ -45,8 +44,7 @@ def test_refusal(rate_hz: float, dt_s: float, nearby: str) -> None:
 
 
 @given(rate_hz=st.floats(1, 240), dt_s=st.floats(0.01, 2))
-def test_what_is_suggested_is_accepted(rate_hz: float, dt_s: float) -> None:
-    """Whoever types one of the listed steps gets a whole number of frames."""
+def test_suggested_time_steps_are_accepted(rate_hz: float, dt_s: float) -> None:
     try:
         frames = frames_per_tick(rate_hz, dt_s)
     except AspEnvError as error:
@@ -59,8 +57,7 @@ def test_what_is_suggested_is_accepted(rate_hz: float, dt_s: float) -> None:
 
 
 @pytest.mark.parametrize("bad", [0.0, -0.2, math.nan, math.inf])
-def test_impossible_numbers(bad: float) -> None:
-    """Neither a rate nor a time step can be zero, negative, or no number."""
+def test_rates_and_time_steps_must_be_positive_numbers(bad: float) -> None:
     with pytest.raises(AspEnvError, match=r"time step .* expected a positive number"):
         frames_per_tick(25.0, bad)
     with pytest.raises(AspEnvError, match=r"frame rate .* expected a positive number"):
@@ -70,21 +67,19 @@ def test_impossible_numbers(bad: float) -> None:
 @pytest.mark.parametrize(
     ("duration_s", "dt_s", "count"), [(3.0, 0.2, 15), (6.0, 0.2, 30), (0.6, 0.2, 3), (3.0, 0.1, 30)]
 )
-def test_ticks(duration_s: float, dt_s: float, count: int) -> None:
-    r"""3 s are 15 ticks of 0\.2 s, although 0.2 · 15 is not 3 to the last bit."""
+def test_ticks_of_a_duration(duration_s: float, dt_s: float, count: int) -> None:
+    """3 s are 15 ticks of 0.2 s, although 0.2 · 15 is not exactly 3 in binary."""
     assert ticks(duration_s, dt_s) == count
 
 
 @pytest.mark.parametrize(("duration_s", "dt_s"), [(0.5, 0.2), (0.1, 0.2)])
-def test_no_whole_number_of_ticks(duration_s: float, dt_s: float) -> None:
-    """Half ticks are refused."""
+def test_partial_ticks_are_rejected(duration_s: float, dt_s: float) -> None:
     with pytest.raises(AspEnvError, match=r"no whole number of ticks of 0\.2 s"):
         ticks(duration_s, dt_s)
 
 
 @pytest.mark.parametrize("bad_s", [0.0, -0.2, math.nan, math.inf])
-def test_times_that_are_no_positive_numbers(bad_s: float) -> None:
-    """Neither as a duration nor as a time step."""
+def test_durations_must_be_positive_numbers(bad_s: float) -> None:
     with pytest.raises(AspEnvError, match="expected a positive number"):
         ticks(bad_s, 0.2)
     with pytest.raises(AspEnvError, match="expected a positive number"):

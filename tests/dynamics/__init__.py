@@ -1,1 +1,1 @@
-"""How a vehicle moves."""
+"""Tests of `asp_env.dynamics`."""

@@ -1,4 +1,4 @@
-"""Generated states and actions for the laws of motion."""
+"""Generated states and actions for the laws of the bicycle model."""
 
 from dataclasses import dataclass
 
@@ -13,7 +13,7 @@ ROWS = 8
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Motion:
-    """Where some vehicles start and what they do for one tick."""
+    """States of some vehicles and their actions for one tick."""
 
     states: Float[np.ndarray, "n 4"]
     actions: Float[np.ndarray, "n 2"]
@@ -30,7 +30,7 @@ def between(low: float, high: float, *shape: int) -> SearchStrategy[np.ndarray]:
 def motions(draw: DrawFn, *, forwards: bool = False) -> Motion:
     """Vehicles of 3.5 to 18 m that move at 1.5 to 28 m/s, half of them backwards.
 
-    In a tick of at most 0.2 s none comes under 0.5 m/s or turns by half a circle.
+    In a tick of at most 0.2 s none becomes slower than 0.5 m/s or turns by half a circle.
     """
     speeds = draw(between(1.5, 28, ROWS))
     if not forwards:
@@ -48,7 +48,7 @@ def motions(draw: DrawFn, *, forwards: bool = False) -> Motion:
 
 @st.composite
 def extremes(draw: DrawFn) -> Motion:
-    """Anything finite up to a million, with zeros, full turns and steering beyond every limit."""
+    """Finite numbers up to a million, with zeros, full turns and steering beyond all limits."""
     special = st.sampled_from([0.0, -0.0, 1e-300, np.pi, -np.pi, np.pi / 2, 2 * np.pi, 0.5, 1e6])
     element = st.one_of(special, st.floats(-1e6, 1e6))
     return Motion(
@@ -60,7 +60,7 @@ def extremes(draw: DrawFn) -> Motion:
 
 
 def apart(states: np.ndarray, others: np.ndarray) -> float:
-    """The largest difference between states; headings by the angle between them."""
+    """Largest difference between states; of headings, the chord of the angle between them."""
     delta = np.abs(states - others)
     turned = others[..., 2] - states[..., 2]
     delta[..., 2] = np.hypot(np.cos(turned) - 1, np.sin(turned))

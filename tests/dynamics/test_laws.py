@@ -10,7 +10,6 @@ import torch
 from hypothesis import given
 
 from asp_env.dynamics import MAX_STEERING_RAD, forward, inverse, rollout
-from asp_env.geometry import wrap_angle
 from tests.dynamics.motions import ROWS, Motion, apart, between, extremes, motions
 
 Integrator = Literal["heun", "euler"]
@@ -20,7 +19,7 @@ both = pytest.mark.parametrize("integrator", INTEGRATORS)
 
 
 def step(motion: Motion, integrator: Integrator = "heun", *, reverse: bool = True) -> np.ndarray:
-    """The states one tick later."""
+    """States one tick later."""
     return forward(
         motion.states,
         motion.actions,
@@ -34,15 +33,14 @@ def step(motion: Motion, integrator: Integrator = "heun", *, reverse: bool = Tru
 @both
 @given(motion=motions())
 def test_inverse_undoes_forward(integrator: Integrator, motion: Motion) -> None:
-    """Away from standstill, forwards or backwards, the actions come back to 1e-9."""
+    """Away from standstill, forwards or backwards, actions are recovered to 1e-9."""
     after = step(motion, integrator)
     found = inverse(motion.states, after, motion.lengths_m, motion.dt_s, integrator=integrator)
     np.testing.assert_allclose(found, motion.actions, atol=1e-9, rtol=0)
 
 
 @given(motion=motions(), elsewhere=between(-500, 500, ROWS, 2))
-def test_inverse_reads_no_positions(motion: Motion, elsewhere: np.ndarray) -> None:
-    """Headings and speeds alone decide on the actions."""
+def test_inverse_ignores_positions(motion: Motion, elsewhere: np.ndarray) -> None:
     after = step(motion)
     moved = np.concatenate([elsewhere, after[:, 2:]], axis=1)
     actions, others = (
@@ -55,7 +53,7 @@ def test_inverse_reads_no_positions(motion: Motion, elsewhere: np.ndarray) -> No
 @pytest.mark.parametrize("reverse", [False, True])
 @given(motion=extremes(), dtype=st.sampled_from([np.float32, np.float64]))
 def test_never_nan(integrator: Integrator, reverse: bool, motion: Motion, dtype: type) -> None:
-    """Whatever finite numbers come in, finite numbers come out, in NumPy and torch."""
+    """Finite inputs give finite outputs, in NumPy and torch."""
     states, actions = motion.states.astype(dtype), motion.actions.astype(dtype)
     lengths = motion.lengths_m.astype(dtype)
     after = forward(states, actions, lengths, motion.dt_s, integrator=integrator, reverse=reverse)
@@ -71,27 +69,6 @@ def test_never_nan(integrator: Integrator, reverse: bool, motion: Motion, dtype:
     assert undone.isfinite().all()
 
 
-@given(angle=st.floats(-1e4, 1e4), dtype=st.sampled_from([np.float32, np.float64]))
-def test_wrapped_angle_is_the_same_angle(angle: float, dtype: type) -> None:
-    """Wrapping changes neither sine nor cosine and stays within π of zero."""
-    given_angle = np.array(angle, dtype=dtype)
-    wrapped = wrap_angle(given_angle)
-    assert wrapped.dtype == dtype
-    assert abs(wrapped) <= dtype(math.pi)
-    turned = float(wrapped) - float(given_angle)
-    slack = 1e-2 if dtype is np.float32 else 1e-11
-    assert abs(math.remainder(turned, 2 * math.pi)) < slack
-
-
-@pytest.mark.parametrize(
-    ("angle", "wrapped"),
-    [(0.0, 0.0), (math.pi, -math.pi), (-math.pi, -math.pi), (7.0, 7 - 2 * math.pi)],
-)
-def test_wrapping_by_hand(angle: float, wrapped: float) -> None:
-    """π is written -π, 7 is 7 - 2π."""
-    assert wrap_angle(angle) == pytest.approx(wrapped, abs=1e-12)
-
-
 @both
 @pytest.mark.parametrize("reverse", [False, True])
 @given(states=between(-20, 20, 3, 4), actions=between(-5, 5, 3, 12, 2), lengths=between(1, 18, 3))
@@ -102,7 +79,7 @@ def test_rollout_is_repeated_forward(
     actions: np.ndarray,
     lengths: np.ndarray,
 ) -> None:
-    """Cumulative sums give what stepping gives, also through standstill."""
+    """Cumulative sums give the same as stepping, also through standstill."""
     at_once = rollout(states, actions, lengths, 0.2, integrator=integrator, reverse=reverse)
     for k in range(actions.shape[1]):
         states = forward(
@@ -114,7 +91,6 @@ def test_rollout_is_repeated_forward(
 @both
 @given(motion=motions())
 def test_numpy_equals_torch(integrator: Integrator, motion: Motion) -> None:
-    """The same code gives the same numbers in both libraries."""
     after = step(motion, integrator)
     states, actions, lengths = (
         torch.from_numpy(array) for array in (motion.states, motion.actions, motion.lengths_m)
@@ -128,7 +104,7 @@ def test_numpy_equals_torch(integrator: Integrator, motion: Motion) -> None:
 
 @given(motion=motions())
 def test_float32_stays_float32(motion: Motion) -> None:
-    """Neither direction widens its input, and float32 agrees with float64 to a millimetre."""
+    """Outputs have the dtype of the inputs, and float32 agrees with float64 to a millimetre."""
     narrow = Motion(
         states=motion.states.astype(np.float32),
         actions=motion.actions.astype(np.float32),
@@ -147,7 +123,7 @@ def test_float32_stays_float32(motion: Motion) -> None:
 
 @given(motion=motions(forwards=True), shift=between(-300, 300, 2), turn=st.floats(-7, 7))
 def test_equivariance(motion: Motion, shift: np.ndarray, turn: float) -> None:
-    """Turning and moving the world, then driving, is driving, then turning and moving it."""
+    """Rotating and translating the states, then driving, equals driving, then doing so."""
     cos, sin = math.cos(turn), math.sin(turn)
 
     def moved(states: np.ndarray) -> np.ndarray:
@@ -164,8 +140,8 @@ def test_equivariance(motion: Motion, shift: np.ndarray, turn: float) -> None:
 
 
 @given(motion=motions(), other=motions())
-def test_rows_do_not_know_of_each_other(motion: Motion, other: Motion) -> None:
-    """One vehicle's motion is the same, whoever else is in the batch."""
+def test_rows_are_independent(motion: Motion, other: Motion) -> None:
+    """A vehicle's motion does not depend on the other rows of the batch."""
     mixed = Motion(
         states=np.concatenate([motion.states[:1], other.states[1:]]),
         actions=np.concatenate([motion.actions[:1], other.actions[1:]]),
@@ -177,7 +153,7 @@ def test_rows_do_not_know_of_each_other(motion: Motion, other: Motion) -> None:
 
 @pytest.mark.parametrize("shape", [(), (0,), (8,), (2, 4), (2, 1, 4)])
 def test_any_batch_axes(shape: tuple[int, ...]) -> None:
-    """The axes in front say how the rows are arranged, nothing else."""
+    """Leading axes only arrange the rows."""
     rng = np.random.default_rng(0)
     motion = Motion(
         states=rng.uniform(-3, 3, (ROWS, 4)),
@@ -201,7 +177,7 @@ def test_any_batch_axes(shape: tuple[int, ...]) -> None:
 
 @given(motion=motions(forwards=True))
 def test_braking_ends_at_rest(motion: Motion) -> None:
-    """28 m/s end within 5.6 s at -5 m/s²; then nothing changes, with the brake or without."""
+    """28 m/s end within 5.6 s at -5 m/s²; then nothing changes, braking or not."""
     braking = np.broadcast_to([-5.0, 0.1], (ROWS, 28, 2))
     stopped = rollout(motion.states, braking, motion.lengths_m, 0.2)[:, -1]
     assert (stopped[:, 3] == 0).all()
@@ -214,13 +190,13 @@ def test_braking_ends_at_rest(motion: Motion) -> None:
 @both
 @pytest.mark.parametrize("reverse", [False, True])
 def test_gradient_at_zero(integrator: Integrator, reverse: bool) -> None:
-    """Standing still with the wheels straight, every derivative is a finite number."""
+    """At standstill with straight wheels every derivative is finite."""
     states = torch.zeros(2, 4, dtype=torch.float64, requires_grad=True)
     actions = torch.zeros(2, 5, 2, dtype=torch.float64, requires_grad=True)
     lengths = torch.full((2,), 4.0, dtype=torch.float64)
-    ways = rollout(states, actions, lengths, 0.2, integrator=integrator, reverse=reverse)
-    back = inverse(ways[:, :-1], ways[:, 1:], lengths[:, None], 0.2, integrator=integrator)
-    for result in (ways, back):
+    after = rollout(states, actions, lengths, 0.2, integrator=integrator, reverse=reverse)
+    back = inverse(after[:, :-1], after[:, 1:], lengths[:, None], 0.2, integrator=integrator)
+    for result in (after, back):
         gradients = torch.autograd.grad(result.sum(), (states, actions), retain_graph=True)
         assert all(gradient.isfinite().all() for gradient in gradients)
 

@@ -1,4 +1,4 @@
-"""What a chosen action may be."""
+"""Limits of actions."""
 
 import math
 
@@ -12,12 +12,12 @@ ALLOWED = [(0.0, 0.0), (4.9, -0.7), (5.0, math.pi / 4), (-5.0, -math.pi / 4)]
 
 
 def test_limits() -> None:
-    """±5 m/s² and ±π/4; what lies within stays as it is."""
+    """±5 m/s² and ±π/4; actions within the limits do not change."""
     np.testing.assert_array_equal(clip_actions(np.array(ACTIONS)), ALLOWED)
 
 
 def test_limits_in_torch() -> None:
-    """Tensors are clipped alike, keep their type, and pass gradients where nothing is clipped."""
+    """Tensors keep their dtype and pass gradients where nothing is clipped."""
     actions = torch.tensor(ACTIONS, dtype=torch.float32, requires_grad=True)
     clipped = clip_actions(actions)
     assert clipped.dtype == torch.float32

@@ -1,4 +1,4 @@
-"""The bicycle model against numbers worked out by hand."""
+"""The bicycle model against numbers computed by hand."""
 
 import math
 from typing import Literal
@@ -26,7 +26,7 @@ def drive(
 
 
 def test_straight() -> None:
-    """10 m/s along +y for 0.2 s is 2 m; accelerating by 1 m/s² adds 0.02 m."""
+    """10 m/s along +y for 0.2 s are 2 m; an acceleration of 1 m/s² adds 0.02 m."""
     ahead, faster = (
         drive((3.0, 4.0, math.pi / 2, 10.0), [(acceleration, 0.0)])[0]
         for acceleration in (0.0, 1.0)
@@ -36,14 +36,14 @@ def test_straight() -> None:
 
 
 def test_one_euler_step() -> None:
-    """For tan δ = 0.5 the slip is atan(0.25): 2 m of way are (4, 1)·2/√17, the turn 2/1.2/√17."""
+    """For tan δ = 0.5 the slip is atan(0.25): 2 m are (4, 1)·2/√17, the turn 2/1.2/√17."""
     (state,) = drive((0.0, 0.0, 0.0, 10.0), [(2.0, math.atan(0.5))], integrator="euler")
     root = math.sqrt(17)
     np.testing.assert_allclose(state, [8 / root, 2 / root, 2 / 1.2 / root, 10.4], atol=1e-12)
 
 
 def test_one_heun_step() -> None:
-    """Both ends of the step weigh the same: 10 m/s at course β, 10.4 m/s turned by Euler's step."""
+    """Mean of both ends of the step: 10 m/s at course β, and 10.4 m/s turned by Euler's step."""
     (state,) = drive((0.0, 0.0, 0.0, 10.0), [(2.0, math.atan(0.5))])
     root = math.sqrt(17)
     slip, turned = math.atan(0.25), 2 / 1.2 / root
@@ -53,7 +53,7 @@ def test_one_heun_step() -> None:
 
 
 def test_left_is_positive() -> None:
-    """Steering left raises the heading and leads to +y; right does the mirror image."""
+    """Steering left increases the heading and y; steering right is the mirror image."""
     left, right = (drive((0.0, 0.0, 0.0, 5.0), [(0.0, steering)])[0] for steering in (0.2, -0.2))
     assert left[1] > 0
     assert left[2] > 0
@@ -63,8 +63,8 @@ def test_left_is_positive() -> None:
 def test_circle() -> None:
     """Sin β = 0.1 turns on a radius of 1.2 / 0.1 = 12 m and closes after 2π·12 m.
 
-    Of 100 steps at 6 m/s each turns by 0.02π and, by the trapezoid rule, moves by the mean of its
-    two ends: the points lie on a circle of radius 0.12π·tan(0.01π)⁻¹ = 11.996 m.
+    Each of 100 steps at 6 m/s turns by 0.02π and, by the trapezoidal rule, moves by the mean of
+    its two ends: the points are on a circle of radius 0.12π·tan(0.01π)⁻¹ = 11.996 m.
     """
     steering = math.atan(2 * 0.1 / math.sqrt(1 - 0.01))
     dt_s = 2 * math.pi * 12 / 6 / 100
@@ -76,29 +76,29 @@ def test_circle() -> None:
 
 
 @pytest.mark.parametrize(
-    ("integrator", "way"),
+    ("integrator", "x"),
     [
         ("heun", [0.16, 0.24, 0.26, 0.26, 0.28]),  # means of the speeds at both ends times 0.2
         ("euler", [0.20, 0.32, 0.36, 0.36, 0.36]),  # speeds before the step times 0.2
     ],
 )
-def test_braking(integrator: Literal["heun", "euler"], way: list[float]) -> None:
-    """1 m/s less 0.4 m/s a tick is 0.6, 0.2, 0, 0; what was braked too much is not owed later."""
+def test_braking(integrator: Literal["heun", "euler"], x: list[float]) -> None:
+    """1 m/s less 0.4 m/s per tick is 0.6, 0.2, 0, 0; excess braking has no effect later."""
     actions = [(-2.0, 0.0)] * 4 + [(1.0, 0.0)]
     states = drive((0.0, 0.0, 0.0, 1.0), actions, integrator=integrator)
     np.testing.assert_allclose(states[:, 3], [0.6, 0.2, 0, 0, 0.2], atol=1e-12)
-    np.testing.assert_allclose(states[:, 0], way, atol=1e-12)
+    np.testing.assert_allclose(states[:, 0], x, atol=1e-12)
 
 
 def test_driving_backwards() -> None:
-    """With `reverse` the speed goes on to -0.2 and -0.6 m/s, and the way back is that of Heun."""
+    """With `reverse` the speed continues to -0.2 and -0.6 m/s."""
     states = drive((0.0, 0.0, 0.0, 1.0), [(-2.0, 0.0)] * 4, reverse=True)
     np.testing.assert_allclose(states[:, 3], [0.6, 0.2, -0.2, -0.6], atol=1e-12)
     np.testing.assert_allclose(states[:, 0], [0.16, 0.24, 0.24, 0.16], atol=1e-12)
 
 
-def test_paper_point_1() -> None:
-    """The paper's inverse lacks ΔT: at 8 m/s and 0.1 rad it would say 0.020; ours says 0.100."""
+def test_inverse_has_the_time_step_that_the_paper_lacks() -> None:
+    """At 8 m/s and 0.1 rad the paper's formula gives 0.020 rad instead of 0.100 rad."""
     start = np.array([0.0, 0.0, 0.0, 8.0])
     after = forward(start, np.array([0.0, 0.1]), LENGTH_M, 0.2, integrator="euler")
     found = inverse(start, after, LENGTH_M, 0.2, integrator="euler")
@@ -107,8 +107,8 @@ def test_paper_point_1() -> None:
     assert round(literal, 3) == 0.020
 
 
-def test_paper_point_2() -> None:
-    """The paper's mean speed in the inverse of Euler's step turns 0.400 rad into 0.366 rad."""
+def test_inverse_of_euler_steps_has_the_initial_speed() -> None:
+    """With the paper's mean speed, 0.400 rad would become 0.366 rad."""
     start = np.array([0.0, 0.0, 0.0, 1.0])
     action = np.array([1.0, 0.4])
     after = forward(start, action, LENGTH_M, 0.2, integrator="euler")
@@ -119,7 +119,7 @@ def test_paper_point_2() -> None:
 
 
 def test_standstill() -> None:
-    """Below a mean speed of 0.5 m/s a turn says nothing: steering 0, on either side of it."""
+    """Below a mean speed of 0.5 m/s, forwards or backwards, the steering is 0."""
     start = np.array([[0.0, 0.0, 0.0, speed] for speed in (0.0, 0.49, 0.51, -0.49, -0.51)])
     after = start + np.array([0.0, 0.0, 0.01, 0.0])
     steering = inverse(start, after, np.full(5, 4.0), 0.2)[:, 1]
@@ -129,7 +129,7 @@ def test_standstill() -> None:
 
 
 def test_inverse_across_the_wrap() -> None:
-    """From π - 0.01 to -π + 0.01 is a left turn of 0.02 rad, not a right turn of nearly 2π."""
+    """From π - 0.01 to -π + 0.01 is a left turn of 0.02 rad, not a right turn of almost 2π."""
     start = np.array([0.0, 0.0, math.pi - 0.01, 6.0])
     after = np.array([0.0, 0.0, -math.pi + 0.01, 6.0])
     # sin β = 1.2·0.02 / (6·0.2) = 0.02
@@ -137,8 +137,7 @@ def test_inverse_across_the_wrap() -> None:
     np.testing.assert_allclose(inverse(start, after, LENGTH_M, 0.2), [0, expected], atol=1e-12)
 
 
-def test_inverse_stops_at_the_steering_limit() -> None:
-    """A turn that asks for more than 45° gets 45°; accelerations are given as seen."""
+def test_inverse_limits_steering_but_not_acceleration() -> None:
     start = np.array([0.0, 0.0, 0.0, 1.0])
     after = np.array([0.0, 0.0, -1.0, 5.0])
     np.testing.assert_allclose(inverse(start, after, LENGTH_M, 0.2), [20, -math.pi / 4], atol=1e-12)

@@ -1,4 +1,4 @@
-"""A small data set on disk for the environments."""
+"""Data for the environments."""
 
 from pathlib import Path
 
@@ -9,6 +9,6 @@ from tests.crossing_files import write_crossing
 
 @pytest.fixture(scope="session")
 def crossing(tmp_path_factory: pytest.TempPathFactory) -> str:
-    """DATA: a crossing with six scenarios, the last of which is 35 ticks of a motorcycle."""
+    """A folder with one recording of six scenarios; the ego of the last is a motorcycle."""
     folder: Path = tmp_path_factory.mktemp("crossing")
     return str(write_crossing(folder))

@@ -1,4 +1,4 @@
-"""Whether two things that environments return are the same, bit for bit."""
+"""Bitwise comparison of what environments return."""
 
 from collections.abc import Sequence
 from typing import Any
@@ -8,7 +8,7 @@ from gymnasium.vector import AutoresetMode
 
 
 def same(one: Any, other: Any, path: str = "") -> None:
-    """Fails where types, shapes or bits differ; containers are compared part by part."""
+    """Asserts equal types, shapes and bits; containers are compared item by item."""
     assert type(one) is type(other), f"{path}: {type(one)} and {type(other)}"
     if isinstance(one, dict):
         assert set(one) == set(other), f"{path}: {set(one) ^ set(other)}"
@@ -31,25 +31,25 @@ def same(one: Any, other: Any, path: str = "") -> None:
 def same_through_ends(
     one: Any, other: Any, mode: AutoresetMode, actions: Sequence[np.ndarray]
 ) -> int:
-    """Two batches return the same bits through their episodes' ends; how many there were."""
+    """Asserts that two vector environments return the same bits; returns the number of endings."""
     same(one.reset(seed=3), other.reset(seed=3))
     ends = 0
     for each in actions:
-        told = one.step(each)
-        same(told, other.step(each))
-        over = told[2] | told[3]
+        returned = one.step(each)
+        same(returned, other.step(each))
+        over = returned[2] | returned[3]
         ends += int(over.sum())
         if mode is AutoresetMode.DISABLED and over.any():
-            told = one.reset(options={"reset_mask": over.copy()})
-            same(told, other.reset(options={"reset_mask": over.copy()}))
+            returned = one.reset(options={"reset_mask": over.copy()})
+            same(returned, other.reset(options={"reset_mask": over.copy()}))
     return ends
 
 
 def same_alone(one: Any, other: Any, seed: int) -> None:
-    """The only agent of a parallel environment is told what a single one tells its ego."""
+    """Asserts that a parallel environment with one agent returns what a single one returns."""
     rng = np.random.default_rng(seed)
     same([part["vehicle_0"] for part in one.reset(seed=seed)], list(other.reset(seed=seed)))
     while one.agents:
         action = rng.uniform(-0.3, 0.6, 2)
-        told = one.step({"vehicle_0": action})
-        same([part["vehicle_0"] for part in told], list(other.step(action)))
+        returned = one.step({"vehicle_0": action})
+        same([part["vehicle_0"] for part in returned], list(other.step(action)))

@@ -1,4 +1,4 @@
-"""Both environment checkers on every choice of observations, and what the spaces promise."""
+"""The environment checkers of Gymnasium and stable-baselines3, and the spaces."""
 
 import itertools
 
@@ -10,20 +10,17 @@ from stable_baselines3.common.env_checker import check_env as check_env_sb3
 
 import asp_env
 from asp_env.envs.replay import ReplayEnv
-from asp_env.sim.observation import KNOWN
+from asp_env.sim.observation import OBSERVATION_NAMES
 
-KINDS = ("raster", "vectors", "actions", "state", "route")
-SUBSETS = [names for n in range(1, 6) for names in itertools.combinations(KINDS, n)]
+COMPONENTS = ("raster", "vectors", "actions", "state", "route")
+SUBSETS = [names for n in range(1, 6) for names in itertools.combinations(COMPONENTS, n)]
 TABLES = {"vectors", "actions", "route"}
 SMALL = (90, 60)
 
 
 @pytest.mark.parametrize("names", SUBSETS, ids="-".join)
-def test_passes_the_checkers_without_a_warning(crossing, names):
-    """Gymnasium's on the environment, stable-baselines3's behind `FlatParts`; warnings are errors.
-
-    stable-baselines3 warns of tables such as the action history, and of nothing else.
-    """
+def test_checkers_pass_without_warnings(crossing, names):
+    """stable-baselines3 warns only of tables such as the action history; warnings are errors."""
     made = gymnasium.make("asp_env/Replay-v0", data=crossing, observations=names, raster_px=SMALL)
     env = made.unwrapped
     check_env(env, skip_render_check=True, skip_close_check=True)
@@ -32,16 +29,15 @@ def test_passes_the_checkers_without_a_warning(crossing, names):
         check_env_sb3(env, skip_render_check=True)
 
 
-def test_passes_gymnasiums_checks_of_rendering_too(crossing):
-    """With every render mode that the metadata name."""
+def test_checks_of_rendering_pass(crossing):
+    """Gymnasium's checker makes the environment in every render mode of the metadata."""
     made = gymnasium.make(
         "asp_env/Replay-v0", data=crossing, observations=("state",), render_mode="rgb_array"
     )
     check_env(made.unwrapped, skip_close_check=True)
 
 
-def test_the_spaces_are_those_of_the_contract(crossing):
-    """Raster uint8 (12, 360, 240), actions float32 (15, 2), finite bounds, actions in ±1."""
+def test_default_spaces(crossing):
     env = gymnasium.make("asp_env/Replay-v0", data=crossing)
     space = env.observation_space
     assert isinstance(space, gymnasium.spaces.Dict)
@@ -54,9 +50,9 @@ def test_the_spaces_are_those_of_the_contract(crossing):
     assert set(np.unique(obs["raster"])) == {0, 255}
 
 
-@pytest.mark.parametrize("name", KNOWN)
-def test_all_that_is_seen_is_finite_and_within_finite_bounds(crossing, name):
-    """Through wild drives far off the road, alone or beside the raster."""
+@pytest.mark.parametrize("name", OBSERVATION_NAMES)
+def test_observations_are_finite_and_within_finite_bounds(crossing, name):
+    """Also far off the road."""
     env = ReplayEnv(crossing, observations=(name,))
     assert isinstance(env.observation_space, gymnasium.spaces.Dict)
     for box in env.observation_space.values():
@@ -76,8 +72,8 @@ def test_all_that_is_seen_is_finite_and_within_finite_bounds(crossing, name):
             assert all(np.isfinite(part).all() for part in obs.values())
 
 
-def test_both_rasters_at_once(crossing):
-    """By the names of their views; `raster` is drawn by `view` in the given pixels."""
+def test_rasters_of_several_views(crossing):
+    """`raster` is drawn by `view` in the given pixels; the others have their usual size."""
     env = ReplayEnv(
         crossing, observations=("raster", "mtp", "chauffeurnet"), view="mtp", raster_px=(60, 60)
     )

@@ -1,4 +1,4 @@
-"""The environments in highway-env's traffic keep all promises of the others."""
+"""The environments in highway-env's traffic pass the same checks as in replayed traffic."""
 
 import copy
 import pickle
@@ -19,22 +19,22 @@ from stable_baselines3.common.vec_env import DummyVecEnv
 import asp_env
 from asp_env.envs.replay import ReplayEnv
 from tests.envs.same import same, same_alone, same_through_ends
-from tests.envs.traces import PARTS, make, trace, trace_vector
+from tests.envs.traces import COMPONENTS, make, trace, trace_vector
 from tests.highway_folders import SITE_NAMES, highway_data
 
-with warnings.catch_warnings():  # PettingZoo's tests import its games by a way it calls old
+with warnings.catch_warnings():  # PettingZoo's tests import its games in a deprecated way
     warnings.simplefilter("ignore")
     from pettingzoo.test import parallel_api_test, parallel_seed_test
 
 IDS = {site: f"asp_env/Highway{site.capitalize()}-v0" for site in SITE_NAMES}
-LITTLE: dict[str, Any] = {"observations": ("state", "actions")}
+SMALL: dict[str, Any] = {"observations": ("state", "actions")}
 
 every_site = pytest.mark.parametrize("site", SITE_NAMES)
 
 
 @every_site
-def test_passes_the_checkers_without_a_warning(site):
-    """Gymnasium's with its renderings, and stable-baselines3's; warnings are errors."""
+def test_checkers_pass_without_warnings(site):
+    """Those of Gymnasium, with rendering, and of stable-baselines3; warnings are errors."""
     assert gymnasium.spec(IDS[site]).kwargs == {"data": f"highway:{site}"}
     options = {"data": highway_data(site), "raster_px": (90, 60), "render_mode": "rgb_array"}
     check_env(gymnasium.make(IDS[site], **options).unwrapped, skip_close_check=True)
@@ -52,10 +52,10 @@ def test_passes_the_checkers_without_a_warning(site):
         ("roundabout", AutoresetMode.DISABLED),
     ],
 )
-def test_equals_single_environments_bit_for_bit(site, mode):
+def test_returns_the_bits_of_single_environments(site, mode):
     """Observations, rewards, endings and infos through autoresets."""
     given: dict[str, Any] = {"num_envs": 3, "data": highway_data(site), "raster_px": (45, 30)}
-    given["observations"] = PARTS
+    given["observations"] = COMPONENTS
     one = gymnasium.make_vec(
         IDS[site], vectorization_mode="vector_entry_point", autoreset_mode=mode, **given
     )
@@ -67,8 +67,8 @@ def test_equals_single_environments_bit_for_bit(site, mode):
     assert same_through_ends(one, other, mode, [each.astype(np.float32) for each in drawn]) > 3
 
 
-def test_the_same_bits_in_another_process_and_beside_other_worlds():
-    """Hashes of all that is returned, alone and batched, whatever was made and driven before."""
+def test_returns_the_same_bits_in_another_process_and_after_other_worlds():
+    """Single and vector environments, whichever worlds were made and stepped before."""
     script = (
         "import sys; from tests.envs.traces import make, trace, trace_vector\n"
         "for data in sys.argv[1:]:\n"
@@ -80,28 +80,28 @@ def test_the_same_bits_in_another_process_and_beside_other_worlds():
     )
     expected = done.stdout.split()
     others = [make(each, traffic="idm") for each in data[::-1]]
-    told = []
+    traces = []
     for each in data:
         env = make(each)
         for other in others:
             trace(other, seed=77, steps=5)
-        told += [trace(env, steps=25), trace_vector(each, steps=8)]
-    assert told == expected
+        traces += [trace(env, steps=25), trace_vector(each, steps=8)]
+    assert traces == expected
     assert len(set(expected)) == 4
 
 
 def _drive(env: ReplayEnv, steps: int = 12) -> list[Any]:
     rng, seen = np.random.default_rng(1), []
     for _ in range(steps):
-        told = env.step(rng.uniform((0.0, -0.2), (0.6, 0.2)))
-        seen.append(told)
-        if told[2] or told[3]:
+        returned = env.step(rng.uniform((0.0, -0.2), (0.6, 0.2)))
+        seen.append(returned)
+        if returned[2] or returned[3]:
             seen.append(env.reset())
     return seen
 
 
 @every_site
-def test_snapshots_and_copies_go_on_alike(site):
+def test_snapshots_and_copies_continue_in_the_same_way(site):
     """In memory, through a small pickle in another environment, and as a deep copy."""
     env = make(highway_data(site))
     env.reset(seed=2)
@@ -121,73 +121,69 @@ def test_snapshots_and_copies_go_on_alike(site):
 
 
 @every_site
-def test_passes_the_tests_of_pettingzoo(site):
-    """Every vehicle an agent; warnings are errors."""
+def test_pettingzoo_tests_pass_without_warnings(site):
     data = highway_data(site)
-    parallel_api_test(asp_env.parallel_env(data, **LITTLE), num_cycles=20)
-    parallel_seed_test(lambda: asp_env.parallel_env(data, **LITTLE), num_cycles=3)
+    parallel_api_test(asp_env.parallel_env(data, **SMALL), num_cycles=20)
+    parallel_seed_test(lambda: asp_env.parallel_env(data, **SMALL), num_cycles=3)
 
 
 @every_site
-def test_a_lone_agent_is_the_ego_of_the_single_environment(site):
-    """With one agent everything that is returned is the same, bit for bit."""
-    one = asp_env.parallel_env(highway_data(site), max_agents=1, **LITTLE)
-    other = ReplayEnv(highway_data(site), **LITTLE)
+def test_one_agent_equals_the_single_environment(site):
+    one = asp_env.parallel_env(highway_data(site), max_agents=1, **SMALL)
+    other = ReplayEnv(highway_data(site), **SMALL)
     for seed in range(2):
         same_alone(one, other, seed)
 
 
 @every_site
-def test_all_agents_live_in_one_world_with_the_traffic(site):
-    """Whoever looks, everybody is in the same place; crashed ones are gone for good."""
-    env = asp_env.parallel_env(highway_data(site), **LITTLE)
+def test_all_agents_share_one_world_with_the_traffic(site):
+    """Every agent's scene has the same vehicles in the same states; agents never return."""
+    env = asp_env.parallel_env(highway_data(site), **SMALL)
     env.reset(options={"scenario": 3})
     assert len(env.agents) > 1
     rng, gone = np.random.default_rng(0), set()
     for _ in range(15):
         before = set(env.agents)
         env.step({agent: rng.uniform((-0.2, -0.1), (0.6, 0.1)) for agent in env.agents})
-        seen = [env.scene(agent) for agent in env.agents]
-        there = [
+        states = [
             {
                 int(scene.ids[0, slot]): scene.states[0, slot, -1].tobytes()
                 for slot in np.flatnonzero(scene.valid[0, :, -1])
             }
-            for scene in seen
+            for scene in (env.scene(agent) for agent in env.agents)
         ]
-        assert all(each == there[0] for each in there)
+        assert all(each == states[0] for each in states)
         assert not gone & set(env.agents)
         gone |= before - set(env.agents)
 
 
-def _parts(seen: Any) -> dict[str, np.ndarray]:
-    """`DummyVecEnv` returns an ordered dictionary."""
+def _as_dict(seen: Any) -> dict[str, np.ndarray]:
+    """Converts the ordered dictionary of `DummyVecEnv`."""
     return dict(seen)
 
 
-def test_stable_baselines_trains_in_it():
-    """Its adapter returns what `DummyVecEnv` over single environments does; PPO runs."""
+def test_stable_baselines3_trains():
+    """Its adapter returns the bits of `DummyVecEnv` over single environments; PPO runs."""
     data = highway_data("intersection")
     options: dict[str, Any] = {"observations": ("state", "route")}
     one = asp_env.sb3_vec_env(2, data, **options)
     other = DummyVecEnv([lambda: ReplayEnv(data, **options)] * 2)
     one.seed(3)
     other.seed(3)
-    same(one.reset(), _parts(other.reset()))
+    same(one.reset(), _as_dict(other.reset()))
     rng = np.random.default_rng(0)
     for _ in range(10):
         actions = rng.uniform((-0.5, -0.3), (1.0, 0.3), (2, 2)).astype(np.float32)
-        told, (seen, *rest) = one.step(actions), other.step(actions)
-        same(list(told), [_parts(seen), *rest])
+        returned, (seen, *rest) = one.step(actions), other.step(actions)
+        same(list(returned), [_as_dict(seen), *rest])
     model = PPO("MultiInputPolicy", one, n_steps=8, batch_size=8, n_epochs=1, device="cpu")
     model.learn(16)
     assert model.num_timesteps == 16
 
 
 @every_site
-def test_forecasts_are_parts_of_the_observation(site):
-    """Side by side as alone."""
-    given: dict[str, Any] = {"data": highway_data(site), **LITTLE}
+def test_vector_forecasts_equal_those_of_single_environments(site):
+    given: dict[str, Any] = {"data": highway_data(site), **SMALL}
     single = asp_env.PredictionFeatures(gymnasium.make(IDS[site], **given), "constant-turn-rate")
     envs = asp_env.VectorPredictionFeatures(
         gymnasium.make_vec(IDS[site], num_envs=2, vectorization_mode="vector_entry_point", **given),

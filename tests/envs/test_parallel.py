@@ -1,4 +1,4 @@
-"""`asp_env.parallel_env`: every vehicle an agent, each with the world from its own view."""
+"""`asp_env.parallel_env`: many vehicles are agents, each with its own view of one world."""
 
 import copy
 import math
@@ -20,11 +20,11 @@ from tests.crossing_files import write_crossing
 from tests.envs.same import same, same_alone
 from tests.real_data import real_data
 
-with warnings.catch_warnings():  # PettingZoo's tests import its games by a way it calls old
+with warnings.catch_warnings():  # PettingZoo's tests import its games in a deprecated way
     warnings.simplefilter("ignore")
     from pettingzoo.test import parallel_api_test, parallel_seed_test
 
-PARTS = ("raster", "vectors", "actions", "state", "route")
+COMPONENTS = ("raster", "vectors", "actions", "state", "route")
 
 
 def _make(data: str, **options: Any) -> ParallelReplayEnv:
@@ -33,17 +33,17 @@ def _make(data: str, **options: Any) -> ParallelReplayEnv:
     )
 
 
-def _coast(env: ParallelReplayEnv) -> dict[str, np.ndarray]:
+def _zero_actions(env: ParallelReplayEnv) -> dict[str, np.ndarray]:
     return {agent: np.zeros(2) for agent in env.agents}
 
 
-def _wild(env: ParallelReplayEnv, rng: np.random.Generator) -> dict[str, np.ndarray]:
+def _random_actions(env: ParallelReplayEnv, rng: np.random.Generator) -> dict[str, np.ndarray]:
     return {agent: rng.uniform((-0.2, -0.1), (0.6, 0.1)) for agent in env.agents}
 
 
 @pytest.fixture(scope="module")
 def queue(tmp_path_factory: pytest.TempPathFactory) -> str:
-    """DATA: A drives at 8 m/s behind B at 4 m/s, 18 m from centre to centre after 3 s."""
+    """A folder: A at 8 m/s behind B at 4 m/s, 18 m from centre to centre after 3 s."""
     drives = (
         Drive(kind=AgentClass.CAR, start=(-90.0, -1.75, 0.0, 8.0)),
         Drive(kind=AgentClass.CAR, start=(-60.0, -1.75, 0.0, 4.0)),
@@ -54,36 +54,35 @@ def queue(tmp_path_factory: pytest.TempPathFactory) -> str:
 
 @pytest.mark.parametrize(
     "options",
-    [{"observations": PARTS}, {"traffic": "idm", "classes": ("car", "van"), "max_agents": 3}],
+    [{"observations": COMPONENTS}, {"traffic": "idm", "classes": ("car", "van"), "max_agents": 3}],
     ids=("log", "idm"),
 )
-def test_passes_the_tests_of_pettingzoo_without_a_warning(crossing, options):
-    """To the end of episodes, which last 75 ticks at most; warnings are errors here."""
+def test_pettingzoo_tests_pass_without_warnings(crossing, options):
+    """To the end of episodes, which last at most 75 ticks; warnings are errors."""
     parallel_api_test(_make(crossing, **options), num_cycles=80)
     parallel_seed_test(lambda: _make(crossing, **options), num_cycles=5)
 
 
 @pytest.mark.data
-def test_passes_the_test_of_pettingzoo_on_real_traffic():
-    """Karlsruhe, where people wait, cross and park."""
+def test_pettingzoo_test_passes_on_real_traffic():
+    """Karlsruhe, with waiting, crossing and parked agents."""
     parallel_api_test(_make(str(real_data("karlsruhe")), traffic="idm"), num_cycles=80)
 
 
 @pytest.mark.parametrize("traffic", ["log", "idm"])
-def test_a_lone_agent_is_the_ego_of_the_single_environment(crossing, traffic):
-    """With one agent everything that is returned is the same, bit for bit."""
+def test_one_agent_equals_the_single_environment(crossing, traffic):
     options: dict[str, Any] = {
-        "observations": PARTS, "raster_px": (45, 30), "traffic": traffic
+        "observations": COMPONENTS, "raster_px": (45, 30), "traffic": traffic
     }  # fmt: skip
     one, other = _make(crossing, max_agents=1, **options), ReplayEnv(crossing, **options)
     for seed in range(4):
         same_alone(one, other, seed)
 
 
-def test_each_agent_sees_what_it_would_see_as_the_ego(crossing):
-    """At the start, against the single environment with that vehicle as its ego from that tick."""
-    env = _make(crossing, observations=PARTS)
-    single = ReplayEnv(crossing, observations=PARTS, raster_px=(45, 30))
+def test_agents_observe_as_egos_of_the_single_environment(crossing):
+    """At the start, with the same vehicle as ego and the same start tick."""
+    env = _make(crossing, observations=COMPONENTS)
+    single = ReplayEnv(crossing, observations=COMPONENTS, raster_px=(45, 30))
     compared = 0
     for scenario in range(len(env.scenarios)):
         seen, infos = env.reset(options={"scenario": scenario})
@@ -95,7 +94,7 @@ def test_each_agent_sees_what_it_would_see_as_the_ego(crossing):
             }
             expected, _ = single.reset(options=start)
             known = seen[agent].copy()
-            if env.scenarios[scenario].length < 75:  # then the goal may lie nearer
+            if env.scenarios[scenario].length < 75:  # The goal may be nearer.
                 known["state"] = expected["state"]
             same(known, expected)
             compared += 1
@@ -103,8 +102,8 @@ def test_each_agent_sees_what_it_would_see_as_the_ego(crossing):
 
 
 @pytest.mark.parametrize("traffic", ["log", "log-actions", "idm"])
-def test_all_agents_live_in_one_world(crossing, traffic):
-    """Whoever looks, everybody is in the same place at every tick; crashed ones are gone."""
+def test_all_agents_share_one_world(crossing, traffic):
+    """Every agent's scene has the same vehicles in the same states; agents that left are absent."""
     env = _make(crossing, traffic=traffic)
     gone = 0
     for scenario in range(len(env.scenarios)):
@@ -112,7 +111,7 @@ def test_all_agents_live_in_one_world(crossing, traffic):
         rng = np.random.default_rng(scenario)
         while env.agents:
             before = set(env.agents)
-            env.step(_wild(env, rng))
+            env.step(_random_actions(env, rng))
             gone += len(before - set(env.agents))
             worlds = [_states(env, agent) for agent in env.agents]
             for world in worlds[1:]:
@@ -121,16 +120,16 @@ def test_all_agents_live_in_one_world(crossing, traffic):
 
 
 def _states(env: ParallelReplayEnv, agent: str) -> dict[int, list[float]]:
-    """Everybody who is there now, by track id."""
+    """States of the vehicles present now, by track id."""
     scene = env.scene(agent)
     slots = np.flatnonzero(scene.valid[0, :, -1])
     return {int(scene.ids[0, a]): scene.states[0, a, -1].tolist() for a in slots}
 
 
-def test_a_crash_by_hand(queue):
-    """A gains 0.8 m a tick on B; of 13.5 m between bumpers none is left at tick 17.
+def test_a_rear_end_collision_ends_the_agent_at_fault(queue):
+    """A gains 0.8 m per tick on B and closes the 13.5 m between the bumpers at tick 17.
 
-    A answers for it, is terminated and gone one tick later. B drives on.
+    A is at fault, is terminated and disappears one tick later. B continues.
     """
     env = _make(queue)
     env.reset(options={"scenario": 0})
@@ -138,20 +137,20 @@ def test_a_crash_by_hand(queue):
     rewards: dict[str, float] = {}
     infos: dict[str, dict[str, Any]] = {}
     for tick in range(1, 18):
-        _, rewards, terminated, truncated, infos = env.step(_coast(env))
+        _, rewards, terminated, truncated, infos = env.step(_zero_actions(env))
         assert not any(truncated.values())
         assert terminated == {"vehicle_0": tick == 17, "vehicle_1": False}
     assert infos["vehicle_0"]["ending"] == "COLLISION"
     assert rewards["vehicle_0"] == pytest.approx(1.6 / 120 - 1, abs=1e-3)
     assert (infos["vehicle_1"]["collision"], infos["vehicle_1"]["at_fault"]) == (True, False)
     assert env.agents == ["vehicle_1"]
-    _, _, _, _, infos = env.step(_coast(env))
+    _, _, _, _, infos = env.step(_zero_actions(env))
     assert not infos["vehicle_1"]["collision"]
     assert list(_states(env, "vehicle_1")) == [2]
 
 
-def test_who_stands_all_the_while_is_traffic(tmp_path):
-    """C stops at 2 s for good, before the scenario of A begins at 3 s."""
+def test_standing_vehicles_are_traffic(tmp_path):
+    """The second car stops at 2 s, before the scenario of the first one begins at 3 s."""
     drives = (
         Drive(kind=AgentClass.CAR, start=(-90.0, -1.75, 0.0, 8.0)),
         Drive(kind=AgentClass.CAR, start=(30.0, 1.75, math.pi, 4.0), phases=((2.0, -2.0, 0.0),)),
@@ -162,8 +161,8 @@ def test_who_stands_all_the_while_is_traffic(tmp_path):
     assert list(_states(env, "vehicle_0")) == [1, 2]
 
 
-def test_actions_move_the_agent_that_they_are_for(queue):
-    """B speeds up by 5 m/s² for a second, from 4 to 9 m/s; A brakes as hard, from 8 to 3 m/s."""
+def test_actions_move_their_own_agent(queue):
+    """In one second at 5 m/s², B accelerates from 4 to 9 m/s and A brakes from 8 to 3 m/s."""
     env = _make(queue)
     env.reset(options={"scenario": 0})
     given = {"vehicle_1": np.array([1.0, 0.0]), "vehicle_0": np.array([-1.0, 0.0])}
@@ -174,14 +173,14 @@ def test_actions_move_the_agent_that_they_are_for(queue):
     assert seen["vehicle_1"]["state"][0] == pytest.approx(9.0, abs=1e-3)
     state = env.state()
     np.testing.assert_allclose(state[:, 3], [3.0, 9.0], atol=1e-3)
-    # 5 m/s² over a second: 5.5 m of 8 m for A and 6.5 m for B, in steps of 0.2 s to the mean speed
+    # The mean speeds are 5.5 m/s and 6.5 m/s.
     np.testing.assert_allclose(state[:, 0], [-66 + 5.5, -48 + 6.5], atol=0.01)
     np.testing.assert_allclose(state[:, 1:3], [[-1.75, 0]] * 2, atol=1e-3)
     np.testing.assert_array_equal(state[:, 6], [1, 1])
 
 
-def test_an_agent_leaves_when_its_track_ends(crossing):
-    """From 8 s on, the motorcycle's track lasts 30 ticks more, to 14 s; the others go on."""
+def test_the_end_of_an_agents_track_truncates_it(crossing):
+    """The motorcycle's track ends 30 ticks after the start at 8 s; the other agents continue."""
     env = _make(crossing)
     env.reset(options={"scenario": 0, "start_tick": 40})
     kinds = {agent: int(env.scene(agent).classes[0, 0]) for agent in env.agents}
@@ -197,45 +196,47 @@ def test_an_agent_leaves_when_its_track_ends(crossing):
     assert env.agents
 
 
-def test_who_may_be_an_agent(crossing):
-    """Classes, ids and a number; the scenario's own vehicle always comes first."""
-    everybody = _make(crossing)
+def test_selection_of_agents(crossing):
+    """By classes, ids and number; the ego of the scenario is always the first agent."""
+    unrestricted = _make(crossing)
     for classes, kinds in ((("car",), {0}), (("truck", "van"), {1, 2})):
         env = _make(crossing, classes=classes)
         for scenario in range(len(env.scenarios)):
             env.reset(options={"scenario": scenario})
             assert {int(env.scene(agent).classes[0, 0]) for agent in env.agents} <= kinds
             assert env.scene("vehicle_0").ids[0, 0] == env.scenarios[scenario].ego_id
-        assert 0 < len(env.scenarios) < len(everybody.scenarios)
+        assert 0 < len(env.scenarios) < len(unrestricted.scenarios)
     few = _make(crossing, ids=(1, 3))
     assert {scenario.ego_id for scenario in few.scenarios} == {1, 3}
     pair = _make(crossing, max_agents=2)
     assert pair.possible_agents == ["vehicle_0", "vehicle_1"]
     for scenario in range(len(pair.scenarios)):
         pair.reset(options={"scenario": scenario})
-        everybody.reset(options={"scenario": scenario})
-        ego, *others = (everybody.scene(agent).states[0, 0, -1, :2] for agent in everybody.agents)
+        unrestricted.reset(options={"scenario": scenario})
+        ego, *others = (
+            unrestricted.scene(agent).states[0, 0, -1, :2] for agent in unrestricted.agents
+        )
         away = [math.dist(ego, other) for other in others]
         if "vehicle_1" in pair.agents:
             second = pair.scene("vehicle_1").states[0, 0, -1, :2]
             assert math.dist(ego, second) == min(away)
 
 
-def test_copies_and_pickles_go_on_in_the_same_way(crossing):
-    """From the middle of an episode on, through the next reset."""
+def test_copies_and_pickles_continue_in_the_same_way(crossing):
+    """From the middle of an episode through the next reset."""
     env = _make(crossing, traffic="idm")
     env.reset(seed=4, options={"scenario": 1})
     for _ in range(3):
-        env.step(_coast(env))
+        env.step(_zero_actions(env))
     for twin in (copy.deepcopy(env), pickle.loads(pickle.dumps(env))):
         original = copy.deepcopy(env)
         for _ in range(5):
-            same(original.step(_coast(original)), twin.step(_coast(twin)))
+            same(original.step(_zero_actions(original)), twin.step(_zero_actions(twin)))
         same(original.reset(), twin.reset())
 
 
 def test_renders_the_whole_place(crossing):
-    """uint8 RGB, the same for the same state, as long as anybody asks; else nothing."""
+    """The same state gives the same picture; without a render mode there is none."""
     env = _make(crossing, render_mode="rgb_array")
     env.reset(seed=0)
     picture = env.render()
@@ -248,16 +249,15 @@ def test_renders_the_whole_place(crossing):
     assert _make(crossing).render() is None
 
 
-def test_refuses_in_one_line(crossing):
-    """What was given, what was expected."""
+def test_invalid_input_is_rejected(crossing):
     for options, message in (
         ({"classes": ("kite",)}, "unknown class of agents 'kite'.*known are bus, car"),
         ({"classes": "car"}, "classes 'car': expected a sequence"),
         ({"ids": ()}, r"ids \(\): expected a sequence"),
-        ({"ids": (99,)}, "no scenario's vehicle is of the given classes and ids"),
+        ({"ids": (99,)}, "the ego of no scenario has one of the given classes and ids"),
         ({"max_agents": 0}, "max_agents 0: expected at least 1"),
         ({"render_mode": "ansi"}, "render mode 'ansi'"),
-        ({"colour": 1}, "unknown argument 'colour'"),
+        ({"colour": 1}, "unexpected keyword argument 'colour'"),
     ):
         with pytest.raises(asp_env.AspEnvError, match=message):
             _make(crossing, **options)
@@ -272,4 +272,4 @@ def test_refuses_in_one_line(crossing):
     with pytest.raises(asp_env.AspEnvError, match="unknown agent 'vehicle_99'"):
         env.scene("vehicle_99")
     with pytest.raises(asp_env.AspEnvError, match="expected two finite numbers"):
-        env.step(_coast(env) | {"vehicle_0": np.array([np.nan, 0.0])})
+        env.step(_zero_actions(env) | {"vehicle_0": np.array([np.nan, 0.0])})

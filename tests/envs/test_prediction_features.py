@@ -1,4 +1,4 @@
-"""Forecasts as parts of the observation."""
+"""The wrappers that add forecasts to the observation."""
 
 import copy
 import dataclasses
@@ -47,19 +47,17 @@ def _scene(env: gymnasium.Env[Any, Any]) -> Scene:
 
 
 class Fan:
-    """Knows vehicles alone: in mode m all go from the ego m metres to its left per tick."""
+    """Forecasts vehicles only: in mode m they start at the ego and move m metres left per tick."""
 
     name, privileged, dt_s, history, horizon = "fan", False, 0.2, 0, 20
     trained_on = None
 
     def __init__(self, probabilities: tuple[float, ...]) -> None:
-        """Of as many modes; counts its calls."""
         self.log_probs = np.log(probabilities)
         self.calls = 0
         self.metadata: dict[str, str] = {}
 
     def predict(self, scene: Scene, future: Future | None = None) -> Forecast:
-        """All modes of all targets."""
         assert future is None
         self.calls += 1
         modes, count = len(self.log_probs), len(scene.targets)
@@ -78,8 +76,8 @@ class Fan:
 
 
 @pytest.mark.parametrize("predictor", ["constant-velocity", "constant-turn-rate"])
-def test_passes_both_checkers(crossing, predictor):
-    """Gymnasium's, which says of every wrapper that it is one, and stable-baselines3's."""
+def test_checkers_pass(crossing, predictor):
+    """Gymnasium's checker warns of every wrapper."""
     env = _env(crossing, observations=("raster", "state"), raster_px=(90, 60),
                render_mode="rgb_array")  # fmt: skip
     env = PredictionFeatures(env.unwrapped, predictor)
@@ -89,8 +87,8 @@ def test_passes_both_checkers(crossing, predictor):
     check_env_sb3(env)
 
 
-def test_the_modes_by_hand(crossing):
-    """Of four modes the two most probable, in that order, at 0.4 s and 2 s: 2 and 10 ticks."""
+def test_most_probable_modes_come_first(crossing):
+    """The two most probable of four modes, at 0.4 s and 2 s: 2 and 10 ticks."""
     fan = Fan((0.2, 0.4, 0.3, 0.1))
     env = PredictionFeatures(_env(crossing), fan, agents=3, modes=2, at_s=(0.4, 2.0))
     seen, _ = env.reset(options={"scenario": 0})
@@ -108,8 +106,8 @@ def test_the_modes_by_hand(crossing):
     assert fan.calls == 1
 
 
-def test_who_is_left_out_goes_on_straight(crossing):
-    """As planners are told: constant velocity, in all modes alike."""
+def test_agents_without_a_forecast_get_constant_velocity(crossing):
+    """In all modes, as for planners."""
     env = PredictionFeatures(_env(crossing), Fan((0.5, 0.5)), agents=8, modes=2, at_s=(1.0,))
     straight = PredictionFeatures(_env(crossing), "constant-velocity", agents=8, at_s=(1.0,))
     compared = 0
@@ -127,8 +125,8 @@ def test_who_is_left_out_goes_on_straight(crossing):
     assert compared
 
 
-def test_the_nearest_first_whatever_their_slots(crossing):
-    """Distances grow; another order of slots and a bigger scene change nothing."""
+def test_nearest_agents_come_first(crossing):
+    """For any order of slots and number of agents."""
     env = _env(crossing)
     env.reset(options={"scenario": 2})
     scene = _scene(env)
@@ -145,8 +143,8 @@ def test_the_nearest_first_whatever_their_slots(crossing):
     np.testing.assert_array_equal(few, targets[:2])
 
 
-def test_alone_on_the_road(crossing):
-    """Nobody near: zeros, and the predictor is not asked."""
+def test_without_agents_the_forecasts_are_zero(crossing):
+    """The predictor is not called."""
     env = _env(crossing)
     env.reset(seed=0)
     scene = _scene(env)
@@ -160,8 +158,8 @@ def test_alone_on_the_road(crossing):
     assert fan.calls == 0
 
 
-def test_a_trained_predictor_in_the_loop(crossing, tmp_path):
-    """By its name with random weights: what it says, bit for bit, and within the space."""
+def test_forecasts_of_a_trained_predictor(crossing, tmp_path):
+    """Loaded by name, with random weights."""
     name = Case("ssp-asp", "vectors").save(tmp_path)
     env = PredictionFeatures(_env(crossing), name, agents=4, at_s=(1.0, 3.0))
     predictor = load_predictor(name, horizon=15, dt_s=0.2)
@@ -183,8 +181,8 @@ def test_a_trained_predictor_in_the_loop(crossing, tmp_path):
 
 @pytest.mark.parametrize("mode", ["NextStep", "Disabled"])
 @pytest.mark.parametrize("predictor", ["constant-turn-rate", "oracle"])
-def test_vectors_of_environments_agree_with_single_ones(crossing, mode, predictor):
-    """Bit for bit, through resets."""
+def test_vector_forecasts_have_the_bits_of_single_ones(crossing, mode, predictor):
+    """Through resets."""
     options: dict[str, Any] = {"agents": 5, "privileged": predictor == "oracle"}
     singles = [PredictionFeatures(_env(crossing), predictor, **options) for _ in range(3)]
     envs = asp_env.VectorPredictionFeatures(
@@ -210,8 +208,8 @@ def test_vectors_of_environments_agree_with_single_ones(crossing, mode, predicto
         over = terminated | truncated
 
 
-def test_one_call_for_all_environments(crossing):
-    """A reset and three steps of five environments: four calls."""
+def test_one_predictor_call_for_all_environments(crossing):
+    """A reset and three steps of five environments make four calls."""
     fan = Fan((1.0,))
     envs = asp_env.VectorPredictionFeatures(_envs(crossing, 5), fan)
     envs.reset(seed=0)
@@ -220,11 +218,9 @@ def test_one_call_for_all_environments(crossing):
     assert fan.calls == 4
 
 
-def test_an_oracle_is_named_one(crossing):
-    """Only when it is allowed, and then the parts say so; it shows what will be."""
-    with pytest.raises(
-        asp_env.AspEnvError, match=r"oracle is told the recorded future.*privileged=T"
-    ):
+def test_privileged_predictors_need_permission_and_rename_the_keys(crossing):
+    """The oracle's forecasts are the positions that the agents then reach."""
+    with pytest.raises(asp_env.AspEnvError, match=r"oracle uses the recorded future.*privileged=T"):
         PredictionFeatures(_env(crossing), "oracle")
     env = PredictionFeatures(_env(crossing), "oracle", privileged=True, agents=2, at_s=(1.0,))
     assert {"oracle_forecast", "oracle_forecast_probabilities", "oracle_forecast_valid"} < set(
@@ -247,8 +243,7 @@ def _nearest(env: PredictionFeatures) -> tuple[np.ndarray, list[int]]:
     return scene.states[0, 0, -1], scene.ids[0, targets[:, 1]].tolist()
 
 
-def test_copies_and_is_rebuilt_from_its_spec(crossing):
-    """A deep copy goes on alike; `gymnasium.make` of the spec gives the same environment."""
+def test_copy_and_spec_give_the_same_environment(crossing):
     env = PredictionFeatures(_env(crossing), "constant-velocity", agents=2)
     env.reset(seed=0)
     twin = copy.deepcopy(env)
@@ -266,21 +261,20 @@ def test_copies_and_is_rebuilt_from_its_spec(crossing):
         ({"predictor": "constant-velocity", "modes": 0}, "modes 0: expected at least 1"),
         ({"predictor": "constant-velocity", "at_s": ()}, "at_s: times 0: expected at least 1"),
         ({"predictor": "constant-velocity", "at_s": (0.3,)}, "0.3 s is no whole number of ticks"),
-        ({"predictor": Fan((1.0,)), "at_s": (5.0,)}, "fan forecasts 4 s: at_s asks for 5 s"),
+        ({"predictor": Fan((1.0,)), "at_s": (5.0,)}, "fan forecasts 4 s: at_s has times up to 5 s"),
     ],
 )
-def test_refuses_in_one_line(crossing, arguments, message):
-    """What was given, what was expected."""
+def test_invalid_arguments_are_rejected(crossing, arguments, message):
     with pytest.raises(asp_env.AspEnvError, match=message):
         PredictionFeatures(_env(crossing), **arguments)
 
 
-def test_refuses_environments_that_do_not_fit(crossing):
-    """One without scenes, one of another time step, and forecasts twice."""
+def test_unsuitable_environments_are_rejected(crossing):
+    """Without scenes, with another time step, and with forecasts already."""
     with pytest.raises(asp_env.AspEnvError, match="has no scenes to forecast"):
         PredictionFeatures(gymnasium.make("CartPole-v1"), "constant-velocity")
     with pytest.raises(asp_env.AspEnvError, match=r"of 0\.2 s, the environment has 0\.12 s"):
         PredictionFeatures(_env(crossing, dt_s=0.12), Fan((1.0,)), at_s=(0.6,))
     env = PredictionFeatures(_env(crossing), "constant-velocity")
-    with pytest.raises(asp_env.AspEnvError, match="has a part 'forecast' already"):
+    with pytest.raises(asp_env.AspEnvError, match="has an entry 'forecast' already"):
         PredictionFeatures(env, "constant-turn-rate")

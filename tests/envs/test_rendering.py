@@ -1,4 +1,4 @@
-"""What the environment shows: pictures, a window, forecasts and plans."""
+"""Rendering of the single environment: pictures, the window, forecasts and plans."""
 
 import copy
 import subprocess
@@ -18,7 +18,7 @@ from asp_env.errors import AspEnvError, MissingExtraError
 from asp_env.render.frames import draw_frame
 from tests.render.screens import open_screen
 
-STILL = np.zeros(2, dtype=np.float32)
+ZERO_ACTION = np.zeros(2, dtype=np.float32)
 
 
 def _make(crossing: str, mode: str | None = "rgb_array", **options: Any) -> ReplayEnv:
@@ -27,7 +27,7 @@ def _make(crossing: str, mode: str | None = "rgb_array", **options: Any) -> Repl
     return env
 
 
-def _said(env: ReplayEnv, steps: int = 10):
+def _forecast(env: ReplayEnv, steps: int = 10):
     scene = env.scene()
     states = constant_velocity(scene, steps=steps)[:, None]
     return make_forecast(
@@ -39,16 +39,16 @@ def _said(env: ReplayEnv, steps: int = 10):
     )
 
 
-def test_the_checker_passes_in_human_mode(crossing):
-    """Gymnasium's, with all modes opened and closed; warnings are errors."""
+def test_gymnasiums_checker_passes_in_human_mode(crossing):
+    """It opens and closes every mode; warnings are errors."""
     made = gymnasium.make(
         "asp_env/Replay-v0", data=crossing, observations=("state",), render_mode="human"
     )
     check_env(made.unwrapped)
 
 
-def test_a_window_keeps_up_with_the_episode(crossing, monkeypatch):
-    """A picture after reset and after every step, each for a tick; `render` returns nothing."""
+def test_the_window_shows_every_tick(crossing, monkeypatch):
+    """After reset and after every step, for the length of a tick; `render` returns None."""
     env = ReplayEnv(crossing, observations=("state",), render_mode="human", dt_s=0.04)
     shown, waited = [], []
     assert env._live._window is not None
@@ -56,25 +56,25 @@ def test_a_window_keeps_up_with_the_episode(crossing, monkeypatch):
     monkeypatch.setattr(env._live._window, "wait_s", waited.append)
     env.reset(options={"scenario": 1})
     for _ in range(3):
-        env.step(STILL)
+        env.step(ZERO_ACTION)
     assert len(shown) == 4
     assert waited == [pytest.approx(25.0)] * 4
     assert np.array_equal(shown[-1], draw_frame(env.scene()))
     assert env.render() is None
-    env.show(forecast=_said(env))
+    env.show(forecast=_forecast(env))
     assert len(shown) == 6
     assert len(waited) == 4
     assert env.metadata["render_fps"] == 25
     assert ReplayEnv.metadata["render_fps"] == 5
 
 
-def test_closing_is_nobodys_trouble(crossing):
-    """The user closes the window, the episode goes on; `close` may be called twice."""
+def test_the_episode_continues_after_the_user_closes_the_window(crossing):
+    """`close` may be called twice."""
     env = _make(crossing, "human")
-    env.step(STILL)
+    env.step(ZERO_ACTION)
     pygame.event.post(pygame.Event(pygame.QUIT))
     for _ in range(3):
-        env.step(STILL)
+        env.step(ZERO_ACTION)
     assert env._live._window is not None
     assert env._live._window.closed
     env.reset()
@@ -85,63 +85,61 @@ def test_closing_is_nobodys_trouble(crossing):
     never.close()
 
 
-def test_a_copy_has_a_window_of_its_own(crossing):
-    """Closing the copy's window leaves that of the original."""
+def test_a_copy_has_its_own_window(crossing):
     env = _make(crossing, "human")
     twin = copy.deepcopy(env)
-    twin.step(STILL)
+    twin.step(ZERO_ACTION)
     assert env._live._window is not None
     assert twin._live._window is not None
     assert env._live._window._window is not twin._live._window._window
     twin.close()
-    env.step(STILL)
+    env.step(ZERO_ACTION)
     assert env._live._window._window is not None
     env.close()
 
 
-def test_what_is_handed_over_is_shown_until_it_has_passed(crossing):
-    """As `draw_frame` draws it; 4 ticks later what is left of 10 steps; then nothing."""
+def test_the_overlay_shows_the_remaining_ticks(crossing):
+    """All 10 steps at first, 6 of them 4 ticks later, then none."""
     env = _make(crossing)
     bare = env.render()
-    forecast = _said(env)
+    forecast = _forecast(env)
     plan = forecast.states[0, 0]
     env.show(forecast=forecast, plan=plan)
     shown = env.render()
     assert np.array_equal(shown, draw_frame(env.scene(), forecast=forecast, plan=plan))
     assert not np.array_equal(shown, bare)
     for _ in range(4):
-        env.step(STILL)
+        env.step(ZERO_ACTION)
     late = draw_frame(env.scene(), forecast=forecast, plan=plan[4:])
     assert np.array_equal(env.render(), late)
     assert not np.array_equal(late, draw_frame(env.scene()))
     for _ in range(6):
-        env.step(STILL)
+        env.step(ZERO_ACTION)
     assert np.array_equal(env.render(), draw_frame(env.scene()))
 
 
-def test_it_is_forgotten(crossing):
-    """By the next call without it, and by reset."""
+def test_show_without_arguments_and_reset_remove_the_overlay(crossing):
     env = _make(crossing)
     bare = env.render()
-    env.show(forecast=_said(env))
+    env.show(forecast=_forecast(env))
     env.show()
     assert np.array_equal(env.render(), bare)
-    env.show(forecast=_said(env))
+    env.show(forecast=_forecast(env))
     env.reset(options={"scenario": 1})
     assert np.array_equal(env.render(), bare)
 
 
-def test_what_is_not_of_this_scene_is_refused(crossing):
-    """Another scene's forecast, a plan of another shape, and what is not finite."""
+def test_invalid_overlays_are_rejected(crossing):
+    """A forecast of another scene, a plan of another shape, and values that are not finite."""
     env, other = _make(crossing), _make(crossing)
     other.reset(options={"scenario": 5})
     bare = env.render()
     with pytest.raises(AspEnvError, match=r"forecast: expected one of this environment's scene"):
-        env.show(forecast=_said(other))
+        env.show(forecast=_forecast(other))
     for plan in (np.zeros(4), np.zeros((3, 1)), np.full((3, 2), np.nan)):
         with pytest.raises(AspEnvError, match="plan of shape"):
             env.show(plan=plan)
-    broken = _said(env)
+    broken = _forecast(env)
     broken.states[0, 0, 0, 0] = np.inf
     with pytest.raises(AspEnvError, match="finite"):
         env.show(forecast=broken)
@@ -150,21 +148,21 @@ def test_what_is_not_of_this_scene_is_refused(crossing):
         ReplayEnv(crossing, observations=("state",)).show()
 
 
-def test_gymnasium_collects_lists_of_pictures(crossing):
-    """`rgb_array_list` is provided by `gymnasium.make`: all pictures since the last time."""
+def test_rgb_array_list_collects_pictures(crossing):
+    """`gymnasium.make` provides this mode: all pictures since the last call."""
     env = gymnasium.make(
         "asp_env/Replay-v0", data=crossing, observations=("state",), render_mode="rgb_array_list"
     )
     env.reset(seed=0)
-    env.step(STILL)
-    env.step(STILL)
+    env.step(ZERO_ACTION)
+    env.step(ZERO_ACTION)
     pictures: Any = env.render()
     assert [picture.shape for picture in pictures] == [(720, 720, 3)] * 3
     assert env.render() == []
 
 
-def test_a_window_needs_its_package_at_once(crossing, monkeypatch):
-    """One line when the environment is made; pictures need nothing."""
+def test_a_missing_package_is_reported_when_the_environment_is_made(crossing, monkeypatch):
+    """Pictures need no package."""
     monkeypatch.setattr("asp_env.render.window.find_spec", lambda _: None)
     with pytest.raises(MissingExtraError, match=r"asp-env\[render\]"):
         ReplayEnv(crossing, render_mode="human")
@@ -172,7 +170,7 @@ def test_a_window_needs_its_package_at_once(crossing, monkeypatch):
 
 
 def test_a_screen_shows_the_environment(tmp_path: Path, crossing: str) -> None:
-    """Under X: what `rgb_array` draws of the same episode stands on the screen, pixel for pixel."""
+    """Under X, the window has the pixels of `rgb_array` for the same episode."""
     script = """
 import sys
 import numpy as np

@@ -1,4 +1,4 @@
-"""`asp_env/Replay-v0` as its users meet it."""
+"""`asp_env/Replay-v0`: rewards, endings, infos and rendering."""
 
 import subprocess
 import sys
@@ -17,8 +17,8 @@ def _make(crossing: str, **options: Any) -> ReplayEnv:
     return ReplayEnv(crossing, **{"raster_px": SMALL, **options})
 
 
-def test_standing_still_by_hand(crossing):
-    """Full brakes from 8 m/s: 1 m/s less per tick, at rest after 1.6 s and 6.4 m of 120 m."""
+def test_reward_of_full_braking(crossing):
+    """From 8 m/s the ego loses 1 m/s per tick and stops after 1.6 s and 6.4 m of 120 m."""
     env = _make(crossing, observations=("state",))
     env.reset(options={"scenario": 0})
     total, info = 0.0, {}
@@ -30,12 +30,12 @@ def test_standing_still_by_hand(crossing):
         total += reward
     assert info["progress"] == pytest.approx(6.4 / 120, abs=1e-3)
     assert info["ending"] == "RUNNING"
-    # eight ticks of 5 m/s² cost 0.01·½ each
+    # Eight ticks of 5 m/s² cost 0.01·½ each.
     assert total == pytest.approx(6.4 / 120 - 8 * 0.005, abs=1e-3)
 
 
-def test_driving_on_reaches_the_goal(crossing):
-    """Scenario 5 is a motorcycle that goes on at its speed: 35 ticks, progress 1, terminated."""
+def test_constant_speed_reaches_the_goal(crossing):
+    """The motorcycle of scenario 5 keeps its speed for 35 ticks; the rewards sum to 1."""
     env = _make(crossing, observations=("state",))
     env.reset(options={"scenario": 5})
     rewards = []
@@ -51,8 +51,8 @@ def test_driving_on_reaches_the_goal(crossing):
         env.step(np.zeros(2))
 
 
-def test_running_out_of_data_is_a_truncation(crossing):
-    """Standing for the 75 ticks of scenario 0, away from everybody: truncated at the 75th."""
+def test_the_end_of_the_data_truncates(crossing):
+    """A standing ego without collisions is truncated at tick 75, the length of the scenario."""
     env = _make(crossing, observations=("state",))
     env.reset(options={"scenario": 1})
     info = {}
@@ -64,7 +64,7 @@ def test_running_out_of_data_is_a_truncation(crossing):
 
 
 def test_leaving_the_road_terminates(crossing):
-    """Hard left from the lane: `OFF_ROAD`, more than 2 m outside, and a cost on the way."""
+    """At more than 2 m off the drivable area, with a cost before."""
     env = _make(crossing, observations=("state",))
     env.reset(options={"scenario": 1})
     costs = 0.0
@@ -79,7 +79,6 @@ def test_leaving_the_road_terminates(crossing):
 
 
 def test_actions_out_of_range_are_clipped(crossing):
-    """Ten times the range does what the range does."""
     envs = [_make(crossing, observations=("state",)) for _ in range(2)]
     for env, scale in zip(envs, (1.0, 10.0), strict=True):
         env.reset(options={"scenario": 0})
@@ -88,8 +87,7 @@ def test_actions_out_of_range_are_clipped(crossing):
     assert envs[0].scene().states.tobytes() == envs[1].scene().states.tobytes()
 
 
-def test_unseeded_resets_go_on_from_the_seeded_one(crossing):
-    """The same draws after the same seed; all scenarios come up."""
+def test_unseeded_resets_continue_the_draws_of_the_seed(crossing):
     env = _make(crossing, observations=("state",))
     names = [scenario.name for scenario in env.scenarios]
     drawn = [env.reset(seed=1)[1]["scenario"], *(env.reset()[1]["scenario"] for _ in range(30))]
@@ -98,8 +96,8 @@ def test_unseeded_resets_go_on_from_the_seeded_one(crossing):
     assert set(drawn) == set(names)
 
 
-def test_a_scene_for_anybodys_predictor(crossing):
-    """The scene behind the wrappers: one situation, the ego in slot 0, its tick the env's."""
+def test_scene_behind_wrappers(crossing):
+    """One situation, the ego in slot 0, at the present tick."""
     env = gymnasium.make("asp_env/Replay-v0", data=crossing, observations=("state",))
     env.reset(options={"scenario": 2})
     env.step(np.zeros(2, dtype=np.float32))
@@ -112,7 +110,7 @@ def test_a_scene_for_anybodys_predictor(crossing):
 
 
 def test_renders_an_rgb_array(crossing):
-    """uint8 (H, W, 3) with more than one colour, the same for the same state; else nothing."""
+    """The same state gives the same picture; without a render mode there is none."""
     env = _make(crossing, render_mode="rgb_array")
     env.reset(seed=0)
     picture = env.render()
@@ -126,16 +124,14 @@ def test_renders_an_rgb_array(crossing):
     assert silent.render() is None
 
 
-def test_closing_twice_is_fine(crossing):
-    """The second close does nothing."""
+def test_close_may_be_called_twice(crossing):
     env = gymnasium.make("asp_env/Replay-v0", data=crossing)
     env.reset(seed=0)
     env.close()
     env.close()
 
 
-def test_the_default_needs_no_torch():
-    """`gym.make` with no argument makes, resets and steps on shipped data without torch."""
+def test_the_default_environment_imports_no_torch():
     script = (
         "import sys, gymnasium as gym, asp_env;"
         "env = gym.make('asp_env/Replay-v0'); env.reset(seed=0);"

@@ -1,4 +1,4 @@
-"""The adapter for stable-baselines3 against its own `DummyVecEnv` over single environments."""
+"""The stable-baselines3 adapter compared with `DummyVecEnv` over single environments."""
 
 import copy
 import subprocess
@@ -38,39 +38,39 @@ def _dummy(crossing: str, **options: Any) -> VecEnv:
     return DummyVecEnv([lambda: ReplayEnv(crossing, **(OPTIONS | options))] * COUNT)
 
 
-def _parts(seen: Any) -> dict[str, np.ndarray]:
-    """`DummyVecEnv` returns an ordered dictionary."""
+def _as_dict(seen: Any) -> dict[str, np.ndarray]:
+    """Converts the ordered dictionary of `DummyVecEnv`."""
     return dict(seen)
 
 
 @pytest.mark.parametrize(("mode", "traffic"), [("SameStep", "log"), ("Disabled", "idm")])
-def test_equals_single_environments_step_for_step(crossing, mode, traffic):
-    """Observations, rewards, ends, infos with their `terminal_observation`, infos of resets."""
+def test_returns_the_bits_of_single_environments(crossing, mode, traffic):
+    """Observations, rewards, endings, infos with `terminal_observation`, and infos of resets."""
     one, other = _adapter(crossing, mode, traffic=traffic), _dummy(crossing, traffic=traffic)
     assert (one.observation_space, one.action_space) == (
         other.observation_space,
         other.action_space,
     )
     assert one.seed(3) == other.seed(3)
-    same(one.reset(), _parts(other.reset()))
+    same(one.reset(), _as_dict(other.reset()))
     rng, ends, limits = np.random.default_rng(0), 0, 0
     for _ in range(100):
         same(one.reset_infos, other.reset_infos)
         actions = rng.uniform((-0.5, -0.3), (1.0, 0.3), (COUNT, 2)).astype(np.float32)
-        actions[0] = -1.0, 0.0  # stands until the data end
-        told, (seen, *rest) = one.step(actions), other.step(actions)
-        same(list(told), [_parts(seen), *rest])
-        ends += int(told[2].sum())
-        limits += sum(info["TimeLimit.truncated"] for info in told[3])
+        actions[0] = -1.0, 0.0  # This ego stands until the data end.
+        returned, (seen, *rest) = one.step(actions), other.step(actions)
+        same(list(returned), [_as_dict(seen), *rest])
+        ends += int(returned[2].sum())
+        limits += sum(info["TimeLimit.truncated"] for info in returned[3])
         assert all(("terminal_observation" in info) == over for info, over in zip(
-            told[3], told[2], strict=True
+            returned[3], returned[2], strict=True
         ))  # fmt: skip
     assert ends > 2 * COUNT
     assert limits
 
 
-def test_seeds_and_options_serve_one_reset(crossing):
-    """As `DummyVecEnv` has it: the same for all or one for each, then drawn again."""
+def test_seeds_and_options_apply_to_one_reset(crossing):
+    """One value for all environments or one for each, as in `DummyVecEnv`."""
     one, other = _adapter(crossing), _dummy(crossing)
     for options in (
         {"scenario": 4},
@@ -81,12 +81,12 @@ def test_seeds_and_options_serve_one_reset(crossing):
             envs.seed(8)
             envs.set_options(options)
         for _ in range(2):
-            same(one.reset(), _parts(other.reset()))
+            same(one.reset(), _as_dict(other.reset()))
             same(one.reset_infos, other.reset_infos)
 
 
 def test_attributes_and_methods_of_each_environment(crossing):
-    """What one environment has; what is one for all is shared."""
+    """Most attributes are shared by all environments."""
     one, other = _adapter(crossing, render_mode=None), _dummy(crossing)
     for envs in (one, other):
         envs.seed(5)
@@ -99,21 +99,20 @@ def test_attributes_and_methods_of_each_environment(crossing):
     assert one.has_attr("recordings")
     assert not one.has_attr("colour")
     scenes = one.env_method("scene")
-    for mine, its in zip(scenes, other.env_method("scene"), strict=True):
-        everybody = np.flatnonzero(mine.ids[0] >= 0)
-        same(mine.states[:, everybody], its.states[:, np.flatnonzero(its.ids[0] >= 0)])
+    for batched, single in zip(scenes, other.env_method("scene"), strict=True):
+        agents, expected = (np.flatnonzero(scene.ids[0] >= 0) for scene in (batched, single))
+        same(batched.states[:, agents], single.states[:, expected])
     assert one.env_is_wrapped(gymnasium.Wrapper) == [False] * COUNT
     for call in (lambda: one.env_method("snapshot", indices=0), lambda: one.get_attr("scene")):
-        with pytest.raises(AttributeError, match=r"one environment alone|scene is a method"):
+        with pytest.raises(AttributeError, match=r"expected scene|scene is a method"):
             call()
-    one.set_attr("label", "mine")
-    assert one.get_attr("label") == ["mine"] * COUNT
-    with pytest.raises(asp_env.AspEnvError, match="is one for all environments"):
-        one.set_attr("label", "yours", indices=[1])
+    one.set_attr("label", "first")
+    assert one.get_attr("label") == ["first"] * COUNT
+    with pytest.raises(asp_env.AspEnvError, match="all environments share it"):
+        one.set_attr("label", "second", indices=[1])
 
 
-def test_pictures(crossing):
-    """Tiles of what the single environments render."""
+def test_pictures_are_those_of_single_environments(crossing):
     one, other = (make(crossing, render_mode="rgb_array") for make in (_adapter, _dummy))
     for envs in (one, other):
         envs.seed(5)
@@ -127,21 +126,21 @@ def test_pictures(crossing):
         assert list(silent.get_images()) == [None] * COUNT
 
 
-def test_what_stable_baselines3_does_with_it(crossing):
-    """PPO with its own policy for Dicts behind `VecMonitor` and `VecNormalize`, then evaluation."""
+def test_ppo_trains_and_is_evaluated(crossing):
+    """With `MultiInputPolicy` behind `VecMonitor` and `VecNormalize`."""
     envs = VecNormalize(VecMonitor(_adapter(crossing)), norm_obs_keys=["state", "route"])
     model = PPO("MultiInputPolicy", envs, n_steps=16, batch_size=32, n_epochs=1, seed=0)
     model.learn(160)
     assert len(model.ep_info_buffer or ())
     envs.training, envs.norm_reward = False, False
-    told = evaluate_policy(model, envs, n_eval_episodes=6, return_episode_rewards=True)
-    assert np.shape(told) == (2, 6)
-    assert np.isfinite(told).all()
+    scores = evaluate_policy(model, envs, n_eval_episodes=6, return_episode_rewards=True)
+    assert np.shape(scores) == (2, 6)
+    assert np.isfinite(scores).all()
     envs.close()
 
 
-def test_forecasts_for_stable_baselines3(crossing):
-    """`VectorPredictionFeatures` inside the adapter: its parts, at last observations, too."""
+def test_adapter_over_prediction_features(crossing):
+    """The forecasts are also part of `terminal_observation`."""
     made = gymnasium.make_vec(
         "asp_env/Replay-v0",
         num_envs=COUNT,
@@ -164,7 +163,7 @@ def test_forecasts_for_stable_baselines3(crossing):
     assert len(envs.env_method("scene", indices=0)) == 1
 
 
-def test_a_copy_goes_on_in_the_same_way(crossing):
+def test_a_copy_continues_in_the_same_way(crossing):
     """Through the ends of episodes."""
     envs = _adapter(crossing)
     envs.seed(2)
@@ -172,13 +171,11 @@ def test_a_copy_goes_on_in_the_same_way(crossing):
     twin = copy.deepcopy(envs)
     for _ in range(20):
         actions = np.full((COUNT, 2), (1.0, 0.3), dtype=np.float32)
-        told = envs.step(actions)
-        same(told, twin.step(actions))
+        same(envs.step(actions), twin.step(actions))
     same(envs.get_attr("np_random_seed"), twin.get_attr("np_random_seed"))
 
 
-def test_refuses_other_autoresets(crossing):
-    """The default of Gymnasium does not do."""
+def test_the_autoreset_mode_next_step_is_rejected(crossing):
     with pytest.raises(asp_env.AspEnvError, match="needs autoreset_mode='SameStep'"):
         _adapter(crossing, "NextStep")
 
@@ -187,8 +184,8 @@ def test_refuses_other_autoresets(crossing):
     ("package", "call"),
     [("stable_baselines3", "sb3_vec_env(2)"), ("pettingzoo", "parallel_env()")],
 )
-def test_the_core_does_without(package, call):
-    """Without the package `import asp_env` works; the call names it and the extra."""
+def test_a_missing_extra_is_named(package, call):
+    """`import asp_env` works without the package."""
     script = (
         f"import sys; sys.modules[{package!r}] = None\n"
         "import asp_env\n"

@@ -1,4 +1,4 @@
-"""Going back: snapshots in memory and through pickles, deep copies, and what they leave out."""
+"""Snapshots in memory and as pickles, and deep copies."""
 
 import copy
 import pickle
@@ -22,19 +22,19 @@ def _make(crossing: str, **options: Any) -> ReplayEnv:
 
 
 def _drive(env: ReplayEnv, steps: int = 25) -> list[Any]:
-    """All that an environment returns, through resets without a seed."""
+    """Everything that an environment returns, through resets without a seed."""
     rng, seen = np.random.default_rng(1), []
     for _ in range(steps):
-        told = env.step(rng.uniform((0.0, -0.5), (1.0, 0.5)))
-        seen.append(told)
-        if told[2] or told[3]:
+        returned = env.step(rng.uniform((0.0, -0.5), (1.0, 0.5)))
+        seen.append(returned)
+        if returned[2] or returned[3]:
             seen.append(env.reset())
     return seen
 
 
 @pytest.mark.parametrize("traffic", TRAFFIC)
-def test_a_snapshot_brings_everything_back_bit_for_bit(crossing, traffic):
-    """Also after other episodes, and in another environment; the draws of resets as well."""
+def test_a_snapshot_restores_every_bit(crossing, traffic):
+    """Including the draws of resets, after other episodes and in another environment."""
     env = _make(crossing, traffic=traffic)
     env.reset(seed=2)
     for _ in range(4):
@@ -52,8 +52,8 @@ def test_a_snapshot_brings_everything_back_bit_for_bit(crossing, traffic):
 
 
 @pytest.mark.parametrize("traffic", TRAFFIC)
-def test_a_pickled_snapshot_is_small_and_brings_everything_back(crossing, traffic):
-    """It holds no recording, no picture and no memory of the drivers: under 10 kB."""
+def test_a_pickled_snapshot_is_small_and_restores_every_bit(crossing, traffic):
+    """It holds no recording, no picture and no state of the drivers: less than 10 kB."""
     env = _make(crossing, traffic=traffic)
     env.reset(seed=2)
     for _ in range(4):
@@ -66,8 +66,7 @@ def test_a_pickled_snapshot_is_small_and_brings_everything_back(crossing, traffi
     same(_drive(other), expected)
 
 
-def test_a_finished_episode_is_brought_back_as_finished(crossing):
-    """Nothing can be stepped there."""
+def test_a_restored_finished_episode_is_finished(crossing):
     env = _make(crossing, observations=("state",))
     env.reset(options={"scenario": 5})
     while not any(env.step(np.zeros(2))[2:4]):
@@ -80,7 +79,7 @@ def test_a_finished_episode_is_brought_back_as_finished(crossing):
 
 
 def test_counterfactuals_share_their_past(crossing):
-    """Two ways on from one snapshot: the scenes agree up to it and differ behind it."""
+    """Two continuations of one snapshot agree up to it and differ afterwards."""
     env = _make(crossing, observations=("state",))
     env.reset(seed=0)
     for _ in range(5):
@@ -97,8 +96,8 @@ def test_counterfactuals_share_their_past(crossing):
 
 
 @pytest.mark.parametrize("traffic", TRAFFIC)
-def test_a_deep_copy_goes_on_in_the_same_way(crossing, traffic):
-    """With every observation at once; recordings and maps are shared, not copied."""
+def test_a_deep_copy_continues_in_the_same_way(crossing, traffic):
+    """Recordings and maps are shared, not copied."""
     env = _make(crossing, traffic=traffic, observations=(*ALL, "mtp"))
     env.reset(seed=3, options={"scenario": 1})
     for _ in range(5):
@@ -112,7 +111,7 @@ def test_a_deep_copy_goes_on_in_the_same_way(crossing, traffic):
 
 @pytest.mark.parametrize("traffic", TRAFFIC)
 def test_snapshots_of_vector_environments(crossing, traffic):
-    """Of episodes at different ticks, through autoresets; in memory and pickled."""
+    """With episodes at different ticks, through autoresets, in memory and pickled."""
     envs = ReplayVectorEnv(3, crossing, traffic=traffic, observations=("state", "vectors"))
     envs.reset(seed=[5, 6, 7])
     rng = np.random.default_rng(0)
@@ -121,7 +120,7 @@ def test_snapshots_of_vector_environments(crossing, traffic):
         envs.step(each)
     start = envs.snapshot()
     expected = [envs.step(each) for each in actions[30:]]
-    assert any((told[2] | told[3]).any() for told in expected)
+    assert any((returned[2] | returned[3]).any() for returned in expected)
     for snapshot in (start, pickle.loads(pickle.dumps(start))):
         envs.restore(snapshot)
         same([envs.step(each) for each in actions[30:]], expected)

@@ -1,4 +1,4 @@
-"""What `ReplayVectorEnv` promises beside being equal: memory, seeds, options, refusals."""
+"""`ReplayVectorEnv`: memory, seeds, options, autoreset modes and errors."""
 
 import copy
 from typing import Any
@@ -14,55 +14,56 @@ from asp_env.envs.vector import ReplayVectorEnv
 from asp_env.errors import AspEnvError
 from tests.envs.same import same
 
-STILL = np.zeros((3, 2), dtype=np.float32)
+ZERO_ACTIONS = np.zeros((3, 2), dtype=np.float32)
 
 
 def _make(crossing: str, **options: Any) -> ReplayVectorEnv:
     return ReplayVectorEnv(3, crossing, **{"observations": ("state", "vectors"), **options})
 
 
-def _held(told: Any) -> list[np.ndarray]:
+def _arrays(returned: Any) -> list[np.ndarray]:
     """All arrays of numbers in what an environment returned."""
-    if isinstance(told, dict):
-        told = list(told.values())
-    if isinstance(told, list | tuple):
-        return [array for each in told for array in _held(each)]
-    return [told] if isinstance(told, np.ndarray) and told.dtype != object else []
+    if isinstance(returned, dict):
+        returned = list(returned.values())
+    if isinstance(returned, list | tuple):
+        return [array for each in returned for array in _arrays(each)]
+    is_numeric = isinstance(returned, np.ndarray) and returned.dtype != object
+    return [returned] if is_numeric else []
 
 
 @pytest.mark.parametrize("mode", list(AutoresetMode), ids=lambda mode: mode.value)
-def test_what_is_held_is_never_written_again(crossing, mode):
-    """Whole arrays, views of them and tensors on them keep their bits while others are made."""
+def test_referenced_arrays_are_never_overwritten(crossing, mode):
+    """Whole arrays, views of them and tensors on them."""
     envs = _make(crossing, autoreset_mode=mode, observations=("state", "vectors", "raster"))
-    arrays = _held(envs.reset(seed=0))
-    held: list[tuple[Any, bytes]] = [(array, array.tobytes()) for array in arrays]
+    arrays = _arrays(envs.reset(seed=0))
+    copies: list[tuple[Any, bytes]] = [(array, array.tobytes()) for array in arrays]
     rng = np.random.default_rng(0)
     for step in range(40):
-        told = envs.step(rng.uniform((0.0, -0.5), (1.0, 0.5), size=(3, 2)))
+        returned = envs.step(rng.uniform((0.0, -0.5), (1.0, 0.5), size=(3, 2)))
         if step % 3 == 0:
-            keep = _held(told)
+            keep = _arrays(returned)
         elif step % 3 == 1:
-            keep = [array[1:, ...] for array in _held(told)]
+            keep = [array[1:, ...] for array in _arrays(returned)]
         else:
-            keep = [torch.from_numpy(array).numpy() for array in _held(told)]
-        held += [(array, array.tobytes()) for array in keep]
-        over = told[2] | told[3]
+            keep = [torch.from_numpy(array).numpy() for array in _arrays(returned)]
+        copies += [(array, array.tobytes()) for array in keep]
+        over = returned[2] | returned[3]
         if mode is AutoresetMode.DISABLED and over.any():
             envs.reset(options={"reset_mask": over.copy()})
-        del told, keep
-    assert all(array.tobytes() == bits for array, bits in held)
+        del returned, keep
+    assert all(array.tobytes() == bits for array, bits in copies)
 
 
-def test_memory_is_used_again_once_nobody_holds_it(crossing):
-    """Where the caller keeps only the latest observation, few arrays are made."""
+def test_unreferenced_arrays_are_reused(crossing):
+    """A caller that keeps only the latest observation gets at most three arrays."""
     envs = _make(crossing)
     envs.reset(seed=0)
-    places = {envs.step(STILL)[0]["lines"].ctypes.data for _ in range(30)}
-    assert len(places) <= 3
+    addresses = {envs.step(ZERO_ACTIONS)[0]["lines"].ctypes.data for _ in range(30)}
+    assert len(addresses) <= 3
 
 
 def test_seeds(crossing):
-    """A number seeds each environment with the next one; a list gives each its own."""
+    """Environments count up from one seed; a list has a seed for each."""
     first = _make(crossing).reset(seed=7)
     same(_make(crossing).reset(seed=[7, 8, 9]), first)
     envs = _make(crossing)
@@ -76,7 +77,6 @@ def test_seeds(crossing):
 
 
 def test_options_for_all_and_for_each(crossing):
-    """One value goes to all environments, a list gives each its own."""
     envs = _make(crossing)
     names = [scenario.name for scenario in envs.scenarios]
     infos = envs.reset(options={"scenario": 2})[1]
@@ -87,8 +87,7 @@ def test_options_for_all_and_for_each(crossing):
     assert envs.scene().ids[:, 0].tolist() == [1, 2, 6]
 
 
-def test_options_are_not_changed(crossing):
-    """The caller's mask is still there after the reset."""
+def test_reset_does_not_change_the_options(crossing):
     envs = _make(crossing, autoreset_mode="Disabled")
     envs.reset(seed=0)
     options = {"reset_mask": np.array([True, False, False]), "scenario": 1}
@@ -97,66 +96,64 @@ def test_options_are_not_changed(crossing):
 
 
 @pytest.mark.parametrize(
-    ("mask", "what"),
+    ("mask", "message"),
     [
         ([True, False, False], "expected a bool array"),
         (np.array([1, 0, 0]), "expected a bool array"),
         (np.array([True, False]), "expected a bool array"),
         (np.zeros(3, dtype=bool), "with a true entry"),
     ],
-    ids=["list", "numbers", "two", "nobody"],
+    ids=["list", "numbers", "two", "empty"],
 )
-def test_a_wrong_mask_is_refused(crossing, mask, what):
-    """The episodes go on."""
+def test_invalid_masks_are_rejected(crossing, mask, message):
+    """The episodes continue."""
     envs = _make(crossing, autoreset_mode=AutoresetMode.DISABLED)
     envs.reset(seed=0)
-    with pytest.raises(AspEnvError, match=what):
+    with pytest.raises(AspEnvError, match=message):
         envs.reset(options={"reset_mask": mask})
-    envs.step(STILL)
+    envs.step(ZERO_ACTIONS)
 
 
-def test_the_first_reset_is_of_all(crossing):
-    """A mask that leaves somebody out who never began is refused; so are steps and scenes."""
+def test_the_first_reset_is_of_all_environments(crossing):
+    """Steps, scenes and snapshots need it."""
     envs = _make(crossing, autoreset_mode="Disabled")
     with pytest.raises(gymnasium.error.ResetNeeded, match="reset all"):
         envs.reset(options={"reset_mask": np.array([True, False, True])})
-    for ask in (lambda: envs.step(STILL), envs.scene, envs.snapshot):
+    for call in (lambda: envs.step(ZERO_ACTIONS), envs.scene, envs.snapshot):
         with pytest.raises(gymnasium.error.ResetNeeded):
-            ask()
+            call()
 
 
-def test_disabled_waits_for_a_reset(crossing):
-    """A step with a finished episode in it is refused, and says which it is."""
+def test_finished_episodes_need_a_reset_in_mode_disabled(crossing):
     envs = _make(crossing, autoreset_mode="Disabled")
     envs.reset(options={"scenario": [1, 5, 1]})
-    told = [envs.step(STILL) for _ in range(35)][-1]
-    assert told[2].tolist() == [False, True, False]
+    returned = [envs.step(ZERO_ACTIONS) for _ in range(35)][-1]
+    assert returned[2].tolist() == [False, True, False]
     with pytest.raises(gymnasium.error.ResetNeeded, match=r"the episodes \[1\] are over"):
-        envs.step(STILL)
-    obs, infos = envs.reset(options={"reset_mask": told[2].copy(), "scenario": 0})
+        envs.step(ZERO_ACTIONS)
+    obs, infos = envs.reset(options={"reset_mask": returned[2].copy(), "scenario": 0})
     assert infos["_scenario"].tolist() == [False, True, False]
     assert infos["tick"].tolist() == [0, 0, 0]
     for name in obs:
-        assert obs[name][[0, 2]].tobytes() == told[0][name][[0, 2]].tobytes()
-    assert envs.step(STILL)[4]["tick"].tolist() == [36, 1, 36]
+        assert obs[name][[0, 2]].tobytes() == returned[0][name][[0, 2]].tobytes()
+    assert envs.step(ZERO_ACTIONS)[4]["tick"].tolist() == [36, 1, 36]
 
 
-def test_actions_that_are_ignored_may_be_anything(crossing):
-    """In the step that resets an episode, its action is not looked at."""
+def test_actions_of_resetting_episodes_are_ignored(crossing):
     envs = _make(crossing)
     envs.reset(options={"scenario": [1, 5, 1]})
-    told = [envs.step(STILL) for _ in range(35)][-1]
-    assert told[2].tolist() == [False, True, False]
-    wild = np.array([(0.0, 0.0), (np.nan, np.inf), (0.0, 0.0)])
-    told = envs.step(wild)
-    assert told[1][1] == 0.0
-    assert told[4]["tick"].tolist() == [36, 0, 36]
+    returned = [envs.step(ZERO_ACTIONS) for _ in range(35)][-1]
+    assert returned[2].tolist() == [False, True, False]
+    invalid = np.array([(0.0, 0.0), (np.nan, np.inf), (0.0, 0.0)])
+    returned = envs.step(invalid)
+    assert returned[1][1] == 0.0
+    assert returned[4]["tick"].tolist() == [36, 0, 36]
     with pytest.raises(AspEnvError, match=r"action \[nan, inf\]"):
-        envs.step(wild)
+        envs.step(invalid)
 
 
 @pytest.mark.parametrize(
-    ("actions", "what"),
+    ("actions", "message"),
     [
         (np.zeros(2), r"shape \(2,\).*\(3, 2\)"),
         (np.zeros((2, 2)), r"shape \(2, 2\)"),
@@ -166,59 +163,57 @@ def test_actions_that_are_ignored_may_be_anything(crossing):
     ],
     ids=["single", "two", "nan", "ragged", "nothing"],
 )
-def test_wrong_actions_are_refused(crossing, actions, what):
-    """One line; the episodes can go on with right ones."""
+def test_invalid_actions_are_rejected(crossing, actions, message):
+    """The episodes continue with valid ones."""
     envs = _make(crossing)
     envs.reset(seed=0)
-    with pytest.raises(AspEnvError, match=what) as caught:
+    with pytest.raises(AspEnvError, match=message) as caught:
         envs.step(actions)
     assert "\n" not in str(caught.value)
-    assert envs.step(STILL)[4]["tick"].tolist() == [1, 1, 1]
+    assert envs.step(ZERO_ACTIONS)[4]["tick"].tolist() == [1, 1, 1]
 
 
 @pytest.mark.parametrize(
-    ("options", "what"),
+    ("options", "message"),
     [
         ({"num_envs": 0}, "num_envs 0: expected at least 1"),
         ({"autoreset_mode": "Later"}, "autoreset_mode 'Later': expected one of NextStep"),
-        ({"observation": ("state",)}, r"unknown argument 'observation' \(did you mean"),
+        ({"observation": ("state",)}, r"unexpected keyword argument 'observation'; did you mean"),
         ({"render_mode": "ansi"}, "render mode 'ansi'"),
     ],
     ids=lambda value: next(iter(value)) if isinstance(value, dict) else None,
 )
-def test_wrong_arguments_are_refused(crossing, options, what):
-    """In one line."""
-    with pytest.raises(AspEnvError, match=what):
+def test_invalid_arguments_are_rejected(crossing, options, message):
+    with pytest.raises(AspEnvError, match=message):
         ReplayVectorEnv(**{"num_envs": 3, "data": crossing, **options})
 
 
 @pytest.mark.parametrize(
-    ("reset", "what"),
+    ("reset", "message"),
     [
         ({"seed": [1, 2]}, "2 seeds: expected 3"),
         ({"options": {"scenario": [1, 2]}}, "of 2 values: expected one or 3"),
         ({"options": {"scenari": 1}}, "unknown reset option 'scenari'"),
     ],
 )
-def test_wrong_resets_are_refused(crossing, reset, what):
-    """In one line."""
-    with pytest.raises(AspEnvError, match=what):
+def test_invalid_resets_are_rejected(crossing, reset, message):
+    with pytest.raises(AspEnvError, match=message):
         _make(crossing).reset(**reset)
 
 
-def test_gymnasiums_wrappers_understand_the_infos(crossing):
-    """A list of dictionaries as of single environments; statistics of episodes."""
+def test_gymnasiums_wrappers_of_infos(crossing):
+    """`DictInfoToList` and `RecordEpisodeStatistics`."""
     envs = DictInfoToList(RecordEpisodeStatistics(_make(crossing)))
     envs.reset(options={"scenario": [1, 5, 1]})
-    infos: Any = [envs.step(STILL)[4] for _ in range(35)][-1]
+    infos: Any = [envs.step(ZERO_ACTIONS)[4] for _ in range(35)][-1]
     assert "episode" not in infos[0]
     assert infos[1]["episode"]["l"] == 35
     assert infos[1]["ending"] == "GOAL"
     assert set(infos[1]["reward_terms"]) == {"progress", "comfort", "collision", "off_road"}
 
 
-def test_made_by_gymnasium(crossing):
-    """Without a warning; with its id, its spec, batched spaces, and the mode in the metadata."""
+def test_gymnasium_makes_the_vector_environment(crossing):
+    """Without warnings, with its id, batched spaces and the autoreset mode in the metadata."""
     envs = gymnasium.make_vec(
         "asp_env/Replay-v0",
         num_envs=3,
@@ -237,10 +232,10 @@ def test_made_by_gymnasium(crossing):
     envs.close()
 
 
-def test_a_deep_copy_goes_on_in_the_same_way(crossing):
-    """And shares the recordings."""
+def test_a_deep_copy_continues_in_the_same_way(crossing):
+    """It shares the recordings."""
     envs = _make(crossing)
     envs.reset(seed=0)
     twin = copy.deepcopy(envs)
     assert twin.recordings is envs.recordings
-    same([twin.step(STILL) for _ in range(90)], [envs.step(STILL) for _ in range(90)])
+    same([twin.step(ZERO_ACTIONS) for _ in range(90)], [envs.step(ZERO_ACTIONS) for _ in range(90)])

@@ -1,4 +1,4 @@
-"""`ReplayVectorEnv` against Gymnasium's own vector environments over single ones."""
+"""`ReplayVectorEnv` compared with Gymnasium's `SyncVectorEnv` over single environments."""
 
 from typing import Any
 
@@ -37,14 +37,14 @@ def _singles(data: str, mode: AutoresetMode, **options: Any) -> SyncVectorEnv:
 
 
 def _actions(rng: np.random.Generator) -> np.ndarray:
-    """Full throttle and wild steering, so that all kinds of endings come up."""
+    """Full acceleration and random steering, which lead to all kinds of endings."""
     return rng.uniform((0.0, -0.5), (1.0, 0.5), size=(COUNT, 2)).astype(np.float32)
 
 
 @pytest.mark.parametrize("mode", list(AutoresetMode), ids=lambda mode: mode.value)
 @pytest.mark.parametrize("traffic", ["log", "log-actions", "idm"])
-def test_equals_single_environments_bit_for_bit(crossing, traffic, mode):
-    """Observations, rewards, endings and infos through many autoresets, in every mode."""
+def test_returns_the_bits_of_single_environments(crossing, traffic, mode):
+    """Observations, rewards, endings and infos through many autoresets."""
     one = _batched(crossing, traffic=traffic, observations=ALL, autoreset_mode=mode)
     other = _singles(crossing, mode, traffic=traffic, observations=ALL)
     rng = np.random.default_rng(0)

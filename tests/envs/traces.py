@@ -1,4 +1,4 @@
-"""Hashes of all that an environment returns, for comparisons between instances and processes."""
+"""Hashes of everything that an environment returns, to compare instances and processes."""
 
 import hashlib
 from typing import Any
@@ -9,16 +9,16 @@ import numpy as np
 from asp_env.envs.replay import ReplayEnv
 from asp_env.envs.vector import ReplayVectorEnv
 
-PARTS = ("raster", "vectors", "actions", "state", "route")
+COMPONENTS = ("raster", "vectors", "actions", "state", "route")
 
 
 def make(data: str, **options: Any) -> ReplayEnv:
-    """With every kind of observation and small pictures."""
-    return ReplayEnv(data, **{"raster_px": (45, 30), "observations": PARTS, **options})
+    """Makes an environment with all components of the observation and small rasters."""
+    return ReplayEnv(data, **{"raster_px": (45, 30), "observations": COMPONENTS, **options})
 
 
 def digest(value: object, into: Any) -> None:
-    """Feeds every bit of an observation, a reward or an info to a hash."""
+    """Updates a hash with every bit of an observation, a reward or an info."""
     if isinstance(value, dict):
         for name in sorted(value):
             into.update(str(name).encode())
@@ -33,20 +33,21 @@ def digest(value: object, into: Any) -> None:
 
 
 def trace(env: gymnasium.Env, *, seed: int = 5, steps: int = 60) -> str:
-    """A hash of all that an environment returns over several episodes."""
+    """Returns a hash of everything that an environment returns over several episodes."""
     seen, rng = hashlib.sha256(), np.random.default_rng(seed)
     digest(env.reset(seed=seed), seen)
     for _ in range(steps):
-        told = env.step(rng.uniform((-0.5, -0.3), (1.0, 0.3)))
-        digest(told, seen)
-        if told[2] or told[3]:
+        returned = env.step(rng.uniform((-0.5, -0.3), (1.0, 0.3)))
+        digest(returned, seen)
+        if returned[2] or returned[3]:
             digest(env.reset(), seen)
     return seen.hexdigest()
 
 
 def trace_vector(data: str, *, steps: int, **options: Any) -> str:
-    """A hash of all that three environments side by side return."""
-    envs = ReplayVectorEnv(3, data, **{"raster_px": (45, 30), "observations": PARTS, **options})
+    """Returns a hash of everything that a vector environment of three returns."""
+    options = {"raster_px": (45, 30), "observations": COMPONENTS, **options}
+    envs = ReplayVectorEnv(3, data, **options)
     seen, rng = hashlib.sha256(), np.random.default_rng(0)
     digest(envs.reset(seed=5), seen)
     for _ in range(steps):

@@ -1,4 +1,4 @@
-"""The report: what it says, that it works in a browser, and that it asks no network."""
+"""Tests of the report: its content, and that it works in a browser without a network."""
 
 import json
 import re
@@ -14,32 +14,32 @@ from selenium.webdriver.support.ui import WebDriverWait
 
 from asp_env.errors import AspEnvError, DataError, MissingExtraError
 from asp_env.evaluation.report import ForecastExamples, write_report
-from asp_env.evaluation.report.payload import MapTable, pictures_payload
+from asp_env.evaluation.report.payload import MapTable, examples_payload
 from tests.builders import make_recording
 from tests.evaluation.runs import make_examples, metric_rows, write_run, write_tables
 
-DRIVERS = ["sampling + constant-velocity", "sampling + ffw-asp"]
+METHODS = ["sampling + constant-velocity", "sampling + ffw-asp"]
 
 
 @pytest.fixture(scope="module")
 def report(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """The report of a made-up run with everything that one can have."""
+    """The report of a synthetic run with every section."""
     out = tmp_path_factory.mktemp("run")
     recording = make_recording(duration_s=30.0)
     write_run(out, [recording])
     return write_report(
         out,
-        title="Made up <b>&</b>",
-        lead="Two drivers & a fork.",
+        title="Synthetic <b>&</b>",
+        lead="Two methods & a fork.",
         maps={recording.name: recording.road_map},
         examples=make_examples([recording], count=2),
     )
 
 
 def rows_of(page: str, heading: str) -> list[list[str]]:
-    """The cells' first words of the first table that carries a heading."""
+    """The values of the first table with a heading, without intervals, badges and details."""
     table = page[page.index(f"<thead><tr><th>{heading}</th>") :].partition("</table>")[0]
-    rows = re.findall(r"<tr[^>]*>(.*?)</tr>", table)
+    rows = re.findall(r"<tr[^>]*>(.*?)</tr>", table, re.DOTALL)
     return [
         [re.sub("<[^>]+>", "", re.sub("<(small|i).*", "", cell)) for cell in cells]
         for row in rows
@@ -48,16 +48,14 @@ def rows_of(page: str, heading: str) -> list[list[str]]:
 
 
 def data_of(page: str) -> dict[str, Any]:
-    """What the page's scripts are handed."""
-    found = re.search(r'<script type="application/json" id="data">(.*?)</script>', page)
-    assert found is not None
-    return json.loads(found[1])
+    """The JSON data of the page."""
+    match = re.search(r'<script type="application/json" id="data">(.*?)</script>', page)
+    assert match is not None
+    return json.loads(match[1])
 
 
-def test_tables_name_who_knew_the_future_first_and_mark_the_best_of_the_others(
-    report: Path,
-) -> None:
-    """FDE of the `all` subset is 0.7 times the error of each predictor; the expert leads."""
+def test_privileged_methods_come_first_and_the_best_of_the_others_is_bold(report: Path) -> None:
+    """FDE of the subset `all` is 0.7 times the error of each predictor."""
     page = report.read_text()
     table = rows_of(page, "most probable")
     column = table[0].index("FDE")
@@ -67,93 +65,96 @@ def test_tables_name_who_knew_the_future_first_and_mark_the_best_of_the_others(
     assert [row[column] for row in table[1:]] == ["0.00", "2.66", "2.17", "1.33"]
     best = page[page.index("<thead><tr><th>most probable</th>") :].partition("</table>")[0]
     assert re.findall(r"<b>([\d.]+)</b>", best) == ["0.27", "0.18", "1.33", "0.53", "26.6", "0.50"]
-    driven = rows_of(page, "")
-    assert [row[0] for row in driven[1:]] == [
+    driving = rows_of(page, "")
+    assert [row[0] for row in driving[1:]] == [
         "expert", "sampling + oracle", "idm", "sampling + constant-velocity", "sampling + ffw-asp",
     ]  # fmt: skip
-    assert [row[driven[0].index("Score")] for row in driven[1:]] == [
+    assert [row[driving[0].index("Score")] for row in driving[1:]] == [
         "93.0", "90.0", "74.0", "70.0", "81.0",
     ]  # fmt: skip
 
 
-def test_kinds_of_targets_have_tables_of_their_own(report: Path) -> None:
-    """Columns left and right of manoeuvres, FDE 1.2 and 1.1 times the error; no tab, no bar."""
+def test_kinds_of_targets_have_separate_tables(report: Path) -> None:
+    """FDE for left and right turns is 1.2 and 1.1 times the error; there is no tab and no bar."""
     page = report.read_text()
-    section = page.partition("<section id='kinds'>")[2].partition("</section>")[0]
+    section = page.partition('<section id="breakdown">')[2].partition("</section>")[0]
     assert "FDE by manoeuvre" in section
     table = rows_of(section, "most probable")
     assert table[0][1:] == ["left", "right"]
     assert table[2] == ["constant-velocity", "4.56", "4.18"]
-    assert "manoeuvre:left" not in page.partition("<section id='kinds'>")[0]
+    assert "manoeuvre:left" not in page.partition('<section id="breakdown">')[0]
     bars = data_of(page)["figures"]["final-errors"]["data"]
     assert {x for bar in bars for x in bar["x"]} == {"all", "moving", "left", "straight"}
 
 
 def test_cards_compare_with_constant_velocity_and_the_expert(report: Path) -> None:
-    """FDE of moving targets 1.90 m beside 3.80 m; score 81.0 % beside 93.0 %."""
-    cards = report.read_text().partition("<div class='cards'>")[2].partition("<section")[0]
-    assert re.findall(r"class='figure'>([\d.]+)", cards) == ["1.90", "1.14", "81.0", "93.9"]
+    """FDE of moving targets is 1.90 m beside 3.80 m, the score 81.0 % beside 93.0 %."""
+    cards = report.read_text().partition('<div class="cards">')[2].partition("<section")[0]
+    assert re.findall(r'class="figure">([\d.]+)', cards) == ["1.90", "1.14", "81.0", "93.9"]
     assert "constant velocity: 3.80 m; ratio 0.50 (0.45 to 0.55)" in cards
-    assert "93.0 % for the logged expert" in cards
+    assert "expert: 93.0 %" in cards
 
 
-def test_the_page_names_nothing_outside_itself_and_escapes_what_it_is_given(report: Path) -> None:
-    """No linked script, style, image or font; titles are text, not markup; under 15 MB."""
+def test_the_page_is_self_contained_and_escapes_its_title(report: Path) -> None:
+    """The page links no script, style, image or font and is smaller than 15 MB."""
     page = report.read_text()
     own = page.replace(page[page.index("/**\n* plotly.js") :].partition("</script>")[0], "")
-    assert len(own) < 2_000_000  # the library was found and cut out
+    assert len(own) < 2_000_000  # plotly has been removed from the text
     assert "http" not in own
     assert not re.search(r"<(script|link|img|iframe)[^>]*(src|href)=[\"'](?!data:)", own)
-    assert "Made up &lt;b&gt;&amp;&lt;/b&gt;" in own
+    assert "Synthetic &lt;b&gt;&amp;&lt;/b&gt;" in own
     assert "<b>&</b>" not in own
     assert report.stat().st_size < 15e6
 
 
-def test_drives_hold_what_was_logged(report: Path) -> None:
-    """Poses in centimetres and thousandths of a radian; spells of events; both drivers."""
-    drives = data_of(report.read_text())["drives"]
-    assert [drive["driver"] for drive in drives] == sorted(DRIVERS * 3)
-    assert len(drives) == 6
-    drive = drives[0]
-    half = (drive["ticks"] - 1) // 2
-    assert drive["events"][1] == ["off-road", half, half + 3]
+def test_rollouts_hold_poses_events_plans_and_forecasts(report: Path) -> None:
+    """Poses are in centimetres and thousandths of a radian."""
+    rollouts = data_of(report.read_text())["drives"]
+    assert [rollout["driver"] for rollout in rollouts] == sorted(METHODS * 3)
+    assert len(rollouts) == 6
+    rollout = rollouts[0]
+    half = (rollout["ticks"] - 1) // 2
+    assert rollout["events"][1] == ["off-road", half, half + 3]
     recording = make_recording(duration_s=30.0)
-    ego = int(drive["name"].split("-")[1])
-    start_tick = int(drive["name"].split("-")[2])
+    ego = int(rollout["name"].split("-")[1])
+    start_tick = int(rollout["name"].split("-")[2])
     track = recording.track(int(np.flatnonzero(recording.track_ids == ego)[0]))
     x, y, heading = track[start_tick * 5, :3] * (100, 100, 1000)
-    assert np.abs(np.array(drive["log"][0]) - (x, y, heading)).max() <= 0.51
-    assert len(drive["plans"]) == drive["ticks"] - 1 == len(drive["log"]) - 1
-    told = drive["forecasts"][3]
-    assert told
-    assert all(sum(p for p, _ in modes) == pytest.approx(1, abs=2e-3) for _, modes in told)
+    assert np.abs(np.array(rollout["log"][0]) - (x, y, heading)).max() <= 0.51
+    assert len(rollout["plans"]) == rollout["ticks"] - 1 == len(rollout["log"]) - 1
+    forecasts = rollout["forecasts"][3]
+    assert forecasts
+    assert all(sum(p for p, _ in modes) == pytest.approx(1, abs=2e-3) for _, modes in forecasts)
 
 
-def test_pictures_keep_places_and_final_errors() -> None:
-    """Steps add up to the forecast's end to a centimetre; captions' errors are the means."""
+def test_examples_preserve_positions_and_final_errors() -> None:
+    """Steps add up to the end of the forecast within a centimetre; errors are means."""
     recording = make_recording()
     examples = make_examples([recording], count=1)
-    (row,) = pictures_payload(examples, MapTable())
+    (row,) = examples_payload(examples, MapTable())
     forecast = examples.forecasts["ffw-asp"]
-    for place in range(len(row["targets"])):
-        for mode, (p, steps) in enumerate(row["forecasts"]["ffw-asp"]["modes"][place]):
+    for target in range(len(row["targets"])):
+        for mode, (p, steps) in enumerate(row["forecasts"]["ffw-asp"]["modes"][target]):
             end = np.array(steps).reshape(-1, 2).sum(axis=0) / 100
-            assert np.abs(end - forecast.states[place, mode, -1, :2]).max() < 0.006
-            assert p == pytest.approx(np.exp(forecast.log_probs[place, mode]), abs=1e-3)
+            assert np.abs(end - forecast.states[target, mode, -1, :2]).max() < 0.006
+            assert p == pytest.approx(np.exp(forecast.log_probs[target, mode]), abs=1e-3)
     straight = examples.forecasts["constant-velocity"].states[:, 0, -1, :2]
     miss = np.linalg.norm(straight - examples.future.states[:, -1, :2], axis=-1)
     assert row["forecasts"]["constant-velocity"]["fde"] == pytest.approx(miss.mean(), abs=0.006)
 
 
-def test_a_run_without_drives_or_pictures_has_no_such_sections(tmp_path: Path) -> None:
-    """Only what there is gets a heading."""
+def test_sections_without_content_are_left_out(tmp_path: Path) -> None:
     write_tables(tmp_path, [row for row in metric_rows() if not row["planner"]])
     page = write_report(tmp_path, title="Open loop").read_text()
-    assert re.findall(r"<section id='(\w+)'", page) == ["forecasts", "kinds", "metrics", "run"]
+    assert re.findall(r'<section id="(\w+)"', page) == [
+        "forecasts",
+        "breakdown",
+        "metrics",
+        "manifest",
+    ]
 
 
-def test_names_that_look_like_markup_stay_text(tmp_path: Path) -> None:
-    """A predictor called as a closing script tag breaks nothing."""
+def test_names_that_look_like_markup_are_escaped(tmp_path: Path) -> None:
     rows = [row | {"predictor": "</script><i>x"} for row in metric_rows() if not row["planner"]]
     write_tables(tmp_path, rows[:8])
     page = write_report(tmp_path, title="Odd").read_text()
@@ -162,8 +163,17 @@ def test_names_that_look_like_markup_stay_text(tmp_path: Path) -> None:
     assert any("</script><i>x" in name for name in data_of(page)["colours"])
 
 
-def test_what_is_missing_or_damaged_is_one_line(tmp_path: Path) -> None:
-    """No table, a column less, text for a number, no manifest, a rollout without its map."""
+def test_run_folders_of_before_recipes_were_named_still_load(tmp_path: Path) -> None:
+    """The column `recipe` of `metrics.csv` was called `preset`; the page is the same."""
+    write_tables(tmp_path, [row | {"recipe": "paper"} for row in metric_rows()])
+    page = write_report(tmp_path, title="x").read_text()
+    assert "recipe paper" in page
+    table = tmp_path / "metrics.csv"
+    table.write_text(table.read_text().replace(",recipe,", ",preset,", 1))
+    assert write_report(tmp_path, title="x").read_text() == page
+
+
+def test_missing_or_damaged_files_are_refused(tmp_path: Path) -> None:
     (tmp_path / "manifest.json").write_text("{}")
     with pytest.raises(DataError, match=r"metrics\.csv: not a table"):
         write_report(tmp_path, title="x")
@@ -183,8 +193,7 @@ def test_what_is_missing_or_damaged_is_one_line(tmp_path: Path) -> None:
     assert not [path for path in tmp_path.iterdir() if "report" in path.name]
 
 
-def test_examples_that_do_not_belong_together_are_refused() -> None:
-    """As many captions as situations, as many targets as the scene has."""
+def test_examples_of_different_scenes_are_refused() -> None:
     examples = make_examples([make_recording()], count=1)
     with pytest.raises(AspEnvError, match="2 captions for 1 situations"):
         ForecastExamples(
@@ -200,69 +209,73 @@ def test_examples_that_do_not_belong_together_are_refused() -> None:
         )
 
 
-def test_without_plotly_the_extra_is_named(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """One line that says what to install."""
+@pytest.mark.parametrize("package", ["plotly", "jinja2"])
+def test_a_missing_package_is_named_with_its_extra(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, package: str
+) -> None:
     write_tables(tmp_path, metric_rows()[:1])
-    monkeypatch.setattr("asp_env.evaluation.report.page.find_spec", lambda _: None)
-    with pytest.raises(MissingExtraError, match=r"'plotly'.*asp-env\[report\]"):
+    monkeypatch.setattr(
+        "asp_env.evaluation.report.page.find_spec", lambda name: None if name == package else name
+    )
+    with pytest.raises(MissingExtraError, match=rf"'{package}'.*asp-env\[report\]"):
         write_report(tmp_path, title="x")
 
 
 def requests(browser: webdriver.Chrome) -> list[str]:
-    """Addresses that the page asked for."""
-    told = [json.loads(entry["message"])["message"] for entry in browser.get_log("performance")]
+    """Addresses that the page requested."""
+    messages = [json.loads(entry["message"])["message"] for entry in browser.get_log("performance")]
     return [
         message["params"]["request"]["url"]
-        for message in told
+        for message in messages
         if message["method"] == "Network.requestWillBeSent"
     ]
 
 
 def pixels(browser: webdriver.Chrome, canvas: str) -> str:
-    """What a canvas shows now."""
+    """The present content of a canvas."""
     return browser.execute_script(f"return document.querySelector({canvas!r}).toDataURL()")
 
 
 def test_the_report_works_in_a_browser(report: Path, browser: webdriver.Chrome) -> None:
-    """Plots and pictures are drawn, the replay plays, the console is clean, the network unused."""
+    """Plots and pictures are drawn, the replay plays, there are no warnings and no requests."""
     browser.get(report.as_uri())
     assert len(browser.find_elements(By.CSS_SELECTOR, ".js-plotly-plot svg.main-svg")) >= 3
     assert len(browser.find_elements(By.CSS_SELECTOR, ".js-plotly-plot .bars .point")) == 32
     blank = "data:,"
-    shown = browser.find_elements(By.CSS_SELECTOR, "#picture-grid canvas")
-    assert len(shown) == 2 * 3
-    drawn = {browser.execute_script("return arguments[0].toDataURL()", each) for each in shown}
+    pictures = browser.find_elements(By.CSS_SELECTOR, "#picture-grid canvas")
+    assert len(pictures) == 2 * 3
+    drawn = {browser.execute_script("return arguments[0].toDataURL()", each) for each in pictures}
     assert blank not in drawn
-    assert len(drawn) == len(shown)
+    assert len(drawn) == len(pictures)
 
     play = browser.find_element(By.ID, "replay-play")
     to_middle = "arguments[0].scrollIntoView({block: 'center', behavior: 'instant'})"
     browser.execute_script(to_middle, play)
     before = pixels(browser, "#replay-canvas")
     time.sleep(0.5)
-    assert pixels(browser, "#replay-canvas") == before  # nothing moves by itself
+    assert pixels(browser, "#replay-canvas") == before  # the replay starts paused
     play.click()
     WebDriverWait(browser, 10).until(lambda b: b.execute_script("return window.replay.tick") > 2)
     assert play.get_attribute("aria-label") == "Pause"
     assert pixels(browser, "#replay-canvas") != before
     play.click()
-    half = browser.execute_script("return (window.replay.log.ticks - 1) / 2 | 0")
+    half = browser.execute_script("return (window.replay.rollout.ticks - 1) / 2 | 0")
     browser.execute_script(f"window.replay.seek({half})")
     assert browser.find_element(By.ID, "replay-event").text == "off-road"
 
-    chosen = browser.find_element(By.ID, "replay-drive").get_property("selectedIndex")
-    one = pixels(browser, "#replay-canvas")
-    driver = browser.find_element(By.ID, "replay-driver")
-    assert driver.text.split("\n") == DRIVERS
+    scenario = browser.find_element(By.ID, "replay-scenario")
+    chosen = scenario.get_property("selectedIndex")
+    before = pixels(browser, "#replay-canvas")
+    method = browser.find_element(By.ID, "replay-method")
+    assert method.text.split("\n") == METHODS
     browser.execute_script(
         "arguments[0].value = arguments[1]; arguments[0].dispatchEvent(new Event('change'))",
-        driver,
-        DRIVERS[1],
+        method,
+        METHODS[1],
     )
-    kept = browser.find_element(By.ID, "replay-drive").get_property("selectedIndex")
-    assert kept == chosen  # the same drive and time of the other driver
+    assert scenario.get_property("selectedIndex") == chosen  # the same scenario at the same time
     assert browser.execute_script("return window.replay.tick") == half
-    assert pixels(browser, "#replay-canvas") != one
+    assert pixels(browser, "#replay-canvas") != before
 
     panels = browser.find_elements(By.CSS_SELECTOR, "#forecasts [role=tabpanel]")
     assert [panel.is_displayed() for panel in panels] == [True, False, False, False]
@@ -271,6 +284,6 @@ def test_the_report_works_in_a_browser(report: Path, browser: webdriver.Chrome) 
     assert [panel.is_displayed() for panel in panels] == [False, True, False, False]
 
     assert [e for e in browser.get_log("browser") if e["level"] in ("SEVERE", "WARNING")] == []
-    asked = requests(browser)
-    assert report.as_uri() in asked
-    assert [url for url in asked if url.startswith(("http", "ws"))] == []
+    urls = requests(browser)
+    assert report.as_uri() in urls
+    assert [url for url in urls if url.startswith(("http", "ws"))] == []

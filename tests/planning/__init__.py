@@ -1,1 +1,1 @@
-"""Planners."""
+"""Tests of planners."""

@@ -1,4 +1,4 @@
-"""Scenes with an ego on the eastbound lane, and what is said of the others in them."""
+"""Scenes with an ego on the eastbound lane, and forecasts of the other agents in them."""
 
 import dataclasses
 
@@ -19,20 +19,20 @@ STEPS = 15
 def approach(
     *others: Drive, speed_mps: float = 10.0, y_m: float = -1.75, road_map: RoadMap | None = None
 ) -> Simulation:
-    """An episode whose ego is at x = -90 + 3 speeds after 3 s, and drives east at its speed."""
+    """An episode whose ego drives east at constant speed from x = -90, and starts after 3 s."""
     drives = (car(-90.0, speed_mps, y_m=y_m), *others)
     recording = make_recording(drives=drives, duration_s=20.0, road_map=road_map)
     return simulate(recording, scenario(1, length=80))
 
 
 def wide_map() -> RoadMap:
-    """The crossing with all the ground around it drivable."""
+    """The crossing with a drivable area of 350 m by 300 m."""
     square = np.array([(-150.0, -150.0), (200.0, -150.0), (200.0, 150.0), (-150.0, 150.0)])
     return dataclasses.replace(make_map(), name="wide", drivable=Ragged.pack([square]))
 
 
-def straight_on(scene: Scene, *, modes: int = 1) -> Forecast:
-    """Everybody goes on straight at its present speed, in equally probable modes."""
+def straight_ahead(scene: Scene, *, modes: int = 1) -> Forecast:
+    """All targets continue straight at their present speed, in equally probable modes."""
     states = constant_velocity(scene, steps=STEPS)[:, None].repeat(modes, axis=1)
     return make_forecast(
         scene,
@@ -44,20 +44,20 @@ def straight_on(scene: Scene, *, modes: int = 1) -> Forecast:
 
 
 def two_modes(scene: Scene, other: Float[np.ndarray, "steps 4"], probability: float) -> Forecast:
-    """The first target stays straight on, or does `other` with a probability."""
-    forecast = straight_on(scene, modes=2)
+    """The first target continues straight, or moves as `other` with the given probability."""
+    forecast = straight_ahead(scene, modes=2)
     forecast.states[0, 1] = other
     forecast.log_probs[0] = np.log([1 - probability, probability])
     return forecast
 
 
 def close_loop(planner: Planner, simulation: Simulation, steps: int) -> Float[np.ndarray, "n 4"]:
-    """The ego's states while the planner drives, others being forecast straight on."""
+    """The ego's states under a planner, with forecasts that continue straight."""
     world = simulation.world
     states = [world.ego_states()[0]]
     for _ in range(steps):
         scene = world.scene()
-        plan = planner.plan(scene, straight_on(scene))
+        plan = planner.plan(scene, straight_ahead(scene))
         simulation.step(plan.actions[:, 0], np.ones(1, dtype=bool))
         states.append(world.ego_states()[0])
     return np.stack(states)

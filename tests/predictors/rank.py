@@ -1,4 +1,4 @@
-"""A program that trains a tiny network with others like it and keeps what each process ends with.
+"""A program that trains a tiny network in several processes and stores the weights of each.
 
 Lightning starts it again for every further device, so it cannot be the test run itself.
 """
@@ -14,7 +14,7 @@ from torch import nn
 
 from predictors.inference.checkpoint import save_weights
 from predictors.training.fitting import train
-from predictors.training.lightning_parts import EpochLogger, Fit
+from predictors.training.lightning_parts import EpochLogger, TrainingModule
 from predictors.training.trainer import Hardware
 from tests.predictors.tiny import tiny_config
 
@@ -30,12 +30,20 @@ def run(
     die_after: int | None,
     backend: str | None,
 ) -> None:
-    """Trains, or dies after an epoch; `rank-N.safetensors` beside `out` is what process N has.
+    """Trains; writes the final weights of process N to `rank-N.safetensors` beside `out`.
 
-    `backend` is what compiles in place of the usual one, which takes half a minute.
+    Args:
+        predictor: Name of the predictor.
+        view: Name of the view.
+        data: DATA.
+        out: The run's folder.
+        changes: Changes of the configuration.
+        hardware: Fields of `Hardware`.
+        die_after: Index of the epoch after which the process exits; None for never.
+        backend: Backend of `torch.compile` instead of the default, which takes half a minute.
     """
 
-    def keep(self: Fit) -> None:
+    def store_weights(self: TrainingModule) -> None:
         path = out.with_name(f"rank-{self.trainer.global_rank}.safetensors")
         save_weights(self.network.state_dict(), path)
 
@@ -44,19 +52,19 @@ def run(
         if trainer.current_epoch == die_after:
             os._exit(9)
 
-    Fit.on_train_end = keep
+    TrainingModule.on_train_end = store_weights
     if backend is not None:
-        usual = nn.Module.compile
+        default = nn.Module.compile
 
-        def traced(self: nn.Module, *args: Any, **options: Any) -> None:
-            usual(self, *args, backend=backend, **options)
+        def compile_with_backend(self: nn.Module, *args: Any, **options: Any) -> None:
+            default(self, *args, backend=backend, **options)
 
-        nn.Module.compile = traced
+        nn.Module.compile = compile_with_backend
     if die_after is not None:
         EpochLogger.on_train_epoch_end = die
     train(tiny_config(predictor, view, **changes), data, out, hardware=Hardware(**hardware))
 
 
 if __name__ == "__main__":
-    told = json.loads(sys.argv[1])
-    run(data=told.pop("data"), out=Path(told.pop("out")), **told)
+    given = json.loads(sys.argv[1])
+    run(data=given.pop("data"), out=Path(given.pop("out")), **given)

@@ -1,4 +1,4 @@
-"""Networks so small that they train in a second: of every trainable predictor, for every view."""
+"""Networks that train in a second: of every trainable predictor, for every view."""
 
 import dataclasses
 from collections.abc import Sequence
@@ -12,9 +12,9 @@ from asp_env import registry
 from asp_env.data.recording import Recording
 from asp_env.data.snippets import index_snippets
 from asp_env.views import make_view
-from predictors.inference.checkpoint import save_learned, shape_for
+from predictors.inference.checkpoint import PredictorSpec, save_trained, shape_for
 from predictors.models.batch import Batch, Labels
-from predictors.models.network import AbstractNetwork, LearnedPlug, NetworkConfig, NetworkShape
+from predictors.models.network import AbstractNetwork, NetworkConfig, NetworkShape
 from predictors.training.data import Batches
 from predictors.training.recipes import TrainingConfig, recipe
 from tests.builders import make_recording
@@ -24,11 +24,11 @@ PIXELS = (36, 24)
 RANGE = (4.0, 0.5)
 
 SIZES = {"features": 8, "hidden": 8, "gru_width": 8, "gru_layers": 1}
-"""What configurations of networks are shrunk to, as far as they have such fields."""
+"""Values of those fields in every network's configuration that has them and sets them."""
 
 
 def pixels_of(view: str) -> tuple[int, int] | None:
-    """The pictures that tests draw."""
+    """Height and width of the rasters of a view in tests."""
     if view.startswith("vectors"):
         return None
     return (36, 36) if view == "mtp" else PIXELS
@@ -37,7 +37,7 @@ def pixels_of(view: str) -> tuple[int, int] | None:
 def tiny_network(
     predictor: str, view: str = "chauffeurnet", *, preset: str = "cpu", **changes: Any
 ) -> NetworkConfig:
-    """A preset's network with 8 of everything, but of what the preset leaves out."""
+    """The network's configuration of a recipe with `SIZES` and further changes."""
     config = recipe(predictor, preset, view=view, horizon_s=3.0).network
     small: dict[str, Any] = {n: size for n, size in SIZES.items() if getattr(config, n, 0)}
     small["encoder"] = "vector" if view.startswith("vectors") else "small"
@@ -47,7 +47,7 @@ def tiny_network(
 def tiny_config(
     predictor: str = "ffw-asp", view: str = "chauffeurnet", **changes: Any
 ) -> TrainingConfig:
-    """The `cpu` recipe with four epochs of three batches of eight 36x24 pictures."""
+    """The recipe `cpu` with four epochs of three batches of eight 36x24 rasters."""
     config = recipe(predictor, "cpu", view=view, horizon_s=3.0)
     config = dataclasses.replace(
         config,
@@ -61,7 +61,7 @@ def tiny_config(
 
 
 def tiny_shape(view: str = "chauffeurnet", horizon: int = 15) -> NetworkShape:
-    """What a network for 36x24 pictures, or for vectors, is made for."""
+    """The shape of a network for small rasters, or for vectors."""
     drawn = make_view(view, pixels=pixels_of(view))
     return shape_for(drawn, history=15, horizon=horizon, dt_s=0.2, action_range=RANGE)
 
@@ -69,11 +69,11 @@ def tiny_shape(view: str = "chauffeurnet", horizon: int = 15) -> NetworkShape:
 def make_network(
     predictor: str, config: NetworkConfig, shape: NetworkShape, *, seed: int = 0
 ) -> AbstractNetwork:
-    """A network whose random weights do not touch the global state."""
-    plug: LearnedPlug = registry.find("predictors", predictor)
+    """A network with random weights; torch's global generator is unchanged."""
+    spec: PredictorSpec = registry.find("predictors", predictor)
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(seed)
-        return plug.network(config, shape)
+        return spec.network(config, shape)
 
 
 def draw_samples(
@@ -84,7 +84,7 @@ def draw_samples(
     later_ticks: Sequence[int] = (),
     recording: Recording | None = None,
 ) -> tuple[Batch, Labels]:
-    """Some snippets of the made-up crossing as one batch."""
+    """Some snippets of the synthetic crossing as one batch."""
     recordings = [make_recording() if recording is None else recording]
     index = index_snippets(recordings, dt_s=0.2, horizon_s=horizon_s)
     batches = Batches(
@@ -98,7 +98,7 @@ def draw_samples(
 
 
 def write_data(folder: Path, *, recordings: int = 3, cars: int = 4) -> str:
-    """Recordings of 12 s in the inD layout; the folder's name."""
+    """Writes recordings of 12 s in the format of inD and returns the folder's name."""
     for number in range(recordings):
         write_recording(
             folder, number=number, classes=("car",) * cars + ("pedestrian",), num_frames=300
@@ -117,14 +117,14 @@ def save_random(
     preset: str = "cpu",
     temperature: float = 1.0,
 ) -> Path:
-    """A checkpoint of a tiny network with random weights; the folder."""
-    plug: LearnedPlug = registry.find("predictors", predictor)
+    """Writes a checkpoint of a tiny network with random weights and returns the folder."""
+    spec: PredictorSpec = registry.find("predictors", predictor)
     config, shape = tiny_network(predictor, view, preset=preset), tiny_shape(view, horizon)
     network = make_network(predictor, config, shape, seed=seed)
     folder.mkdir(parents=True)
-    save_learned(
+    save_trained(
         folder,
-        plug=plug,
+        spec=spec,
         network_config=config,
         shape=shape,
         view=make_view(view, pixels=pixels_of(view)),

@@ -1,1 +1,1 @@
-"""Tests of the pictures for people."""
+"""Tests of frames, videos and windows."""

@@ -1,4 +1,4 @@
-"""A made-up film, small enough to be reckoned by hand."""
+"""A synthetic film that is small enough to compute its frames by hand."""
 
 import numpy as np
 
@@ -13,11 +13,12 @@ STEPS = 5
 
 
 def make_rollout() -> Rollout:
-    """One second: an ego eastward at 10 m/s, its log 4 m behind, and a car in the west-bound lane.
+    """One second of an ego and a car.
 
-    The car leaves after tick 3. At ticks 0 to 4 the ego means to go straight on, and at ticks 0
-    and 2 two modes of 10 steps are forecast for the car: straight on, and to the south. The ego
-    touches somebody at ticks 2 and 3 and is off the road at tick 5.
+    The ego drives east at 10 m/s, 4 m ahead of the recorded ego; its plans at ticks 0 to 4 go
+    straight on. The car drives west and leaves after tick 3; at ticks 0 and 2 it has a forecast of
+    two modes of 10 steps: straight on, and to the south. The ego has a collision at ticks 2 and 3
+    and is off the road at tick 5.
     """
     ticks = np.arange(STEPS + 1, dtype=np.float32)
     states = np.zeros((STEPS + 1, 2, 4), dtype=np.float32)
@@ -31,16 +32,16 @@ def make_rollout() -> Rollout:
     ahead = np.arange(1, 11, dtype=np.float32)
     plans = np.zeros((STEPS, 10, 2), dtype=np.float32)
     plans[..., 0], plans[..., 1] = 2 * (ticks[:STEPS, None] + ahead), -1.75
-    said = np.array([0, 2])
+    forecast_ticks = np.array([0, 2])
     forecast = np.zeros((2, 2, 10, 2), dtype=np.float32)
-    forecast[:] = states[said, 1, None, None, :2]
+    forecast[:] = states[forecast_ticks, 1, None, None, :2]
     forecast[:, 0, :, 0] -= 2 * ahead
     forecast[:, 1, :, 1] -= 2 * ahead
     events = np.zeros((STEPS + 1, 3), dtype=bool)
     events[2:4, :2], events[5, 2] = True, True
     return Rollout(
         scenario=Scenario(
-            source="made-up",
+            source="synthetic",
             recording=0,
             recording_name="00",
             start_tick=15,
@@ -61,13 +62,13 @@ def make_rollout() -> Rollout:
         forecast_states=forecast,
         forecast_log_probs=np.log(np.array([(0.75, 0.25)] * 2, dtype=np.float32)),
         forecast_slots=np.array([1, 1]),
-        forecast_ticks=said,
+        forecast_ticks=forecast_ticks,
         events=events,
         event_names=("collision", "at-fault collision", "off-road"),
     )
 
 
-def make_film(rollout: Rollout | None = None, title: str = "made up") -> Film:
-    """The rollout on a crossing without a photograph."""
+def make_film(rollout: Rollout | None = None, title: str = "synthetic") -> Film:
+    """A film of the rollout at a crossing without a background image."""
     rollout = make_rollout() if rollout is None else rollout
     return Film(rollout=rollout, road_map=MAP, background=None, title=title)

@@ -63,7 +63,7 @@ def test_a_line_is_marked_if_either_direction_marks_it(tmp_path: Path) -> None:
 
 
 def test_each_lane_has_its_own_limit(tmp_path: Path) -> None:
-    """36 km/h are 10 m/s, 72 are 20; the third lane tells none."""
+    """36 km/h are 10 m/s, 72 are 20; the third lane has none."""
     lanelets = [
         Lanelet(
             subtype="road",
@@ -101,7 +101,7 @@ def test_ground_beside_a_lane(tmp_path: Path) -> None:
     assert road_map.line_types.tolist() == [LineType.VIRTUAL, LineType.VIRTUAL, LineType.CURB]
 
 
-def test_a_centre_line_is_as_it_is_told(tmp_path: Path) -> None:
+def test_a_given_centre_line_is_used(tmp_path: Path) -> None:
     """A strip whose left side makes a detour: its lane is straight all the same."""
     lane = Lanelet(
         subtype="road",

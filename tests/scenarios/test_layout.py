@@ -8,7 +8,7 @@ import pandas as pd
 import pytest
 
 from asp_env.data.classes import AgentClass
-from asp_env.data.source import load
+from asp_env.data.source import open_data
 from asp_env.geometry import wrap_angle
 from asp_env.metrics.drivable import off_road_m
 
@@ -92,7 +92,7 @@ def test_velocities_are_those_of_the_positions(site: Path) -> None:
 
 def test_parked_cars_span_the_recording(site: Path) -> None:
     """Some cars stand from the first frame to the last, at exactly one place."""
-    for recording in load(site):
+    for recording in open_data(site):
         parked = np.flatnonzero(recording.parked)
         still = [i for i in parked if np.ptp(recording.track(int(i)), axis=0).max() == 0.0]
         assert still
@@ -101,7 +101,7 @@ def test_parked_cars_span_the_recording(site: Path) -> None:
 
 def test_the_picture_shows_asphalt_under_the_cars(site: Path) -> None:
     """Pixels at moving vehicles' middles are grey (grass is green); not so if y were flipped."""
-    for recording in load(site):
+    for recording in open_data(site):
         assert recording.background is not None
         assert recording.background.path.stat().st_size < 150_000
         image = cv2.imread(str(recording.background.path))
@@ -117,7 +117,7 @@ def test_the_picture_shows_asphalt_under_the_cars(site: Path) -> None:
 
 def test_vehicles_stay_on_the_map(site: Path) -> None:
     """Fewer than 0.5 % of moving vehicles' boxes have a corner 0.3 m off the lanelets."""
-    for recording in load(site):
+    for recording in open_data(site):
         tracks = np.flatnonzero(recording.predicted)
         states = np.concatenate([recording.track(int(i)) for i in tracks])
         sizes = np.concatenate(
@@ -127,8 +127,8 @@ def test_vehicles_stay_on_the_map(site: Path) -> None:
 
 
 def test_the_map_needs_no_repair(site: Path) -> None:
-    """The reader mends nothing, and every lane but those at the rim goes on."""
-    for recording in load(site):
+    """The reader repairs nothing, and every lane but those at the rim has a successor."""
+    for recording in open_data(site):
         assert recording.repairs == ()
         assert recording.road_map.repairs == ()
         lanes = len(recording.road_map.lanes)
@@ -138,7 +138,7 @@ def test_the_map_needs_no_repair(site: Path) -> None:
 
 def test_the_map_lies_under_the_tracks(site: Path) -> None:
     """A moving car's heading is that of the nearest lane, and the lane is within 1 m, mostly."""
-    for recording in load(site):
+    for recording in open_data(site):
         lanes = [recording.road_map.lanes[i] for i in range(len(recording.road_map.lanes))]
         points = np.concatenate([0.5 * (lane[1:] + lane[:-1]) for lane in lanes])
         steps = np.concatenate([np.diff(lane, axis=0) for lane in lanes])

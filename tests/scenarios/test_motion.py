@@ -45,7 +45,7 @@ def test_a_straight_line_stays_one() -> None:
 
 @given(st.lists(st.floats(0.0, 15.0), min_size=30, max_size=60), st.integers(10, 20))
 def test_progress_never_goes_back_and_stops_stay(speeds: list[float], stop_at: int) -> None:
-    """Whatever the speeds, nobody moves backwards, and 4 s of standing have 2 s at one place."""
+    """For any speeds, no agent moves backwards, and 4 s of standing include 2 s at one point."""
     plan = np.concatenate([speeds[:stop_at], np.zeros(40), speeds[stop_at:], [15.0] * 5])
     motion = reconstruct(np.arange(len(plan) + 1) * 0.1, straight(plan), kind="car", length_m=4.5)
     assert motion is not None
@@ -55,7 +55,7 @@ def test_progress_never_goes_back_and_stops_stay(speeds: list[float], stop_at: i
     assert np.abs(steps[middle - 25 : middle + 25]).max() < 1e-9
 
 
-def test_a_change_of_lanes_is_spread_over_the_way() -> None:
+def test_a_lane_change_is_spread_over_the_path() -> None:
     """A jump of 3.5 m becomes a bend without steps that ends in the new lane."""
     points = straight(np.full(100, 10.0))
     points[40:, 1] += 3.5
@@ -65,7 +65,7 @@ def test_a_change_of_lanes_is_spread_over_the_way() -> None:
     assert np.abs(eased[68:] - points[68:]).max() < 1e-9
 
 
-def test_changing_to_and_fro_while_standing_leaves_no_trace() -> None:
+def test_opposite_lane_changes_while_standing_cancel() -> None:
     """Two opposite jumps at one place cancel."""
     points = straight(np.concatenate([np.full(30, 10.0), np.zeros(20), np.full(30, 10.0)]))
     points[40:45, 1] += 3.5
@@ -92,7 +92,7 @@ def test_measurement_errors_shrink_but_stay() -> None:
     assert heading.std() < np.radians(1.5)
 
 
-def test_who_never_moves_has_no_motion() -> None:
+def test_an_agent_that_never_moves_has_no_motion() -> None:
     """A vehicle that stays where it was inserted is left out."""
     points = np.zeros((50, 2))
     assert reconstruct(np.arange(50) * 0.1, points, kind="car", length_m=4.5) is None

@@ -11,7 +11,7 @@ import pandas as pd
 import pytest
 
 from asp_env import registry
-from asp_env.data.source import load
+from asp_env.data.source import open_data
 from asp_env.errors import AspEnvError, MissingExtraError
 from scenarios.sumo import dataset, open_source, synthesize
 from scenarios.synthesize import Synthesize
@@ -41,11 +41,11 @@ def test_same_seed_same_bytes_in_another_process(short: Path, tmp_path: Path) ->
 
 
 def test_another_seed_is_another_place(short: Path, tmp_path: Path) -> None:
-    """Map, picture and tracks of seed 8 differ from those of seed 7."""
+    """Map, image and tracks of seed 8 differ from those of seed 7."""
     synthesize(tmp_path / "b", site="intersection", recordings=1, minutes=0.1, seed=8)
-    ours, theirs = contents(tmp_path / "b"), contents(short)
-    assert ours.keys() == theirs.keys()
-    assert not set(ours.values()) & set(theirs.values())
+    own, reference = contents(tmp_path / "b"), contents(short)
+    assert own.keys() == reference.keys()
+    assert not set(own.values()) & set(reference.values())
 
 
 def test_noise_keeps_the_truth(short: Path, tmp_path: Path) -> None:
@@ -59,21 +59,21 @@ def test_noise_keeps_the_truth(short: Path, tmp_path: Path) -> None:
     error = np.hypot(measured.xCenter - true.xCenter, measured.yCenter - true.yCenter)
     assert 0.005 < error.mean() < 0.1
     assert error.max() < 0.5
-    assert len(load(tmp_path / "n")) == 1
+    assert len(open_data(tmp_path / "n")) == 1
 
 
 def test_recordings_share_places(tmp_path: Path) -> None:
-    """Three recordings are made at one place, which has one map and one picture."""
+    """Three recordings share one location, which has one map and one image."""
     synthesize(tmp_path / "c", site="roundabout", recordings=3, minutes=0.05, seed=0)
     files = contents(tmp_path / "c")
     assert len([name for name in files if name.endswith(".osm")]) == 1
     assert len({files[name] for name in files if name.endswith(".png")}) == 1
     assert len({files[name] for name in files if name.endswith("_tracks.csv")}) == 3
-    assert {recording.location for recording in load(tmp_path / "c")} == {"0"}
+    assert {recording.location for recording in open_data(tmp_path / "c")} == {"0"}
 
 
 def test_an_unknown_site_lists_those_known(tmp_path: Path) -> None:
-    """One line that names what there is; nothing is written."""
+    """One line that lists the known sites; nothing is written."""
     with pytest.raises(AspEnvError, match="'motorway': known are intersection, roundabout"):
         Synthesize(out=tmp_path / "x", site="motorway").run()
     with pytest.raises(AspEnvError, match="known are intersection, roundabout"):
@@ -82,7 +82,7 @@ def test_an_unknown_site_lists_those_known(tmp_path: Path) -> None:
 
 
 def test_a_folder_with_something_in_it_is_refused(tmp_path: Path) -> None:
-    """What is there stays as it is."""
+    """The existing content is unchanged."""
     (tmp_path / "mine.txt").write_text("mine")
     with pytest.raises(AspEnvError, match="not an empty folder"):
         synthesize(tmp_path, site="intersection", recordings=1, minutes=0.05, seed=0)
@@ -94,7 +94,7 @@ def test_a_folder_with_something_in_it_is_refused(tmp_path: Path) -> None:
 def test_an_unwritable_place_is_refused(tmp_path: Path) -> None:
     """A file in the way of the folder: one line."""
     (tmp_path / "file").touch()
-    with pytest.raises(AspEnvError, match="cannot write to") as caught:
+    with pytest.raises(AspEnvError, match="cannot be written") as caught:
         synthesize(tmp_path / "file" / "out", site="roundabout", recordings=1, minutes=1.0, seed=0)
     assert "\n" not in str(caught.value)
 
@@ -113,7 +113,7 @@ def test_an_unwritable_place_is_refused(tmp_path: Path) -> None:
 def test_impossible_numbers_are_refused(
     tmp_path: Path, recordings: int, minutes: float, seed: int, locations: int | None
 ) -> None:
-    """No recordings, no time, a negative seed, or more places than recordings: one line."""
+    """No recordings, no time, a negative seed, or more locations than recordings: one line."""
     with pytest.raises(AspEnvError, match="cannot be made"):
         synthesize(
             tmp_path / "x",
@@ -138,7 +138,7 @@ def stand_in(marker: str) -> Callable[..., None]:
     """Writes one file instead of traffic."""
 
     def write(out: Path, **_: object) -> None:
-        out.mkdir(parents=True)
+        out.mkdir(parents=True, exist_ok=True)
         (out / "marker").write_text(marker)
 
     return write
@@ -155,7 +155,7 @@ def test_the_source_is_made_once(tmp_path: Path, monkeypatch: pytest.MonkeyPatch
     assert [path.name for path in folder.parent.iterdir()] == [folder.name]
 
 
-def test_the_slower_of_two_takes_what_the_faster_made(
+def test_the_slower_of_two_processes_uses_the_folder_of_the_faster(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """If the folder appears meanwhile, it is kept and used."""
@@ -171,7 +171,7 @@ def test_the_slower_of_two_takes_what_the_faster_made(
     assert [path.name for path in folder.parent.iterdir()] == [folder.name]
 
 
-def test_the_registry_knows_command_and_source() -> None:
+def test_the_command_and_the_source_are_registered() -> None:
     """`asp-env synthesize` and DATA `synthetic:` lead here."""
     assert registry.find("commands", "synthesize") is Synthesize
     assert registry.find("sources", "synthetic") is open_source
@@ -180,7 +180,7 @@ def test_the_registry_knows_command_and_source() -> None:
 @pytest.mark.parametrize("name", ["intersection", "roundabout"])
 def test_samples_ship(name: str) -> None:
     """Two minutes of all classes, read without a repair; both together take under 4 MB."""
-    (recording,) = load(f"sample:{name}")
+    (recording,) = open_data(f"sample:{name}")
     assert recording.num_frames == 3000
     assert len(np.unique(recording.classes)) == 7
     assert recording.parked.any()

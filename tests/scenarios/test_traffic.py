@@ -6,8 +6,7 @@ import numpy as np
 import pandas as pd
 
 from asp_env.dynamics import inverse, rollout
-from asp_env.geometry import box_corners
-from scenarios.sumo.dataset import boxes_overlap
+from asp_env.geometry import boxes_overlap
 from scenarios.sumo.demand import SHARES, demand, right_turn_rad
 from scenarios.sumo.sites import crossroads
 
@@ -48,8 +47,8 @@ def test_inferred_actions_lead_back_to_the_log(site: Path) -> None:
     assert np.median(drift) < 0.03
 
 
-def test_nobody_moves_backwards_or_creeps_while_standing(site: Path) -> None:
-    """Speed along the heading is never negative; who stands is at exactly one place."""
+def test_agents_neither_move_backwards_nor_creep_while_standing(site: Path) -> None:
+    """Speed along the heading is never negative; a standing agent stays at one point."""
     standing = 0
     for name in ("00", "01"):
         for track in vehicles(site, name):
@@ -61,21 +60,21 @@ def test_nobody_moves_backwards_or_creeps_while_standing(site: Path) -> None:
     assert standing > 100
 
 
-def test_nobody_touches_anybody(site: Path) -> None:
+def test_vehicles_do_not_overlap(site: Path) -> None:
     """No two boxes of vehicles overlap in any fifth frame."""
     for name in ("00", "01"):
         rows = pd.concat(vehicles(site, name))
-        states = np.column_stack([rows.xCenter, rows.yCenter, np.radians(rows.heading)])
+        poses = [rows.xCenter, rows.yCenter, np.radians(rows.heading)]
+        boxes = np.column_stack([*poses, rows.length, rows.width])
         rows = rows.assign(number=np.arange(len(rows)))
-        corners = box_corners(states, rows[["length", "width"]].to_numpy())
         for _, frame in rows[rows.frame % STEP == 0].groupby("frame"):
             a, b = np.triu_indices(len(frame), 1)
             number = frame.number.to_numpy()
-            assert not boxes_overlap(corners[number[a]], corners[number[b]]).any()
+            assert not boxes_overlap(boxes[number[a]], boxes[number[b]]).any()
 
 
 def test_tracks_begin_and_end_at_the_rim(site: Path) -> None:
-    """Who appears or disappears during a recording does so near the picture's edge."""
+    """Agents that appear or disappear during a recording do so near the edge of the image."""
     for name in ("00", "01"):
         meta = pd.read_csv(site / "data" / f"{name}_tracksMeta.csv")
         tracks = pd.read_csv(site / "data" / f"{name}_tracks.csv")
@@ -95,7 +94,7 @@ def test_all_turns_occur(site: Path) -> None:
         assert min((turned < -45).sum(), (np.abs(turned) < 45).sum(), (turned > 45).sum()) >= 1
 
 
-def test_all_classes_are_asked_for() -> None:
+def test_the_demand_has_all_classes() -> None:
     """An hour's demand has every class, cars most, and from every arm to every other."""
     rng = np.random.default_rng(0)
     place = crossroads(rng)
@@ -108,7 +107,7 @@ def test_all_classes_are_asked_for() -> None:
     assert len({round(right_turn_rad(a, b), 6) for a, b in pairs}) == len(pairs)
 
 
-def test_dropping_someone_leaves_the_others() -> None:
+def test_removing_an_agent_leaves_the_others_unchanged() -> None:
     """Demand without a road user is the same but for its line."""
     rng = np.random.default_rng(1)
     wanted = demand(rng, crossroads(rng), 300.0)
@@ -116,13 +115,3 @@ def test_dropping_someone_leaves_the_others() -> None:
     assert len(fewer.entries) == len(wanted.entries) - 1
     assert 'id="v3"' not in fewer.routes
     assert [e for e in wanted.entries if e[1] != "v3"] == list(fewer.entries)
-
-
-def test_boxes_overlap_by_hand() -> None:
-    """Unit squares 0.9 apart overlap, 1.1 apart do not; one turned by 45° reaches 0.2 further."""
-    size = np.ones((1, 2))
-    square = box_corners(np.zeros((1, 3)), size)
-    cases = [(0.9, 0.0, True), (1.1, 0.0, False), (1.1, 45.0, True), (1.25, 45.0, False)]
-    for x, degrees, expected in cases:
-        other = box_corners(np.array([[x, 0.0, np.radians(degrees)]]), size)
-        assert boxes_overlap(square, other).tolist() == [expected]

@@ -1,1 +1,1 @@
-"""Worlds, drivers, rewards and observations."""
+"""Tests of worlds, drivers, rewards and observations."""

@@ -1,4 +1,4 @@
-"""What happens in a world of replayed recordings, step by step."""
+"""`ReplayWorld`, step by step."""
 
 import math
 
@@ -26,8 +26,8 @@ from tests.sim.worlds import (
 )
 
 
-def test_log_traffic_repeats_the_recording_bit_for_bit():
-    """Every state and every presence equals the track at that frame, for a whole episode."""
+def test_uncontrolled_agents_replay_their_tracks_bit_for_bit():
+    """Every state and its validity equal the track at that frame, for a whole episode."""
     recording = make_recording()
     simulation = simulate(recording, scenario(3, length=60))
     replay(simulation, 60)
@@ -35,13 +35,13 @@ def test_log_traffic_repeats_the_recording_bit_for_bit():
     for slot, track in enumerate(episodes.tracks[0].tolist()):
         for tick in range(HISTORY + 61):
             row = 5 * tick - recording.first_frames[track]
-            there = 0 <= row < len(recording.track(track))
-            assert episodes.valid[0, tick, slot] == there
-            expected = recording.track(track)[row] if there else np.zeros(4)
+            present = 0 <= row < len(recording.track(track))
+            assert episodes.valid[0, tick, slot] == present
+            expected = recording.track(track)[row] if present else np.zeros(4)
             assert episodes.states[0, tick, slot].tobytes() == np.float32(expected).tobytes()
 
 
-def test_slots_are_ego_then_first_appearance_then_id():
+def test_slots_are_ordered_by_ego_then_first_appearance_then_id():
     """Ids 3, 1, 2 appear at 4 s, 0 s and 0 s; the ego is 3, so slots hold 3, 1, 2, 4."""
     recording = on_road(car(-50, 5), car(0, 5, appears_s=4.0), car(30, 5, appears_s=6.0))
     world = simulate(recording, scenario(3, start=40, length=20)).world
@@ -84,7 +84,7 @@ def test_steering_by_hand():
 
 
 def test_braking_ends_at_standstill():
-    """1 m/s less 5 m/s² for 0.2 s is 0, and it stays 0."""
+    """1 m/s minus 5 m/s² for 0.2 s is 0, and it stays 0."""
     recording = make_recording(
         drives=(car(-90.0, 6.0, (3.0, -5 / 3, 0.0)), car(0.0, 0.0)), duration_s=12.0
     )
@@ -98,30 +98,30 @@ def test_braking_ends_at_standstill():
     assert now(simulation, 1) == pytest.approx([x, -1.75, 0.0, 0.0], abs=1e-6)
 
 
-def test_leaving_agents_stay_away():
-    """Somebody who has left is invalid and zero from then on, though its log goes on."""
+def test_agents_that_left_stay_absent():
+    """They are invalid and zero although their track continues."""
     simulation = simulate(on_road(car(-50, 5)), scenario(length=10))
     world = simulation.world
-    nobody = np.zeros((1, 2), dtype=bool)
+    uncontrolled = np.zeros((1, 2), dtype=bool)
     leaving = np.array([[False, True]])
-    world.step(np.zeros((1, 2, 2), dtype=np.float32), nobody, leaving)
+    world.step(np.zeros((1, 2, 2), dtype=np.float32), uncontrolled, leaving)
     assert now(simulation, 2) is None
-    world.step(np.zeros((1, 2, 2), dtype=np.float32), nobody)
+    world.step(np.zeros((1, 2, 2), dtype=np.float32), uncontrolled)
     assert now(simulation, 2) is None
     assert not world.episodes.states[0, world.now[0], 1].any()
 
 
-def test_nobody_absent_can_be_driven():
-    """A `driven` agent that is not there yet does not come into being."""
+def test_a_controlled_agent_does_not_appear():
+    """Its track starts at 4 s, but an agent that is controlled before stays absent."""
     simulation = simulate(on_road(car(-50, 5, appears_s=4.0)), scenario(length=10))
-    driven = np.array([[False, True]])
-    simulation.world.step(np.ones((1, 2, 2), dtype=np.float32), driven)
+    controlled = np.array([[False, True]])
+    simulation.world.step(np.ones((1, 2, 2), dtype=np.float32), controlled)
     assert now(simulation, 2) is None
 
 
 @pytest.mark.parametrize("traffic", ["log", "log-actions", "idm"])
-def test_an_episode_that_is_over_stays_as_it_is(traffic):
-    """Steps behind the scenario's length change nothing: not the states, not the events."""
+def test_an_episode_that_is_over_does_not_change(traffic):
+    """Steps after the end of the scenario change neither states nor events."""
     simulation = simulate(on_road(car(-50, 5)), scenario(length=4), traffic)
     drive(simulation, [(0.5, 0.0)] * 4)
     scene, events = simulation.world.scene(), simulation.world.events()
@@ -134,24 +134,24 @@ def test_an_episode_that_is_over_stays_as_it_is(traffic):
 
 
 @pytest.mark.parametrize(
-    ("wrong", "what"),
+    ("unfit", "message"),
     [
         (scenario(9), "has no track 9"),
         (scenario(1, start=14), "ticks -1 to"),
         (scenario(1, length=0), "are needed"),
         (scenario(1, start=90, length=11), "spans 0 to 100"),
     ],
-    ids=["no such track", "before its track", "no length", "behind its track"],
+    ids=["no such track", "before its track", "no length", "after its track"],
 )
-def test_a_scenario_that_does_not_fit_is_refused(wrong, what):
-    """One line that says what is needed and what there is; a 20 s track has ticks 0 to 100."""
-    with pytest.raises(AspEnvError, match=what) as caught:
-        simulate(on_road(), wrong)
+def test_a_scenario_that_does_not_fit_is_refused(unfit, message):
+    """The message is one line; a 20 s track has ticks 0 to 100."""
+    with pytest.raises(AspEnvError, match=message) as caught:
+        simulate(on_road(), unfit)
     assert "\n" not in str(caught.value)
 
 
 def test_a_refused_reset_changes_nothing():
-    """A scenario that does not fit leaves all episodes as they were, also those before it."""
+    """A scenario that does not fit leaves all episodes unchanged, also those before it."""
     simulation = simulate(on_road(), [scenario(), scenario()])
     drive(simulation, [(1.0, 0.0)] * 3)
     before = simulation.world.scene()
@@ -161,23 +161,23 @@ def test_a_refused_reset_changes_nothing():
     assert simulation.world.scene().states.tobytes() == before.states.tobytes()
 
 
-def test_standing_car_ahead_is_run_into():
-    """10 m/s towards a car whose rear is 3.5 m + 2·4.5 m/2 away: FRONT or OTHER_STANDS at 4 m."""
+def test_contact_with_a_standing_car_ahead_by_hand():
+    """At 10 m/s the boxes of 4.5 m overlap once the centres are 4 m apart."""
     recording = make_recording(drives=(car(-90.0, 10.0), car(-52.0, 0.0)), duration_s=10.0)
     simulation = simulate(recording, scenario(length=20))
     contacts = []
     for _ in range(4):
         contacts.append(Contact(int(simulation.world.events().contacts[0, 1])))
         drive(simulation, [(0.0, 0.0)])
-    # centres 8, 6, 4, 2 m apart, boxes 4.5 m long
+    # centres 8, 6, 4, 2 m apart
     assert contacts == [Contact.NONE, Contact.NONE, Contact.OTHER_STANDS, Contact.OTHER_STANDS]
     events = simulation.world.events()
     assert events.collision.tolist() == [True]
     assert events.at_fault.tolist() == [True]
 
 
-def test_hit_from_behind_is_not_the_egos_fault():
-    """A replayed follower at 10 m/s drives into the braking ego: a contact, and not its fault."""
+def test_the_ego_is_not_at_fault_for_a_contact_at_its_rear():
+    """A replayed follower at 10 m/s drives into the braking ego."""
     recording = make_recording(drives=(car(-80.0, 10.0), car(-90.0, 10.0)), duration_s=10.0)
     simulation = simulate(recording, scenario(length=20))
     drive(simulation, [(-5.0, 0.0)] * 8)  # 1.6 s: the gap of 5.5 m is lost after 1.48 s
@@ -187,11 +187,11 @@ def test_hit_from_behind_is_not_the_egos_fault():
     assert events.at_fault.tolist() == [False]
 
 
-def test_whose_fault_a_contact_is_shows_when_it_begins():
-    """A replayed car drives into the standing ego; moving off inside it is no new collision.
+def test_a_contact_keeps_the_class_of_its_first_tick():
+    """A replayed car drives into the standing ego, which then moves off inside it.
 
-    Alone the last state would be a front of the ego in somebody. After the ego is out of it and
-    stands, the next one that comes is judged anew.
+    The later ticks on their own would be contacts of the ego's front. Once the ego is clear and
+    stands again, the contact with the next car is a new one.
     """
     followers = (car(-95.0, 6.0), car(-120.0, 6.0))
     recording = make_recording(drives=(car(-84.0, 6.0), *followers), duration_s=14.0)
@@ -221,10 +221,10 @@ def test_whose_fault_a_contact_is_shows_when_it_begins():
         (AgentClass.BICYCLE, -0.5, False),
     ],
 )
-def test_the_egos_own_trailer_is_no_contact(kind, gap_m, own):
-    """A trailer of 7 m within the ego from the start never counts; one that comes up to it does.
+def test_the_egos_trailer_is_no_contact(kind, gap_m, own):
+    """A trailer of 7 m that overlaps the ego from the start never counts; a separate one does.
 
-    The ego brakes to a stop and its trailer, replayed at 5 m/s, goes through it within 4 s.
+    The ego brakes to a stop, and the trailer, replayed at 5 m/s, drives through it within 4 s.
     """
     length_m = float(FOOTPRINTS_M[kind, 0])
     trailer_x_m = -60.0 - length_m / 2 - gap_m - 3.5
@@ -233,20 +233,20 @@ def test_the_egos_own_trailer_is_no_contact(kind, gap_m, own):
         car(trailer_x_m, 5.0, kind=AgentClass.TRAILER),
     )
     simulation = simulate(make_recording(drives=drives, duration_s=12.0), scenario(length=40))
-    met = [bool(simulation.world.events().collision[0])]
+    contacts = [bool(simulation.world.events().collision[0])]
     for _ in range(20):
         drive(simulation, [(-2.0, 0.0)])
-        met.append(bool(simulation.world.events().collision[0]))
+        contacts.append(bool(simulation.world.events().collision[0]))
     assert simulation.world.episodes.own_trailer.tolist() == [[False, own]]
-    assert any(met) is not own
-    assert met[0] is (gap_m < 0 and not own)
+    assert any(contacts) is not own
+    assert contacts[0] is (gap_m < 0 and not own)
 
 
-def test_an_own_trailer_is_forgotten_with_its_episode():
-    """After a reset without a trailer the same slot has contacts again."""
-    pulled = (car(-60.0, 5.0), car(-65.5, 5.0, kind=AgentClass.TRAILER))
+def test_a_reset_discards_the_egos_trailer():
+    """After a reset without a trailer the same slot can have contacts."""
+    with_trailer = (car(-60.0, 5.0), car(-65.5, 5.0, kind=AgentClass.TRAILER))
     alone = (car(-90.0, 10.0), car(-52.0, 0.0))
-    recordings = [make_recording(drives=each, duration_s=12.0) for each in (pulled, alone)]
+    recordings = [make_recording(drives=each, duration_s=12.0) for each in (with_trailer, alone)]
     simulation = simulate(recordings, scenario(length=20))
     assert simulation.world.episodes.own_trailer.any()
     simulation.reset([scenario(length=20, recording=1)], [np.random.default_rng(0)])
@@ -255,9 +255,10 @@ def test_an_own_trailer_is_forgotten_with_its_episode():
 
 
 def test_off_road_by_hand():
-    """Road edge at y = -3.5; a car of 1.8 m at y = -3.5 sticks out by 0.9 m, at -2.5 not at all.
+    """Road edge at y = -3.5; a car of 1.8 m at y = -3.5 is 0.9 m outside, at -2.5 not at all.
 
-    Where the log itself sticks out, the map has a gap: so much is excused, within 2 m of its way.
+    Where the recorded ego is outside, the map has a gap: that distance is subtracted within 2 m of
+    its track.
     """
     cases = ((-2.5, -2.5, 0), (-2.5, -3.5, 0.9), (-3.5, -3.5, 0), (-3.5, -4.5, 1))
     for log_m, y_m, outside_m in cases:
@@ -282,17 +283,17 @@ def test_route_coordinates_by_hand():
     assert simulation.world.events().route_offset_m[0] > 0.1
 
 
-def test_the_route_goes_on_behind_the_recorded_way():
-    """Points 1 m apart: what is left of the track, and 60 m straight on."""
+def test_the_route_continues_after_the_track():
+    """Points 1 m apart: the rest of the track, and 60 m straight ahead."""
     scene = simulate(on_road(), scenario(length=30)).world.scene()
     route = scene.route[0, scene.route_valid[0]]
     assert np.hypot(*np.diff(route, axis=0).T) == pytest.approx(1.0, abs=1e-3)
-    # 100 ticks in all, 85 after now, of 1 m each
+    # 100 ticks in total, 85 after now, of 1 m each
     assert len(route) == 85 + 60 + 1
 
 
 def test_a_loop_that_ends_at_its_start_is_not_cut_short():
-    """Standing just behind the start of a closed loop is progress of about 0, not of 94 m."""
+    """Standing just before the start of a closed loop is progress of about 0, not of 94 m."""
     circle = Drive(
         kind=AgentClass.CAR, start=(40.0, 25.0, 0.0, 10.0), phases=((60.0, 0.0, 0.17989),)
     )
@@ -310,8 +311,8 @@ def test_a_loop_that_ends_at_its_start_is_not_cut_short():
 
 
 @pytest.mark.data
-def test_real_recordings_are_repeated_bit_for_bit():
-    """Every scenario of the Karlsruhe recordings under `log`: states and presence are the log's."""
+def test_real_recordings_are_replayed_bit_for_bit():
+    """Every scenario of the Karlsruhe recordings: states and validity are the recorded ones."""
     recordings = open_data(real_data("karlsruhe"))
     found = list(find_scenarios(recordings, source="", dt_s=DT_S, history=HISTORY))
     assert len(found) > 20

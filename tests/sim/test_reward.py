@@ -1,4 +1,4 @@
-"""Terms of the reward, by hand."""
+"""The terms of the reward, by hand."""
 
 import dataclasses
 
@@ -21,13 +21,13 @@ def _terms(
     return {name: float(value[0]) for name, value in terms.items()}
 
 
-def test_nothing_happens_nothing_is_due():
-    """Constant speed straight on, on the road, touching nobody, no way gained: all terms are 0."""
+def test_all_terms_are_zero_without_progress_or_events():
+    """Constant speed straight ahead, on the road, without contact or progress."""
     assert _terms(RUNNING) == {"progress": 0.0, "comfort": 0.0, "collision": 0.0, "off_road": 0.0}
 
 
-def test_progress_is_the_share_of_the_logged_way():
-    """3 m of 30 m are 0.1; behind the goal and before the start nothing is gained."""
+def test_progress_is_the_share_of_the_recorded_distance():
+    """3 m of 30 m are 0.1; beyond the goal and before the start nothing is gained."""
     after = dataclasses.replace(RUNNING, route_m=np.full(1, 13.0))
     assert _terms(after)["progress"] == pytest.approx(0.1)
     beyond = dataclasses.replace(RUNNING, route_m=np.full(1, 50.0))
@@ -37,7 +37,7 @@ def test_progress_is_the_share_of_the_logged_way():
 
 
 def test_progress_sums_to_one_at_the_goal():
-    """The replayed ego gains 1 in all; so does one that drives beyond the goal."""
+    """The replayed ego gains 1 in total; so does an ego that drives beyond the goal."""
     for step in (replay, lambda simulation, _: drive(simulation, [(1.5, 0.0)])):
         simulation = simulate(on_road(), scenario(length=30))
         world, total = simulation.world, 0.0
@@ -57,7 +57,7 @@ def test_comfort_by_hand():
     assert _terms(RUNNING, ended=turned)["comfort"] == pytest.approx(-0.5, rel=1e-4)
 
 
-def test_comfort_knows_that_angles_wrap():
+def test_comfort_wraps_angles():
     """From heading π - 0.05 to -π + 0.05 is a turn of 0.1 rad, not of 6.2."""
     before, after = STRAIGHT.copy(), STRAIGHT.copy()
     before[0, 2], after[0, 2] = np.pi - 0.05, -np.pi + 0.05
@@ -66,11 +66,11 @@ def test_comfort_knows_that_angles_wrap():
 
 
 @pytest.mark.parametrize("kind", list(Contact), ids=lambda kind: kind.name)
-def test_collision_only_where_the_ego_answers_for_it(kind):
-    """-1 for a standing other, the ego's front and side; 0 for its rear and a standing ego."""
+def test_collision_costs_only_if_the_ego_is_at_fault(kind):
+    """-1 for a standing agent, the ego's front and side; 0 for its rear and a standing ego."""
     after = dataclasses.replace(RUNNING, contacts=np.array([[0, kind]], dtype=np.int8))
-    guilty = kind in (Contact.OTHER_STANDS, Contact.FRONT, Contact.SIDE)
-    assert _terms(after)["collision"] == (-1.0 if guilty else 0.0)
+    at_fault = kind in (Contact.OTHER_STANDS, Contact.FRONT, Contact.SIDE)
+    assert _terms(after)["collision"] == (-1.0 if at_fault else 0.0)
 
 
 def test_off_road_beyond_the_tolerance():

@@ -1,4 +1,4 @@
-"""What a world lets be known: all of now and of the past, nothing of the future."""
+"""Scenes of a world: all of the present and the past, nothing of the future."""
 
 import dataclasses
 
@@ -10,8 +10,8 @@ from tests.builders import make_recording
 from tests.sim.worlds import DT_S, HISTORY, drive, on_road, replay, scenario, simulate
 
 
-def test_a_scene_shows_what_there_is():
-    """Shapes of the contract: 15 past ticks and now, actions between them, targets but the ego."""
+def test_shapes_and_content_of_a_scene():
+    """15 past ticks and now, actions between them; targets are the present agents but the ego."""
     recording = make_recording()
     simulation = simulate(recording, [scenario(1, length=20), scenario(3, start=30)])
     drive(simulation, [(0.0, 0.0)] * 2)
@@ -31,30 +31,30 @@ def test_a_scene_shows_what_there_is():
 
 
 def test_actions_of_a_scene_are_inferred_from_its_states():
-    """After a step with 2 m/s² the last action of the ego is 2 m/s², whoever drove it."""
+    """After a step with (2 m/s², 0.1 rad) the last action of the ego is that."""
     simulation = simulate(on_road(), scenario())
     drive(simulation, [(2.0, 0.1)])
     action = simulation.world.scene().actions[0, 0, -1]
     assert action == pytest.approx([2.0, 0.1], abs=2e-3)
 
 
-def _with_other_future(recording: Recording, frame: int, keep: int) -> Recording:
-    """The recording with everybody's rows but one track's changed behind a frame."""
+def _with_other_future(recording: Recording, frame: int, unchanged: int) -> Recording:
+    """The recording with the rows of all tracks but one changed after a frame."""
     states = recording.states.copy()
     for track in range(len(recording)):
         first = int(recording.first_frames[track])
         rows = states[recording.starts[track] : recording.starts[track + 1]]
-        if track != keep:
+        if track != unchanged:
             rows[max(frame + 1 - first, 0) :, :3] += 7.0
     return dataclasses.replace(recording, states=states)
 
 
 @pytest.mark.parametrize("traffic", ["log", "idm"])
 def test_a_scene_holds_no_future(traffic):
-    """Other tracks' rows behind the present frame can be anything: the scene is the same bits."""
+    """Changing other tracks after the present frame leaves the bits of the scene unchanged."""
     recording = make_recording()
     steps, start = 8, HISTORY
-    changed = _with_other_future(recording, frame=5 * start, keep=0)
+    changed = _with_other_future(recording, frame=5 * start, unchanged=0)
     scenes = []
     for each in (recording, changed):
         scenes.append(simulate(each, scenario(1, start=start), traffic).world.scene())
@@ -63,7 +63,7 @@ def test_a_scene_holds_no_future(traffic):
         if isinstance(before, np.ndarray):
             assert before.tobytes() == after.tobytes(), field.name
     if traffic == "log":
-        late = _with_other_future(recording, frame=5 * (start + steps), keep=0)
+        late = _with_other_future(recording, frame=5 * (start + steps), unchanged=0)
         pair = [simulate(each, scenario(1, start=start)) for each in (recording, late)]
         for each in pair:
             replay(each, steps)
@@ -71,8 +71,8 @@ def test_a_scene_holds_no_future(traffic):
         assert first.states.tobytes() == second.states.tobytes()
 
 
-def test_earlier_scenes_are_not_written_to():
-    """Steps and resets leave the arrays of a scene that was handed out before as they were."""
+def test_earlier_scenes_are_not_overwritten():
+    """Steps and resets do not change the arrays of earlier scenes and events."""
     simulation = simulate(make_recording(), scenario(1))
     scene, events = simulation.world.scene(), simulation.world.events()
     arrays = {
@@ -81,9 +81,9 @@ def test_earlier_scenes_are_not_written_to():
         for field in dataclasses.fields(given)
         if isinstance(getattr(given, field.name), np.ndarray)
     }
-    kept = {name: array.copy() for name, array in arrays.items()}
+    copies = {name: array.copy() for name, array in arrays.items()}
     drive(simulation, [(1.0, 0.1)] * 3)
     simulation.reset([scenario(3, start=20)], [np.random.default_rng(1)])
     drive(simulation, [(1.0, 0.1)] * 2)
     for name, array in arrays.items():
-        assert array.tobytes() == kept[name].tobytes(), name
+        assert array.tobytes() == copies[name].tobytes(), name

@@ -1,4 +1,4 @@
-"""Why an episode is over."""
+"""Endings of episodes, and snapshots with the drivers' memory."""
 
 import dataclasses
 
@@ -28,8 +28,8 @@ SIGNS = {
 }
 
 
-def test_an_episode_goes_on_while_nothing_holds():
-    """2 m off the road, a hit from behind, a tick left and 1 cm to go are no end yet."""
+def test_an_episode_runs_while_no_ending_applies():
+    """2 m off the road, a contact at the rear, one tick left and 2 cm to the goal end nothing."""
     almost = dataclasses.replace(
         RUNNING,
         contacts=np.array([[0, Contact.REAR]], dtype=np.int8),
@@ -42,8 +42,8 @@ def test_an_episode_goes_on_while_nothing_holds():
 
 
 @pytest.mark.parametrize("kind", list(SIGNS), ids=lambda kind: kind.name)
-def test_the_first_of_the_enumeration_wins(kind):
-    """Of a reason and all that come after it in the enumeration, the reason is named."""
+def test_the_first_ending_in_order_applies(kind):
+    """Of an ending and all after it in the enumeration, the first one is returned."""
     assert ending(dataclasses.replace(RUNNING, **SIGNS[kind])).tolist() == [kind]
     all_later = {}
     for later in reversed([each for each in SIGNS if each >= kind]):
@@ -52,8 +52,8 @@ def test_the_first_of_the_enumeration_wins(kind):
 
 
 @pytest.mark.parametrize("traffic", TRAFFICS)
-def test_a_snapshot_brings_back_the_drivers_memory(traffic):
-    """After a restore the same 10 steps lead to the same bits, whatever happened in between."""
+def test_a_snapshot_restores_the_memory_of_drivers(traffic):
+    """After a restore the same 10 steps yield the same bits."""
     recording = on_road(car(-60.0, 6.0), car(-40.0, 9.0, (3.0, -2.0, 0.0)), car(-90.0, 10.0))
     scenarios = [scenario(1), scenario(1, start=HISTORY + 6)]
     simulation = simulate(recording, scenarios, traffic=traffic)

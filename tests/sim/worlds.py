@@ -1,4 +1,4 @@
-"""Short ways to recordings of a few vehicles, their scenarios, and simulations of them."""
+"""Helpers for recordings of a few vehicles, their scenarios, and simulations of them."""
 
 from collections.abc import Sequence
 
@@ -20,10 +20,10 @@ TRAFFICS = (
     *("predictor:constant-turn-rate", "predictor:every=3:mode=sampled:oracle"),
     "default=idm,truck=log-actions,4=policy,6=predictor:constant-velocity",
 )
-"""Every driver that runs no network, and a table of several."""
+"""Every driver of a replay world without a network, and a table of several."""
 
 EGO = Drive(kind=AgentClass.CAR, start=(1.75, -95.0, np.pi / 2, 5.0))
-"""Drives north, away from what happens on the road along x."""
+"""Drives north, away from the road along x."""
 
 
 def car(
@@ -34,7 +34,7 @@ def car(
     kind: AgentClass = AgentClass.CAR,
     appears_s: float = 0.0,
 ) -> Drive:
-    """Somebody on the eastbound lane; an appearance after 0 s keeps it from being parked."""
+    """A vehicle on the eastbound lane; a standing one that appears after 0 s is not parked."""
     start = (x_m, y_m, 0.0, speed_mps)
     return Drive(kind=kind, start=start, phases=phases, appears_s=appears_s)
 
@@ -42,7 +42,7 @@ def car(
 def scenario(
     ego_id: int = 1, *, start: int = HISTORY, length: int = 30, recording: int = 0
 ) -> Scenario:
-    """A scenario of a recording made in memory."""
+    """A scenario of a recording in memory."""
     return Scenario(
         source="made-up",
         recording=recording,
@@ -57,9 +57,9 @@ def simulate(
     recordings: Sequence[Recording] | Recording,
     scenarios: Sequence[Scenario] | Scenario,
     traffic: TrafficSpec = "log",
-    kind: type[World] = ReplayWorld,
+    world_class: type[World] = ReplayWorld,
 ) -> Simulation:
-    """Episodes that have just begun."""
+    """Episodes that have just started."""
     recordings = [recordings] if isinstance(recordings, Recording) else recordings
     scenarios = [scenarios] if isinstance(scenarios, Scenario) else scenarios
     simulation = Simulation(
@@ -68,26 +68,26 @@ def simulate(
         num_episodes=len(scenarios),
         dt_s=DT_S,
         history=HISTORY,
-        kind=kind,
+        world_class=world_class,
     )
     simulation.reset(scenarios, [np.random.default_rng(each.seed) for each in scenarios])
     return simulation
 
 
 def on_road(*drives: Drive, duration_s: float = 20.0) -> Recording:
-    """The ego on the crossing road with id 1, then the given ones numbered from 2."""
+    """A recording of the ego on the crossing road with id 1, and of vehicles with ids from 2."""
     return make_recording(drives=(EGO, *drives), duration_s=duration_s)
 
 
 def replay(simulation: Simulation, steps: int) -> None:
-    """Steps in which the egos replay their log."""
+    """Steps in which the egos replay their tracks."""
     count = len(simulation.world)
     for _ in range(steps):
         simulation.step(np.zeros((count, 2), dtype=np.float32), np.zeros(count, dtype=bool))
 
 
 def drive(simulation: Simulation, actions: Sequence[tuple[float, float]]) -> None:
-    """Steps in which every ego carries out the same actions."""
+    """Steps in which every ego executes the same actions."""
     count = len(simulation.world)
     for action in actions:
         held = np.tile(np.array(action, dtype=np.float32), (count, 1))
@@ -95,7 +95,7 @@ def drive(simulation: Simulation, actions: Sequence[tuple[float, float]]) -> Non
 
 
 def now(simulation: Simulation, track_id: int, episode: int = 0) -> np.ndarray | None:
-    """The state of somebody now, None if it is not there."""
+    """The present state of an agent, None if it is absent."""
     world = simulation.world
     tick = world.now[episode]
     slot = int(np.flatnonzero(world.episodes.ids[episode] == track_id)[0])

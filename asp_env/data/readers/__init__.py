@@ -1,1 +1,26 @@
-"""Files of others into recordings and maps."""
+"""Readers: recordings and maps from the files of published datasets."""
+
+from asp_env.data.readers.interaction import InteractionFiles, read_interaction
+from asp_env.data.readers.lanelet2 import Origin, read_lanelet2
+from asp_env.data.readers.layout import TrackTable
+from asp_env.data.readers.levelx import LevelxFiles, read_levelx
+from asp_env.data.readers.opening import (
+    ReaderState,
+    RecordingFiles,
+    content_hash,
+    open_recording,
+)
+
+__all__ = [
+    "InteractionFiles",
+    "LevelxFiles",
+    "Origin",
+    "ReaderState",
+    "RecordingFiles",
+    "TrackTable",
+    "content_hash",
+    "open_recording",
+    "read_interaction",
+    "read_lanelet2",
+    "read_levelx",
+]

@@ -1,14 +1,13 @@
-"""The INTERACTION layout: which files make a recording, and which map and origin belong to it.
+"""The INTERACTION layout: recordings of one or two CSV tables each, and their maps.
 
-`vehicle_tracks_NNN.csv` and perhaps `pedestrian_tracks_NNN.csv` lie in a folder named after their
-location, the location's map is `LOCATION.osm` or, in local metres, `LOCATION.osm_xy`: INTERACTION
-has `recorded_trackfiles/LOCATION/` beside `maps/`, TAF-BW `LOCATION/` beside `maps/`. Positions
-are metres from an origin: (0, 0) degrees, or what `meta_data.csv` beside the tracks says.
+`vehicle_tracks_NNN.csv` and optionally `pedestrian_tracks_NNN.csv` lie in a folder named after
+their location; the location's map is `LOCATION.osm` or, in local metres, `LOCATION.osm_xy`.
+INTERACTION has `recorded_trackfiles/LOCATION/` and `maps/` in one folder, TAF-BW `LOCATION/` and
+`maps/`. Positions are metres from an origin: (0, 0) degrees, or that of the recording's row in
+`meta_data.csv` in the tracks' folder.
 
-MERGED: `vehicle_tracks_NNN.csv` and `pedestrian_tracks_NNN.csv` into one table of tracks.
-
-Positions and times are trusted, and nothing else: published velocities may be scaled or of the
-wrong sign and headings folded into ±90°, so both are derived from the positions. Frame ids are not
+Only positions and times are used as they are. Published velocities may be scaled or have the wrong
+sign and headings may be folded into ±90°, so both are derived from the positions. Frame ids are not
 read: they may count frames that were left out.
 """
 
@@ -22,20 +21,44 @@ import numpy as np
 import pandas as pd
 from jaxtyping import Bool, Float, Int
 
-from asp_env.data.classes import FOOTPRINTS_M, VULNERABLE, parse_class
-from asp_env.data.readers.folders import maps_in, natural, upwards, walk
-from asp_env.data.readers.lanelet2 import Origin, shorten
-from asp_env.data.readers.levelx import TrackTable, states_of
-from asp_env.data.readers.smoothing import JUMP_M, count_held, find_jumps, follow_heading, smooth
+from asp_env.data.classes import FOOTPRINTS_M, VULNERABLE
+from asp_env.data.readers.lanelet2 import Origin
+from asp_env.data.readers.layout import (
+    MAP_SUFFIXES,
+    TrackTable,
+    classes_of,
+    find_maps,
+    natural_key,
+    shorten,
+    states_of,
+    walk,
+    with_parents,
+)
+from asp_env.data.readers.smoothing import (
+    JUMP_M,
+    count_held,
+    find_jumps,
+    follow_heading,
+    smooth,
+)
 from asp_env.data.readers.tables import Clock, Kind, find_line, read_clock, read_columns
 from asp_env.dynamics.bicycle import AXLE_SHARE_OF_LENGTH
 from asp_env.errors import DataError
 
-MAP_SUFFIXES = (".osm", ".osm_xy")
-"""In this order, where a map comes twice."""
-
 META = "meta_data.csv"
 KMH_PER_MPS = 3.6
+
+MIN_PIECE_S = 0.5
+"""Pieces of tracks between gaps or jumps that are shorter than this are left out: they are too
+short for an estimate of speed. Chosen by hand."""
+
+FORWARD_ABOVE_MPS = 3.0
+"""No vehicle drives backwards faster than this: above it, a heading against the motion is wrong.
+Chosen by hand."""
+
+MAX_WRONG_SHARE = 0.01
+"""If more than this share of the headings of fast vehicles are wrong, the headings are taken to be
+folded into ±90°. Chosen by hand: single tracker errors must not count."""
 
 _PART = re.compile(r"^(vehicle|pedestrian)_tracks_([^.]+)\.csv(?:\.gz)?$")
 _META_COLUMNS: dict[str, Kind] = {
@@ -45,61 +68,100 @@ _META_COLUMNS: dict[str, Kind] = {
     "speedLimit_kmh": "number",
     "locationId": "text",
 }
-_OPTIONAL = frozenset({"speedLimit_kmh", "locationId"})
+_OPTIONAL_META = frozenset({"speedLimit_kmh", "locationId"})
+_TRACKS: Mapping[str, Kind] = {
+    "track_id": "whole",
+    "timestamp_ms": "number",
+    "agent_type": "text",
+    "x": "number",
+    "y": "number",
+    "psi_rad": "number",
+    "length": "number",
+    "width": "number",
+}
+_OPTIONAL_TRACKS = frozenset({"psi_rad", "length", "width"})
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class InteractionFiles:
-    """Where one recording's files lie. A missing table of vehicles is named as it should be."""
+    """The files of one recording. The path of a missing vehicle table is where it is expected."""
 
     name: str
     root: Path
-    """The folder that was given as DATA: maps are searched from the recording up to it."""
+    """The folder given as DATA. Maps are searched from the recording's folder up to it."""
     location: str
     number: str
-    """As in the files' names, such as `000`."""
+    """The recording's number in the names of its files, such as `000`."""
     tracks: Path
     pedestrians: Path | None
     meta: Path | None
 
     @property
     def tables(self) -> tuple[Path, ...]:
-        """All files that there should be but the map."""
+        """The CSV files of the recording."""
         return tuple(path for path in (self.tracks, self.pedestrians, self.meta) if path)
 
     @property
     def background(self) -> None:
-        """There is no picture."""
+        """None: this layout has no background images."""
         return
 
     def check_complete(self) -> None:
-        """Refuses pedestrians without vehicles.
+        """Checks that the table of vehicles exists.
 
         Raises:
-            DataError: that is all there is.
+            DataError: there is a table of pedestrians only.
         """
         if not self.tracks.is_file() and self.pedestrians:
             raise DataError(
-                f"{self.tracks}: no such file, though {self.pedestrians.name} is there; "
-                "copy it beside that or remove the recording"
+                f"{self.tracks}: no such file, though {self.pedestrians.name} exists; "
+                "copy it to the same folder or remove the recording"
             )
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class InteractionMeta:
-    """What is known of a recording besides its tracks."""
+    """Properties of a recording besides its tracks."""
 
     location: str
     location_id: str
-    """The location as `meta_data.csv` calls it, else as the folder does."""
+    """The location's name in `meta_data.csv`, else that of its folder."""
     speed_limit_mps: float | None
     origin: Origin
 
 
-def find_recordings(root: Path) -> tuple[InteractionFiles, ...]:
-    """The recordings below a folder, by name: `LOCATION/NNN`; incomplete ones too.
+@dataclass(frozen=True, slots=True, kw_only=True)
+class _Rows:
+    """Rows of both tables, sorted by track, then time."""
 
-    Where folders of one name lie in several places, names carry these: `2020/LOCATION/NNN`.
+    track: Int[np.ndarray, " rows"]
+    time_ms: Float[np.ndarray, " rows"]
+    kind: Int[np.ndarray, " rows"]
+    """`AgentClass`."""
+    positions: Float[np.ndarray, "rows 2"]
+    heading: Float[np.ndarray, " rows"]
+    """Radians; NaN where the file has none."""
+    sizes: Float[np.ndarray, "rows 2"]
+    """Length and width; 0 where the file has none."""
+    sources: Mapping[int, tuple[Path, object]]
+    """For tracks with new ids: their file and their id in it."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class _Piece:
+    """The smoothed part of a track between two gaps or jumps."""
+
+    track: int
+    rows: slice
+    positions: Float[np.ndarray, "rows 2"]
+    velocities: Float[np.ndarray, "rows 2"]
+
+
+def find_recordings(root: Path) -> tuple[InteractionFiles, ...]:
+    """The recordings in and below a folder, in natural order of names, incomplete ones included.
+
+    A recording's name is `LOCATION/NNN`. Where several folders have the same name, it includes
+    their path below `root`: `2020/LOCATION/NNN`.
     """
     parts: dict[tuple[Path, str], dict[str, Path]] = {}
     metas: dict[Path, Path] = {}
@@ -126,14 +188,14 @@ def find_recordings(root: Path) -> tuple[InteractionFiles, ...]:
                 meta=metas.get(folder),
             )
         )
-    return tuple(sorted(found, key=lambda files: natural(files.name)))
+    return tuple(sorted(found, key=lambda files: natural_key(files.name)))
 
 
 def read_meta(files: InteractionFiles) -> InteractionMeta:
-    """What `meta_data.csv` says of a recording; without one, the origin is (0, 0) degrees.
+    """Reads a recording's row of `meta_data.csv`. Without that file the origin is (0, 0) degrees.
 
     Raises:
-        DataError: it is damaged, or does not know the recording.
+        DataError: the file is damaged, or has no row for the recording.
     """
     folder = files.tracks.parent.name
     if files.meta is None:
@@ -141,7 +203,7 @@ def read_meta(files: InteractionFiles) -> InteractionMeta:
         return InteractionMeta(
             location=files.location, location_id=folder, speed_limit_mps=None, origin=origin
         )
-    for chunk in read_columns(files.meta, _META_COLUMNS, optional=_OPTIONAL):
+    for chunk in read_columns(files.meta, _META_COLUMNS, optional=_OPTIONAL_META):
         for row, number in enumerate(chunk["id"]):
             if _same_number(str(number), files.number):
                 limit_kmh = float(chunk["speedLimit_kmh"][row]) if "speedLimit_kmh" in chunk else 0
@@ -160,26 +222,27 @@ def read_meta(files: InteractionFiles) -> InteractionMeta:
 
 
 def find_map(
-    files: InteractionFiles, meta: InteractionMeta, maps_below: dict[Path, list[Path]]
+    files: InteractionFiles, meta: InteractionMeta, maps_by_folder: dict[Path, list[Path]]
 ) -> Path:
-    """The map named after a recording's location: the nearest, going up from it to DATA.
+    """The map with the name of a recording's location: the nearest one in a parent folder.
 
-    Where DATA is the location's own folder or the one that holds it, `maps/` may lie beside them.
+    The folders `maps/` beside the recording's folder and beside its parent are searched too, even
+    if they are outside of DATA.
 
     Args:
         files: the recording's files.
-        meta: what is known of it.
-        maps_below: the maps in and below folders, as far as these were searched; is added to.
+        meta: its metadata.
+        maps_by_folder: map files in and below the folders searched so far. Results are added.
 
     Raises:
-        DataError: there is none.
+        DataError: no map has that name.
     """
     folder = files.tracks.parent
     names = [name.lower() for name in (folder.name, meta.location_id)]
-    inside = upwards(folder, files.root)
+    inside = with_parents(folder, files.root)
     beside = [place / "maps" for place in (folder.parent, folder.parent.parent)]
     for place in (*inside, *(each for each in beside if each.is_dir())):
-        fitting = [path for path in maps_in(place, maps_below) if path.stem.lower() in names]
+        fitting = [path for path in find_maps(place, maps_by_folder) if path.stem.lower() in names]
         if fitting:
             return min(
                 fitting,
@@ -195,75 +258,14 @@ def find_map(
     )
 
 
-def _origin(path: Path, latitude_deg: float, longitude_deg: float) -> Origin:
-    for name, value, most in (("originLat", latitude_deg, 90), ("originLon", longitude_deg, 180)):
-        if abs(value) > most:
-            line = find_line(path, {name: value})
-            raise DataError(
-                f"{path}, line {line}: {name} is {value:g}, expected {-most} to {most} degrees"
-            )
-    return Origin.at(latitude_deg=latitude_deg, longitude_deg=longitude_deg)
-
-
-def _same_number(one: str, other: str) -> bool:
-    return one.strip().lstrip("0") == other.lstrip("0")
-
-
-LEAST_S = 0.5
-"""What lasts less between two gaps or jumps is left out: no speed can be told of it."""
-
-NOBODY_BACKS_MPS = 3.0
-"""Whose heading points back at more than this has a wrong heading."""
-
-MOST_WRONG = 0.01
-"""If more of the fast vehicles' rows than this are so, headings are folded into ±90°."""
-
-_COLUMNS: Mapping[str, Kind] = {
-    "track_id": "whole",
-    "timestamp_ms": "number",
-    "agent_type": "text",
-    "x": "number",
-    "y": "number",
-    "psi_rad": "number",
-    "length": "number",
-    "width": "number",
-}
-_OPTIONAL_COLUMNS = frozenset({"psi_rad", "length", "width"})
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class _Rows:
-    """Rows sorted by track, then time."""
-
-    track: Int[np.ndarray, " rows"]
-    time_ms: Float[np.ndarray, " rows"]
-    kind: Int[np.ndarray, " rows"]
-    positions: Float[np.ndarray, "rows 2"]
-    heading: Float[np.ndarray, " rows"]
-    """Radians as the file says, NaN where it does not."""
-    sizes: Float[np.ndarray, "rows 2"]
-    """Length and width as the file says, 0 where it does not."""
-    names: Mapping[int, tuple[Path, object]]
-    """Where tracks that got another id come from: the file and their id in it."""
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class _Piece:
-    """What lies between two gaps or jumps of a track, smoothed."""
-
-    track: int
-    rows: slice
-    positions: Float[np.ndarray, "rows 2"]
-    velocities: Float[np.ndarray, "rows 2"]
-
-
 def read_interaction(files: InteractionFiles) -> tuple[TrackTable, float]:
     """Reads a recording's tracks and its frame rate.
 
-    Tracks are cut at gaps and jumps, positions smoothed; speeds and headings follow from them.
-    A vehicle's heading in the file says which end is its front, unless headings contradict fast
-    motion, and how it stands if it never moves. Vulnerable road users head where they move, from
-    the past alone; before they first move they have the file's heading, or 0.
+    Tracks are split at gaps and jumps, positions are smoothed, and speeds and headings are derived
+    from them. The heading in the file determines which end of a vehicle is its front, unless
+    headings contradict fast motion, and the heading of a vehicle that never moves. The heading of a
+    vulnerable road user is its direction of motion, of the past alone; before the first motion it
+    is that of the file, or 0.
 
     Returns:
         The tracks, and the frames per second.
@@ -272,21 +274,21 @@ def read_interaction(files: InteractionFiles) -> tuple[TrackTable, float]:
         DataError: a file is damaged, or no frame rate fits its times.
     """
     rows = _read(files)
-    clock = read_clock(rows.track, rows.time_ms, lambda at, what: _line(files, rows, at, what))
+    clock = read_clock(rows.track, rows.time_ms, lambda row, what: _located(files, rows, row, what))
     repairs: list[str] = []
     pieces = _pieces(rows, clock, repairs)
     if not pieces:
         raise DataError(
-            f"{files.tracks}: no track lasts {LEAST_S:g} s without a gap or jump; "
+            f"{files.tracks}: no track lasts {MIN_PIECE_S:g} s without a gap or jump; "
             "copy it again or remove the recording"
         )
-    kinds, sizes = _per_track(rows, pieces, repairs)
+    kinds, sizes = _kinds_and_sizes(rows, pieces, repairs)
     vulnerable = np.isin(kinds, [int(kind) for kind in VULNERABLE])
-    folded = _folded(rows, pieces, vulnerable, repairs)
+    folded = _headings_are_folded(rows, pieces, vulnerable, repairs)
     measured = np.concatenate(
         [
-            _measured(rows, piece, float(size[0]), clock.step_s, folded, bool(foot))
-            for piece, size, foot in zip(pieces, sizes, vulnerable, strict=True)
+            _measured(rows, piece, float(size[0]), clock.step_s, folded, bool(is_vulnerable))
+            for piece, size, is_vulnerable in zip(pieces, sizes, vulnerable, strict=True)
         ]
     )
     lengths = np.array([len(piece.positions) for piece in pieces])
@@ -304,16 +306,30 @@ def read_interaction(files: InteractionFiles) -> tuple[TrackTable, float]:
     return table, clock.rate_hz
 
 
+def _origin(path: Path, latitude_deg: float, longitude_deg: float) -> Origin:
+    for name, value, limit in (("originLat", latitude_deg, 90), ("originLon", longitude_deg, 180)):
+        if abs(value) > limit:
+            line = find_line(path, {name: value})
+            raise DataError(
+                f"{path}, line {line}: {name} is {value:g}, expected {-limit} to {limit} degrees"
+            )
+    return Origin.at(latitude_deg=latitude_deg, longitude_deg=longitude_deg)
+
+
+def _same_number(one: str, other: str) -> bool:
+    return one.strip().lstrip("0") == other.lstrip("0")
+
+
 def _read(files: InteractionFiles) -> _Rows:
-    vehicles = _columns(files.tracks, _COLUMNS)
-    names: dict[int, tuple[Path, object]] = {}
+    vehicles = _columns(files.tracks, _TRACKS)
+    sources: dict[int, tuple[Path, object]] = {}
     tables = [vehicles]
     if files.pedestrians:
-        walkers = _columns(files.pedestrians, {**_COLUMNS, "track_id": "text"})
-        codes, ids = pd.factorize(walkers["track_id"])
+        pedestrians = _columns(files.pedestrians, {**_TRACKS, "track_id": "text"})
+        codes, ids = pd.factorize(pedestrians["track_id"])
         first = int(vehicles["track_id"].max()) + 1
-        names = {first + code: (files.pedestrians, name) for code, name in enumerate(ids)}
-        tables.append({**walkers, "track_id": first + codes})
+        sources = {first + code: (files.pedestrians, name) for code, name in enumerate(ids)}
+        tables.append({**pedestrians, "track_id": first + codes})
     all_rows = {name: np.concatenate([table[name] for table in tables]) for name in vehicles}
     order = np.lexsort((all_rows["timestamp_ms"], all_rows["track_id"]))
     columns = {name: column[order] for name, column in all_rows.items()}
@@ -324,61 +340,50 @@ def _read(files: InteractionFiles) -> _Rows:
         positions=np.stack([columns["x"], columns["y"]], axis=-1),
         heading=columns["psi_rad"],
         sizes=np.stack([columns["length"], columns["width"]], axis=-1),
-        names=names,
+        sources=sources,
     )
     same = (np.diff(rows.track) == 0) & (np.diff(rows.time_ms) == 0)
     if same.any():
+        what = "a second row of track {track} at {time} ms"
         raise DataError(
-            _line(files, rows, int(same.argmax()) + 1, "a second row of track {track} at {time} ms")
+            _located(files, rows, int(same.argmax()) + 1, what)
             + ", expected one; remove one of the two"
         )
     return rows
 
 
-def _columns(path: Path, wanted: Mapping[str, Kind]) -> dict[str, np.ndarray]:
-    """Columns of a file, agent types as classes, those that it lacks as if nothing were known."""
-    chunks: dict[str, list[np.ndarray]] = {name: [] for name in wanted}
-    for chunk in read_columns(path, wanted, optional=_OPTIONAL_COLUMNS):
-        unknown = {"psi_rad": np.nan, "length": 0.0, "width": 0.0}
-        chunk["agent_type"] = _classes(path, chunk["agent_type"])
+def _columns(path: Path, columns: Mapping[str, Kind]) -> dict[str, np.ndarray]:
+    """Columns of a file, with agent types as classes and missing columns as unknown values."""
+    chunks: dict[str, list[np.ndarray]] = {name: [] for name in columns}
+    unknown = {"psi_rad": np.nan, "length": 0.0, "width": 0.0}
+    for chunk in read_columns(path, columns, optional=_OPTIONAL_TRACKS):
+        chunk["agent_type"] = classes_of(path, "agent_type", chunk["agent_type"])
         for name, cells in chunks.items():
             cells.append(chunk.get(name, np.full(len(chunk["x"]), unknown.get(name))))
     return {name: np.concatenate(cells) for name, cells in chunks.items()}
 
 
-def _classes(path: Path, names: np.ndarray) -> Int[np.ndarray, " rows"]:
-    codes, known = pd.factorize(names)
-    numbers = []
-    for name in known:
-        try:
-            numbers.append(int(parse_class(str(name))))
-        except DataError as error:
-            line = find_line(path, {"agent_type": str(name)})
-            raise DataError(f"{path}, line {line}: {error}") from None
-    return np.array(numbers, dtype=np.int8)[codes]
-
-
-def _line(files: InteractionFiles, rows: _Rows, at: int, what: str) -> str:
-    """Where a row came from, and what is wrong with it: `{track}` and `{time}` are filled in."""
-    number = int(rows.track[at])
-    path, name = rows.names.get(number, (files.tracks, number))
-    cells = {"track_id": name, "timestamp_ms": float(rows.time_ms[at])}
-    before = (rows.track[:at] == number) & (rows.time_ms[:at] == rows.time_ms[at])
+def _located(files: InteractionFiles, rows: _Rows, row: int, what: str) -> str:
+    """A row's file and line, followed by `what` with `{track}` and `{time}` filled in."""
+    number = int(rows.track[row])
+    path, name = rows.sources.get(number, (files.tracks, number))
+    cells = {"track_id": name, "timestamp_ms": float(rows.time_ms[row])}
+    before = (rows.track[:row] == number) & (rows.time_ms[:row] == rows.time_ms[row])
     line = find_line(path, cells, occurrence=int(before.sum()) + 1)
-    return f"{path}, line {line}: " + what.format(track=name, time=f"{rows.time_ms[at]:g}")
+    return f"{path}, line {line}: " + what.format(track=name, time=f"{rows.time_ms[row]:g}")
 
 
 def _pieces(rows: _Rows, clock: Clock, repairs: list[str]) -> list[_Piece]:
-    """Tracks between gaps and jumps; the first of a track keeps its id, others get new ones."""
+    """Splits tracks at gaps and jumps. Later pieces of a track get new ids."""
     changes = np.diff(rows.track) != 0
     gaps = ~changes & (np.diff(clock.frames) > 1)
     jumps = np.zeros_like(gaps)
     for begin, end in _stretches(changes | gaps):
         jumps[begin : end - 1] = find_jumps(rows.positions[begin:end])
-    _tell(rows, gaps, "gaps in tracks' times, split there", repairs)
-    _tell(rows, jumps, f"jumps of over {JUMP_M:g} m in tracks, split there", repairs)
+    _report_splits(rows, gaps, "gaps in tracks' times, split there", repairs)
+    _report_splits(rows, jumps, f"jumps of over {JUMP_M:g} m in tracks, split there", repairs)
 
-    fresh = int(rows.track.max()) + 1
+    new_id = int(rows.track.max()) + 1
     pieces: list[_Piece] = []
     later: list[_Piece] = []
     held, short = [], []
@@ -387,46 +392,49 @@ def _pieces(rows: _Rows, clock: Clock, repairs: list[str]) -> list[_Piece]:
         begin = first + count_held(rows.positions[first:end], clock.step_s)
         if begin > first:
             held.append(track)
-        if end - begin < max(round(LEAST_S * clock.rate_hz), 2):
+        if end - begin < max(round(MIN_PIECE_S * clock.rate_hz), 2):
             short.append(track)
             continue
         positions, velocities = smooth(rows.positions[begin:end], clock.step_s)
-        known = bool(pieces) and pieces[-1].track == track
+        is_later = bool(pieces) and pieces[-1].track == track
         piece = _Piece(
-            track=fresh + len(later) if known else track,
+            track=new_id + len(later) if is_later else track,
             rows=slice(begin, end),
             positions=positions,
             velocities=velocities,
         )
-        (later if known else pieces).append(piece)
-    _count(held, "tracks whose first position is held, left out until they are followed", repairs)
-    _count(short, f"tracks with pieces under {LEAST_S:g} s, these left out", repairs)
+        (later if is_later else pieces).append(piece)
+    _report_tracks(held, "tracks repeat their first position, repeated rows left out", repairs)
+    _report_tracks(short, f"tracks have pieces under {MIN_PIECE_S:g} s, these left out", repairs)
     return pieces + later
 
 
 def _stretches(ends_after: Bool[np.ndarray, " steps"]) -> list[tuple[int, int]]:
-    """First row and end of what lies between the steps that are marked."""
+    """First row and end of each stretch of rows between marked steps."""
     bounds = [0, *(np.flatnonzero(ends_after) + 1).tolist(), len(ends_after) + 1]
     return list(itertools.pairwise(bounds))
 
 
-def _count(tracks: Sequence[int], what: str, repairs: list[str]) -> None:
+def _report_tracks(tracks: Sequence[int], what: str, repairs: list[str]) -> None:
     if tracks:
-        told = [str(track) for track in dict.fromkeys(tracks)]
-        repairs.append(f"{len(told)} {what}: {shorten(told)}")
+        names = [str(track) for track in dict.fromkeys(tracks)]
+        repairs.append(f"{len(names)} {what}: {shorten(names)}")
 
 
-def _tell(rows: _Rows, after: Bool[np.ndarray, " steps"], what: str, repairs: list[str]) -> None:
+def _report_splits(
+    rows: _Rows, after: Bool[np.ndarray, " steps"], what: str, repairs: list[str]
+) -> None:
     if after.any():
-        at = np.flatnonzero(after)
-        told = [f"{rows.track[row]} after {rows.time_ms[row]:g} ms" for row in at]
-        repairs.append(f"{len(told)} {what}: {shorten(told)}")
+        splits = [
+            f"{rows.track[row]} after {rows.time_ms[row]:g} ms" for row in np.flatnonzero(after)
+        ]
+        repairs.append(f"{len(splits)} {what}: {shorten(splits)}")
 
 
-def _per_track(
+def _kinds_and_sizes(
     rows: _Rows, pieces: Sequence[_Piece], repairs: list[str]
 ) -> tuple[Int[np.ndarray, " pieces"], Float[np.ndarray, "pieces 2"]]:
-    """Each piece's class and size: those of its first row, and the median."""
+    """Each piece's class, which is that of its first row, and its median size."""
     kinds = np.array([rows.kind[piece.rows.start] for piece in pieces], dtype=np.int8)
     sizes = np.array([np.median(rows.sizes[piece.rows], axis=0) for piece in pieces])
     differ = [
@@ -434,33 +442,33 @@ def _per_track(
         for piece, kind in zip(pieces, kinds, strict=True)
         if (rows.kind[piece.rows] != kind).any()
     ]
-    _count(differ, "tracks change their agent_type", repairs)
+    _report_tracks(differ, "tracks change their agent_type", repairs)
     known = (sizes > 0).all(axis=-1, keepdims=True)
     return kinds, np.where(known, sizes, FOOTPRINTS_M[kinds]).astype(np.float32)
 
 
-def _folded(
+def _headings_are_folded(
     rows: _Rows,
     pieces: Sequence[_Piece],
     vulnerable: Bool[np.ndarray, " pieces"],
     repairs: list[str],
 ) -> bool:
-    """Whether the file's headings do not tell a vehicle's front from its rear."""
+    """Whether the file's headings do not distinguish a vehicle's front from its rear."""
     fast = wrong = 0
-    for piece, foot in zip(pieces, vulnerable, strict=True):
+    for piece, is_vulnerable in zip(pieces, vulnerable, strict=True):
         heading = rows.heading[piece.rows]
-        if foot or np.isnan(heading).any():
+        if is_vulnerable or np.isnan(heading).any():
             continue
-        moves = np.hypot(*piece.velocities.T) > NOBODY_BACKS_MPS
+        moves = np.hypot(*piece.velocities.T) > FORWARD_ABOVE_MPS
         along = (piece.velocities * np.stack([np.cos(heading), np.sin(heading)], axis=-1)).sum(-1)
         fast += int(moves.sum())
         wrong += int((moves & (along < 0)).sum())
-    if wrong <= MOST_WRONG * fast:
+    if wrong <= MAX_WRONG_SHARE * fast:
         return False
     share = 100 * wrong / fast
     repairs.append(
         f"{share:.0f} % of the headings of fast vehicles point backwards: "
-        "which end is the front is told by motion alone"
+        "the front is determined from motion alone"
     )
     return True
 

@@ -1,10 +1,8 @@
-"""The inD/rounD layout: which files make a recording, and which map and scale belong to it.
+"""The inD/rounD layout: recordings of three CSV tables each, their maps, and background images.
 
-Per recording `XX`: `XX_recordingMeta.csv`, `XX_tracksMeta.csv`, `XX_tracks.csv` (or `.csv.gz`) and
-perhaps `XX_background.png`, together in any folder below the one given. Metadata are read per
-recording, never per location: the origin differs between recordings of one site.
-
-MERGED: `XX_tracks.csv` and `XX_tracksMeta.csv` into one table of tracks.
+Recording `XX` consists of `XX_recordingMeta.csv`, `XX_tracksMeta.csv`, `XX_tracks.csv` (or
+`.csv.gz`) and optionally `XX_background.png`, all in one folder, at any depth. Metadata are read
+for each recording, not for each location: the origin differs between recordings of one location.
 """
 
 import math
@@ -14,249 +12,42 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Float, Int
 
-from asp_env.data.classes import FOOTPRINTS_M, VULNERABLE, parse_class
-from asp_env.data.readers.folders import maps_in, natural, upwards, walk
-from asp_env.data.readers.lanelet2 import Origin, project, read_osm, shorten
+from asp_env.data.classes import FOOTPRINTS_M, VULNERABLE
+from asp_env.data.readers.lanelet2 import Origin, read_osm, to_local
+from asp_env.data.readers.layout import (
+    TrackTable,
+    classes_of,
+    find_maps,
+    natural_key,
+    shorten,
+    states_of,
+    walk,
+    with_parents,
+)
 from asp_env.data.readers.tables import Kind, find_line, read_columns, read_table
 from asp_env.errors import DataError
-from asp_env.geometry import wrap_angle
 
 CONSTRUCTION_RECORDINGS = frozenset(range(11, 18))
-"""Recordings of inD's location 1 made while its site was under construction."""
+"""Recordings of inD's location 1 that were made while its site was under construction."""
 
 NEAR_M = 1_000.0
-"""A map that does not name its location belongs to a recording this near."""
+"""A map whose name gives no location belongs to recordings within this distance. Chosen by hand:
+more than a site's extent, less than the distance between sites."""
 
 DOWNSCALE = {"ind": 12, "round": 10, "exid": 6, "unid": 2}
-"""By how much the published background images are smaller than `orthoPxToMeter` says."""
+"""Factor by which each dataset's published background images are smaller than the images that
+`orthoPxToMeter` refers to."""
 
 SCALES = (1, 2, 6, 10, 12)
+"""Factors to try for a dataset that is not in `DOWNSCALE`."""
+
 MARGIN_PX = 5.0
-"""So far outside its image a position may lie by the rounding of scales and smoothing."""
+"""Distance by which positions may lie outside the image, for rounded scales and smoothed positions.
+Chosen by hand."""
 
 _PART = re.compile(r"^(.+)_(recordingMeta\.csv|tracksMeta\.csv|tracks\.csv(?:\.gz)?)$")
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class LevelxFiles:
-    """Where one recording's files lie. Those that are missing are named as they should be."""
-
-    name: str
-    root: Path
-    """The folder that was given as DATA: maps are searched from the recording up to it."""
-    recording_meta: Path
-    tracks_meta: Path
-    tracks: Path
-    background: Path | None
-
-    @property
-    def tables(self) -> tuple[Path, Path, Path]:
-        """The three files that every recording has."""
-        return (self.recording_meta, self.tracks_meta, self.tracks)
-
-    def check_complete(self) -> None:
-        """Refuses a recording that lacks one of its tables.
-
-        Raises:
-            DataError: it does.
-        """
-        there = [path.name for path in self.tables if path.is_file()]
-        for path in self.tables:
-            if path.name not in there:
-                raise DataError(
-                    f"{path}: no such file, though {', '.join(there)} is there; "
-                    "copy it beside the others or remove the recording"
-                )
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class RecordingMeta:
-    """What `XX_recordingMeta.csv` says."""
-
-    number: int
-    location: int
-    frame_rate_hz: float
-    speed_limit_mps: float | None
-    metres_per_ortho_pixel: float | None
-    origin: Origin
-
-
-def find_recordings(root: Path) -> tuple[LevelxFiles, ...]:
-    """The recordings below a folder, by name; incomplete ones too, so that they can be reported.
-
-    Where one id occurs in several folders, names carry the folder: `rounD/00`.
-    """
-    parts: dict[tuple[Path, str], dict[str, Path]] = {}
-    for folder, names in walk(root):
-        for name in names:
-            if match := _PART.match(name):
-                kind = match[2].split(".")[0]
-                parts.setdefault((folder, match[1]), {})[kind] = folder / name
-    ids = [prefix for _, prefix in parts]
-    found = []
-    for (folder, prefix), files in parts.items():
-        background = folder / f"{prefix}_background.png"
-        place = folder.parent if folder.name == "data" else folder
-        inside = place.relative_to(root) if place.is_relative_to(root) else Path()
-        found.append(
-            LevelxFiles(
-                name=prefix if ids.count(prefix) == 1 else (inside / prefix).as_posix(),
-                root=root,
-                recording_meta=files.get("recordingMeta", folder / f"{prefix}_recordingMeta.csv"),
-                tracks_meta=files.get("tracksMeta", folder / f"{prefix}_tracksMeta.csv"),
-                tracks=files.get("tracks", folder / f"{prefix}_tracks.csv"),
-                background=background if background.is_file() else None,
-            )
-        )
-    return tuple(sorted(found, key=lambda files: natural(files.name)))
-
-
-def read_recording_meta(path: Path) -> RecordingMeta:
-    """Reads `XX_recordingMeta.csv`.
-
-    Raises:
-        DataError: it is damaged, or its frame rate is no positive number.
-    """
-    needed = ("recordingId", "locationId", "frameRate", "xUtmOrigin", "yUtmOrigin")
-    table = read_table(
-        path,
-        {
-            **dict.fromkeys(needed[:2], "whole"),
-            **dict.fromkeys(needed[2:], "number"),
-            **dict.fromkeys(("latLocation", "lonLocation"), "number"),
-        },
-    )
-    rate = float(table["frameRate"][0])
-    if rate <= 0:
-        raise DataError(f"{path}, line 2: frameRate is {rate:g}, expected a positive number of Hz")
-    return RecordingMeta(
-        number=int(table["recordingId"][0]),
-        location=int(table["locationId"][0]),
-        frame_rate_hz=rate,
-        speed_limit_mps=_positive(path, "speedLimit"),
-        metres_per_ortho_pixel=_positive(path, "orthoPxToMeter"),
-        origin=Origin(
-            x_m=float(table["xUtmOrigin"][0]),
-            y_m=float(table["yUtmOrigin"][0]),
-            longitude_deg=float(table["lonLocation"][0]),
-            latitude_deg=float(table["latLocation"][0]),
-        ),
-    )
-
-
-def find_map(files: LevelxFiles, meta: RecordingMeta, maps_below: dict[Path, list[Path]]) -> Path:
-    """The lanelet2 map of a recording: the nearest, going up from it, that fits its location.
-
-    A map fits if its own name ends in the location's id (`location1.osm`), or its folder's name
-    begins with it (`01_bendplatz`). Of several, inD's construction map serves the recordings made
-    then and no others. Without a name that fits, the map within 1 km of the recording serves.
-
-    Args:
-        files: the recording's files.
-        meta: its metadata.
-        maps_below: the maps in and below folders, as far as these were searched; is added to.
-
-    Raises:
-        DataError: there is none.
-    """
-    top = files.root.parent if files.root.name == "data" else files.root
-    for folder in upwards(files.recording_meta.parent, top):
-        maps = [path for path in maps_in(folder, maps_below) if path.suffix == ".osm"]
-        fitting = [path for path in maps if _names_location(path, meta.location)]
-        under_construction = meta.location == 1 and meta.number in CONSTRUCTION_RECORDINGS
-        preferred = [path for path in fitting if _is_construction(path) == under_construction]
-        chosen = preferred or fitting or _near(maps, meta.origin)
-        if chosen:
-            return chosen[0]
-    raise DataError(
-        f"{files.root}: no map for location {meta.location} of recording {files.name}; "
-        f"expected a lanelet2 file location{meta.location}.osm in it or below"
-    )
-
-
-def metres_per_pixel(
-    files: LevelxFiles, meta: RecordingMeta, size_px: tuple[int, int], xy: np.ndarray
-) -> float | None:
-    """The scale of a background image.
-
-    `orthoPxToMeter` is that of the original image; the published one is smaller by a factor that
-    no file tells. It is the dataset's where a folder carries its name (inD 12, rounD 10, exiD 6,
-    uniD 2), else the smallest of 1, 2, 6, 10, 12; in either case all positions must lie in the
-    image, as they do where they were seen in it.
-
-    Args:
-        files: the recording's files.
-        meta: its metadata.
-        size_px: width and height of the image.
-        xy: positions (n, 2) of the recording's road users, metres.
-
-    Returns:
-        Metres per pixel; None without `orthoPxToMeter`, or if no factor fits.
-    """
-    if meta.metres_per_ortho_pixel is None:
-        return None
-    folders = [part.lower() for part in files.recording_meta.resolve().parts[:-1]]
-    named = [
-        factor
-        for name, factor in DOWNSCALE.items()
-        if any(re.match(rf"{name}(?![a-z])", folder) for folder in folders)
-    ]
-    low, high = xy.min(axis=0), xy.max(axis=0)
-    for factor in (*named, *SCALES):
-        scale = factor * meta.metres_per_ortho_pixel
-        margin = MARGIN_PX * scale
-        right, bottom = size_px[0] * scale, size_px[1] * scale
-        if (
-            min(low[0], -high[1]) > -margin
-            and high[0] - right < margin
-            and -low[1] - bottom < margin
-        ):
-            return scale
-    return None
-
-
-def _names_location(path: Path, location: int) -> bool:
-    own = re.search(r"location[_-]?0*(\d+)$", path.stem, re.IGNORECASE)
-    if own:
-        return int(own[1]) == location
-    folder = re.match(r"0*(\d+)[_-]", path.parent.name)
-    return bool(folder) and int(folder[1]) == location
-
-
-def _is_construction(path: Path) -> bool:
-    return "const" in f"{path.parent.name}/{path.stem}".lower()
-
-
-def _near(maps: list[Path], origin: Origin) -> list[Path]:
-    found = []
-    for path in maps:
-        try:
-            degrees = np.array(list(read_osm(path).nodes.values())).reshape(-1, 2)
-        except DataError:
-            continue
-        if not len(degrees):
-            continue
-        xy = np.median(project(degrees[:, 0], degrees[:, 1], origin), axis=0)
-        distance = math.hypot(*xy)
-        if distance < NEAR_M:
-            found.append((distance, path))
-    return [path for _, path in sorted(found)]
-
-
-def _positive(path: Path, column: str) -> float | None:
-    """An optional cell; files write nothing, 0, -1 or NaN for what is not known."""
-    try:
-        value = float(read_table(path, {column: "number"})[column][0])
-    except DataError:
-        return None
-    return value if value > 0 else None
-
-
-MOVES_MPS = 0.3
-"""Above this the direction of motion is a vulnerable road user's heading."""
-
 _META: Mapping[str, Kind] = {
     "trackId": "whole",
     "initialFrame": "whole",
@@ -280,21 +71,52 @@ _MEASURED = ("xCenter", "yCenter", "heading", "xVelocity", "yVelocity")
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class TrackTable:
-    """The columns of a `Recording` that come from its tracks, and what had to be mended."""
+class LevelxFiles:
+    """The files of one recording. Paths of missing files are those where they are expected."""
 
-    track_ids: Int[np.ndarray, " tracks"]
-    classes: Int[np.ndarray, " tracks"]
-    sizes: Float[np.ndarray, "tracks 2"]
-    first_frames: Int[np.ndarray, " tracks"]
-    starts: Int[np.ndarray, " tracks+1"]
-    states: Float[np.ndarray, "rows 4"]
-    repairs: tuple[str, ...]
+    name: str
+    root: Path
+    """The folder given as DATA. Maps are searched from the recording's folder up to it."""
+    recording_meta: Path
+    tracks_meta: Path
+    tracks: Path
+    background: Path | None
+
+    @property
+    def tables(self) -> tuple[Path, Path, Path]:
+        """The three CSV files that every recording has."""
+        return (self.recording_meta, self.tracks_meta, self.tracks)
+
+    def check_complete(self) -> None:
+        """Checks that all tables exist.
+
+        Raises:
+            DataError: a table is missing.
+        """
+        present = [path.name for path in self.tables if path.is_file()]
+        for path in self.tables:
+            if path.name not in present:
+                raise DataError(
+                    f"{path}: no such file, though {', '.join(present)} exists; "
+                    "copy it to the same folder or remove the recording"
+                )
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class RecordingMeta:
+    """The content of `XX_recordingMeta.csv`."""
+
+    number: int
+    location: int
+    frame_rate_hz: float
+    speed_limit_mps: float | None
+    metres_per_ortho_pixel: float | None
+    origin: Origin
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class _Rows:
-    """Rows sorted by track, then frame."""
+    """Rows of `XX_tracks.csv`, sorted by track, then frame."""
 
     track: Int[np.ndarray, " rows"]
     frame: Int[np.ndarray, " rows"]
@@ -303,65 +125,173 @@ class _Rows:
     sizes: Float[np.ndarray, "rows 2"]
 
 
-def read_tracks(files: LevelxFiles) -> TrackTable:
-    """Reads a recording's tracks.
+def find_recordings(root: Path) -> tuple[LevelxFiles, ...]:
+    """The recordings in and below a folder, in natural order of names, incomplete ones included.
 
-    Vehicles keep the file's heading; their speed is the velocity's, negative when they back up.
-    Vulnerable road users head where they move; below 0.3 m/s they keep the heading they had, and
-    before they first move the file's. Their speed is the size of the velocity.
-    A track with a gap in its frames is split there: what follows gets an id of its own.
+    A recording's name is its id, preceded by its folder where several folders have the same id:
+    `rounD/00`.
+    """
+    parts: dict[tuple[Path, str], dict[str, Path]] = {}
+    for folder, names in walk(root):
+        for name in names:
+            if match := _PART.match(name):
+                kind = match[2].split(".")[0]
+                parts.setdefault((folder, match[1]), {})[kind] = folder / name
+    ids = [prefix for _, prefix in parts]
+    found = []
+    for (folder, prefix), files in parts.items():
+        background = folder / f"{prefix}_background.png"
+        place = folder.parent if folder.name == "data" else folder
+        inside = place.relative_to(root) if place.is_relative_to(root) else Path()
+        found.append(
+            LevelxFiles(
+                name=prefix if ids.count(prefix) == 1 else (inside / prefix).as_posix(),
+                root=root,
+                recording_meta=files.get("recordingMeta", folder / f"{prefix}_recordingMeta.csv"),
+                tracks_meta=files.get("tracksMeta", folder / f"{prefix}_tracksMeta.csv"),
+                tracks=files.get("tracks", folder / f"{prefix}_tracks.csv"),
+                background=background if background.is_file() else None,
+            )
+        )
+    return tuple(sorted(found, key=lambda files: natural_key(files.name)))
+
+
+def read_recording_meta(path: Path) -> RecordingMeta:
+    """Reads `XX_recordingMeta.csv`.
 
     Raises:
-        DataError: a file is damaged, or the two disagree on which tracks there are.
+        DataError: the file is damaged, or its frame rate is not positive.
+    """
+    needed = ("recordingId", "locationId", "frameRate", "xUtmOrigin", "yUtmOrigin")
+    table = read_table(
+        path,
+        {
+            **dict.fromkeys(needed[:2], "whole"),
+            **dict.fromkeys(needed[2:], "number"),
+            **dict.fromkeys(("latLocation", "lonLocation"), "number"),
+        },
+    )
+    rate = float(table["frameRate"][0])
+    if rate <= 0:
+        raise DataError(f"{path}, line 2: frameRate is {rate:g}, expected a positive number of Hz")
+    return RecordingMeta(
+        number=int(table["recordingId"][0]),
+        location=int(table["locationId"][0]),
+        frame_rate_hz=rate,
+        speed_limit_mps=_positive_or_none(path, "speedLimit"),
+        metres_per_ortho_pixel=_positive_or_none(path, "orthoPxToMeter"),
+        origin=Origin(
+            x_m=float(table["xUtmOrigin"][0]),
+            y_m=float(table["yUtmOrigin"][0]),
+            longitude_deg=float(table["lonLocation"][0]),
+            latitude_deg=float(table["latLocation"][0]),
+        ),
+    )
+
+
+def find_map(
+    files: LevelxFiles, meta: RecordingMeta, maps_by_folder: dict[Path, list[Path]]
+) -> Path:
+    """The lanelet2 map of a recording: the nearest matching one in a parent folder.
+
+    A map matches a location if its name ends in the location's id (`location1.osm`), or its
+    folder's name begins with it (`01_bendplatz`). inD's construction-site map is for the recordings
+    made during construction only, where another one matches as well. If no name matches, a map
+    within 1 km of the recording is used.
+
+    Args:
+        files: the recording's files.
+        meta: its metadata.
+        maps_by_folder: map files in and below the folders searched so far. Results are added.
+
+    Raises:
+        DataError: no map matches.
+    """
+    top = files.root.parent if files.root.name == "data" else files.root
+    for folder in with_parents(files.recording_meta.parent, top):
+        maps = [path for path in find_maps(folder, maps_by_folder) if path.suffix == ".osm"]
+        fitting = [path for path in maps if _names_location(path, meta.location)]
+        under_construction = meta.location == 1 and meta.number in CONSTRUCTION_RECORDINGS
+        preferred = [path for path in fitting if _is_construction(path) == under_construction]
+        chosen = preferred or fitting or _maps_near(maps, meta.origin)
+        if chosen:
+            return chosen[0]
+    raise DataError(
+        f"{files.root}: no map for location {meta.location} of recording {files.name}; "
+        f"expected a lanelet2 file location{meta.location}.osm in it or below"
+    )
+
+
+def metres_per_pixel(
+    files: LevelxFiles, meta: RecordingMeta, size_px: tuple[int, int], xy: np.ndarray
+) -> float | None:
+    """The scale of a background image.
+
+    `orthoPxToMeter` is the scale of the original image. The published image is smaller by a factor
+    that no file contains. It is the dataset's factor if a folder has the dataset's name (inD 12,
+    rounD 10, exiD 6, uniD 2), otherwise the smallest of 1, 2, 6, 10 and 12. A factor is used only
+    if all positions then lie in the image.
+
+    Args:
+        files: the recording's files.
+        meta: its metadata.
+        size_px: width and height of the image.
+        xy: (n, 2) positions of the recording's agents, metres.
+
+    Returns:
+        Metres per pixel. None without `orthoPxToMeter`, or if no factor fits.
+    """
+    if meta.metres_per_ortho_pixel is None:
+        return None
+    folders = [part.lower() for part in files.recording_meta.resolve().parts[:-1]]
+    named = [
+        factor
+        for name, factor in DOWNSCALE.items()
+        if any(re.match(rf"{name}(?![a-z])", folder) for folder in folders)
+    ]
+    low, high = xy.min(axis=0), xy.max(axis=0)
+    for factor in (*named, *SCALES):
+        scale = factor * meta.metres_per_ortho_pixel
+        margin = MARGIN_PX * scale
+        right, bottom = size_px[0] * scale, size_px[1] * scale
+        if (
+            min(low[0], -high[1]) > -margin
+            and high[0] - right < margin
+            and -low[1] - bottom < margin
+        ):
+            return scale
+    return None
+
+
+def read_levelx(files: LevelxFiles) -> TrackTable:
+    """Reads a recording's tracks.
+
+    The heading of a vehicle is that of the file; its speed is the norm of the velocity, negative if
+    the vehicle moves backwards. The heading of a vulnerable road user is its direction of motion;
+    below 0.3 m/s the previous heading is held, and before the first motion it is that of the file.
+    A track with a gap in its frames is split there, and the later part gets a new id.
+
+    Raises:
+        DataError: a file is damaged, or the two tables list different tracks.
     """
     meta = read_table(files.tracks_meta, _META)
-    ids = meta["trackId"]
-    if len(np.unique(ids)) < len(ids):
-        values, counts = np.unique(ids, return_counts=True)
-        twice = int(values[counts > 1][0])
-        line = find_line(files.tracks_meta, {"trackId": twice}, occurrence=2)
-        raise DataError(
-            f"{files.tracks_meta}, line {line}: track {twice} is listed twice, expected once; "
-            "remove one of the two"
-        )
-    order = np.argsort(ids)
-    classes = _classes(files, meta["class"])[order]
+    _check_unique(files, meta["trackId"])
+    order = np.argsort(meta["trackId"])
+    ids = meta["trackId"][order]
+    classes = classes_of(files.tracks_meta, "class", meta["class"])[order]
     rows = _read_rows(files)
-    _check_ids(files, rows, ids[order])
+    _check_same_tracks(files, rows, ids)
     repairs: list[str] = []
     begins = np.flatnonzero(np.diff(rows.track, prepend=rows.track[0] - 1))
     _compare_frames(rows, begins, meta, order, repairs)
     sizes = _sizes(rows.sizes[begins], meta, order, classes)
 
-    splits = np.flatnonzero((np.diff(rows.track) == 0) & (np.diff(rows.frame) > 1)) + 1
-    starts = np.union1d(begins, splits)
-    owner = np.searchsorted(ids[order], rows.track[starts])
-    new_ids = ids[order][owner]
-    fresh = np.isin(starts, splits)
-    new_ids[fresh] = ids.max() + 1 + np.arange(fresh.sum())
-    if len(splits):
-        told = [f"{rows.track[at]} after frame {rows.frame[at - 1]}" for at in splits]
-        repairs.append(f"{len(splits)} gaps in tracks' frames, split there: {shorten(told)}")
-    by_id = np.argsort(new_ids, kind="stable")
-    vulnerable = np.isin(classes, [int(kind) for kind in VULNERABLE])
-    return _assemble(rows, starts, by_id, new_ids, owner, classes, sizes, vulnerable, repairs)
-
-
-def _assemble(
-    rows: _Rows,
-    starts: Int[np.ndarray, " tracks"],
-    by_id: Int[np.ndarray, " tracks"],
-    new_ids: Int[np.ndarray, " tracks"],
-    owner: Int[np.ndarray, " tracks"],
-    classes: Int[np.ndarray, " metas"],
-    sizes: Float[np.ndarray, "metas 2"],
-    vulnerable: Bool[np.ndarray, " metas"],
-    repairs: list[str],
-) -> TrackTable:
+    starts, new_ids = _split_at_gaps(rows, begins, ids, repairs)
     lengths = np.diff(starts, append=len(rows.track))
-    states = states_of(
-        rows.measured, np.repeat(starts, lengths), np.repeat(vulnerable[owner], lengths)
-    )
+    owner = np.searchsorted(ids, rows.track[starts])
+    vulnerable = np.isin(classes[owner], [int(kind) for kind in VULNERABLE])
+    states = states_of(rows.measured, np.repeat(starts, lengths), np.repeat(vulnerable, lengths))
+    by_id = np.argsort(new_ids, kind="stable")
     if (np.diff(by_id) < 0).any():
         ends = starts + lengths
         states = np.concatenate([states[starts[track] : ends[track]] for track in by_id])
@@ -376,46 +306,52 @@ def _assemble(
     )
 
 
-def states_of(
-    measured: Float[np.ndarray, "rows 5"],
-    first_row: Int[np.ndarray, " rows"],
-    vulnerable: Bool[np.ndarray, " rows"],
-) -> Float[np.ndarray, "rows 4"]:
-    """The states of a recording's rows.
-
-    Vulnerable road users head where they move, from the past alone; vehicles' speeds have the
-    sign of motion along the heading.
-
-    Args:
-        measured: x, y, heading in degrees, velocity along x and y.
-        first_row: of each row, the first of its track.
-        vulnerable: which rows are of vulnerable road users.
-    """
-    heading = np.radians(measured[:, 2])
-    velocity_x, velocity_y = measured[:, 3], measured[:, 4]
-    total = np.hypot(velocity_x, velocity_y)
-    moves = vulnerable & (total > MOVES_MPS)
-    row = np.arange(len(measured))
-    last_moving = np.maximum.accumulate(np.where(moves, row, -1))
-    known = vulnerable & (last_moving >= first_row)
-    course = np.arctan2(velocity_y, velocity_x)
-    heading = np.where(known, course[last_moving], heading)
-    along = velocity_x * np.cos(heading) + velocity_y * np.sin(heading)
-    # the bicycle's speed is that of the box's centre, which slips sideways in bends
-    speed = np.where(vulnerable, total, np.copysign(total, along))
-    states = np.stack([measured[:, 0], measured[:, 1], wrap_angle(heading), speed], axis=-1)
-    return states.astype(np.float32)
+def _names_location(path: Path, location: int) -> bool:
+    own = re.search(r"location[_-]?0*(\d+)$", path.stem, re.IGNORECASE)
+    if own:
+        return int(own[1]) == location
+    folder = re.match(r"0*(\d+)[_-]", path.parent.name)
+    return bool(folder) and int(folder[1]) == location
 
 
-def _classes(files: LevelxFiles, names: np.ndarray) -> Int[np.ndarray, " metas"]:
-    numbers = {}
-    for name in dict.fromkeys(names):
+def _is_construction(path: Path) -> bool:
+    return "const" in f"{path.parent.name}/{path.stem}".lower()
+
+
+def _maps_near(maps: list[Path], origin: Origin) -> list[Path]:
+    found = []
+    for path in maps:
         try:
-            numbers[name] = int(parse_class(str(name)))
-        except DataError as error:
-            line = find_line(files.tracks_meta, {"class": str(name)})
-            raise DataError(f"{files.tracks_meta}, line {line}: {error}") from None
-    return np.array([numbers[name] for name in names], dtype=np.int8)
+            degrees = np.array(list(read_osm(path).nodes.values())).reshape(-1, 2)
+        except DataError:
+            continue
+        if not len(degrees):
+            continue
+        xy = np.median(to_local(degrees[:, 0], degrees[:, 1], origin), axis=0)
+        distance = math.hypot(*xy)
+        if distance < NEAR_M:
+            found.append((distance, path))
+    return [path for _, path in sorted(found)]
+
+
+def _positive_or_none(path: Path, column: str) -> float | None:
+    """The cell of an optional column. Files write nothing, 0, -1 or NaN for an unknown value."""
+    try:
+        value = float(read_table(path, {column: "number"})[column][0])
+    except DataError:
+        return None
+    return value if value > 0 else None
+
+
+def _check_unique(files: LevelxFiles, ids: Int[np.ndarray, " metas"]) -> None:
+    values, counts = np.unique(ids, return_counts=True)
+    if len(values) < len(ids):
+        double = int(values[counts > 1][0])
+        line = find_line(files.tracks_meta, {"trackId": double}, occurrence=2)
+        raise DataError(
+            f"{files.tracks_meta}, line {line}: track {double} is listed twice, expected once; "
+            "remove one of the two lines"
+        )
 
 
 def _read_rows(files: LevelxFiles) -> _Rows:
@@ -426,8 +362,8 @@ def _read_rows(files: LevelxFiles) -> _Rows:
         frame.append(chunk["frame"].astype(np.int32))
         measured.append(np.stack([chunk[name] for name in _MEASURED], axis=-1).astype(np.float32))
         unknown = np.zeros(len(chunk["frame"]))
-        both = [chunk.get("length", unknown), chunk.get("width", unknown)]
-        sizes.append(np.stack(both, axis=-1).astype(np.float32))
+        size = [chunk.get("length", unknown), chunk.get("width", unknown)]
+        sizes.append(np.stack(size, axis=-1).astype(np.float32))
     rows = _Rows(
         track=np.concatenate(track),
         frame=np.concatenate(frame),
@@ -449,8 +385,8 @@ def _sorted(files: LevelxFiles, rows: _Rows) -> _Rows:
         )
         same = (np.diff(rows.track) == 0) & (np.diff(rows.frame) == 0)
         if same.any():
-            at = int(same.argmax())
-            values = {"trackId": int(rows.track[at]), "frame": int(rows.frame[at])}
+            row = int(same.argmax())
+            values = {"trackId": int(rows.track[row]), "frame": int(rows.frame[row])}
             line = find_line(files.tracks, values, occurrence=2)
             raise DataError(
                 f"{files.tracks}, line {line}: a second row for track {values['trackId']} at frame "
@@ -463,22 +399,23 @@ def _sorted(files: LevelxFiles, rows: _Rows) -> _Rows:
     return rows
 
 
-def _check_ids(files: LevelxFiles, rows: _Rows, ids: Int[np.ndarray, " metas"]) -> None:
-    there = np.unique(rows.track)
-    strangers = np.setdiff1d(there, ids)
-    if len(strangers):
-        line = find_line(files.tracks, {"trackId": int(strangers[0])})
+def _check_same_tracks(files: LevelxFiles, rows: _Rows, ids: Int[np.ndarray, " metas"]) -> None:
+    present = np.unique(rows.track)
+    unlisted = np.setdiff1d(present, ids)
+    if len(unlisted):
+        line = find_line(files.tracks, {"trackId": int(unlisted[0])})
         raise DataError(
-            f"{files.tracks}, line {line}: track {strangers[0]} is not in "
-            f"{files.tracks_meta.name}, expected each of its tracks there; "
-            "the files are of different recordings or damaged"
+            f"{files.tracks}, line {line}: track {unlisted[0]} is not in "
+            f"{files.tracks_meta.name}, expected all tracks there; "
+            "the files belong to different recordings or are damaged"
         )
-    absent = np.setdiff1d(ids, there)
+    absent = np.setdiff1d(ids, present)
     if len(absent):
         line = find_line(files.tracks_meta, {"trackId": int(absent[0])})
         raise DataError(
             f"{files.tracks}: has no row for {len(absent)} tracks of {files.tracks_meta.name}, "
-            f"the first being {absent[0]} (line {line} there); the file is cut: copy it again"
+            f"the first of which is {absent[0]} (line {line} there); the file is truncated: "
+            "copy it again"
         )
 
 
@@ -494,10 +431,10 @@ def _compare_frames(
         rows.frame[last] != meta["finalFrame"][order]
     )
     if differ.any():
-        told = [str(track) for track in rows.track[begins][differ]]
+        tracks = [str(track) for track in rows.track[begins][differ]]
         repairs.append(
-            f"{len(told)} tracks begin or end at another frame than tracksMeta says: "
-            f"{shorten(told)}"
+            f"{len(tracks)} tracks begin or end at another frame than in tracksMeta: "
+            f"{shorten(tracks)}"
         )
 
 
@@ -507,7 +444,25 @@ def _sizes(
     order: Int[np.ndarray, " metas"],
     classes: Int[np.ndarray, " metas"],
 ) -> Float[np.ndarray, "metas 2"]:
-    """The rows' sizes, where they are zero the metadata's, where these are the class's."""
+    """The sizes in the rows, where these are zero those in the metadata, else the class's."""
     in_meta = np.stack([meta["length"], meta["width"]], axis=-1)[order].astype(np.float32)
     sizes = np.where((in_rows > 0).all(axis=-1, keepdims=True), in_rows, in_meta)
     return np.where((sizes > 0).all(axis=-1, keepdims=True), sizes, FOOTPRINTS_M[classes])
+
+
+def _split_at_gaps(
+    rows: _Rows,
+    begins: Int[np.ndarray, " metas"],
+    ids: Int[np.ndarray, " metas"],
+    repairs: list[str],
+) -> tuple[Int[np.ndarray, " tracks"], Int[np.ndarray, " tracks"]]:
+    """First row and id of each track after tracks are split where frames are missing."""
+    splits = np.flatnonzero((np.diff(rows.track) == 0) & (np.diff(rows.frame) > 1)) + 1
+    starts = np.union1d(begins, splits)
+    new_ids = ids[np.searchsorted(ids, rows.track[starts])]
+    is_new = np.isin(starts, splits)
+    new_ids[is_new] = ids.max() + 1 + np.arange(is_new.sum())
+    if len(splits):
+        gaps = [f"{rows.track[row]} after frame {rows.frame[row - 1]}" for row in splits]
+        repairs.append(f"{len(splits)} gaps in tracks' frames, split there: {shorten(gaps)}")
+    return starts, new_ids

@@ -1,4 +1,4 @@
-"""From a recording's files to a `Recording`, through the cache."""
+"""Opening a recording of any layout, from its files or from the cache."""
 
 import hashlib
 import struct
@@ -14,18 +14,20 @@ from asp_env.data import cache
 from asp_env.data.readers import interaction, levelx
 from asp_env.data.readers.interaction import InteractionFiles, InteractionMeta, read_interaction
 from asp_env.data.readers.lanelet2 import Origin, read_lanelet2
-from asp_env.data.readers.levelx import LevelxFiles, RecordingMeta, TrackTable, read_tracks
+from asp_env.data.readers.layout import TrackTable
+from asp_env.data.readers.levelx import LevelxFiles, RecordingMeta, read_levelx
 from asp_env.data.recording import Background, Recording
 from asp_env.data.road_map import Ragged, RoadMap
 from asp_env.errors import DataError
 
 RecordingFiles = LevelxFiles | InteractionFiles
-"""Where one recording's files lie, of any layout."""
+"""The files of one recording, of any layout."""
 
 Meta = RecordingMeta | InteractionMeta
+"""The metadata of one recording, of any layout."""
 
-Entry = tuple[dict[str, Any], dict[str, np.ndarray]]
-"""Facts and arrays, as the cache keeps them."""
+CacheEntry = tuple[dict[str, Any], dict[str, np.ndarray]]
+"""Facts and arrays, the content of a cache file."""
 
 _TRACK_COLUMNS = ("track_ids", "classes", "sizes", "first_frames", "starts", "states")
 _MAP_PARTS = ("lines", "drivable", "lanes", "areas")
@@ -33,63 +35,74 @@ _MAP_COLUMNS = ("line_types", "successors", "two_way", "limits_mps", "limited")
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Opened:
-    """What is known already, so that one place has one map and no folder is searched twice."""
+class ReaderState:
+    """Results shared by the recordings of one DATA: one map per place, and one search per folder.
+
+    Keys of recordings are their names.
+    """
 
     recordings: dict[str, Recording] = field(default_factory=dict)
     maps: dict[tuple[Path, Origin], RoadMap] = field(default_factory=dict)
     places: dict[str, tuple[Meta, Path]] = field(default_factory=dict)
-    """Of each recording: its metadata, and where its map lies."""
+    """Metadata and path of the map of each recording."""
     hashes: dict[str, str] = field(default_factory=dict)
-    maps_below: dict[Path, list[Path]] = field(default_factory=dict)
-    """By folder; without it, finding the maps of N recordings would look at N² files."""
+    maps_by_folder: dict[Path, list[Path]] = field(default_factory=dict)
+    """Map files by folder. Without it, opening N recordings would list N² files."""
 
 
-def open_recording(files: RecordingFiles, opened: Opened) -> Recording:
-    """The recording, read now unless it is open, and kept in `opened`.
+def open_recording(files: RecordingFiles, state: ReaderState) -> Recording:
+    """Opens a recording, unless `state` has it already.
+
+    Args:
+        files: the recording's files.
+        state: results so far. The recording is added.
 
     Raises:
         DataError: its files are damaged.
     """
-    if files.name not in opened.recordings:
-        meta, map_path = _place(files, opened)
+    if files.name not in state.recordings:
+        meta, map_path = _place(files, state)
         place = (map_path, meta.origin)
-        recording = _recording(files, meta, opened.maps.get(place) or _road_map(*place))
-        opened.maps[place] = recording.road_map
-        opened.recordings[files.name] = recording
-    return opened.recordings[files.name]
+        recording = _recording(files, meta, state.maps.get(place) or _road_map(*place))
+        state.maps[place] = recording.road_map
+        state.recordings[files.name] = recording
+    return state.recordings[files.name]
 
 
-def content_hash(files: RecordingFiles, opened: Opened) -> str:
-    """A hash of the content of a recording's tables and map; the picture does not count.
+def content_hash(files: RecordingFiles, state: ReaderState) -> str:
+    """A hash of the content of a recording's tables and map, without its background image.
+
+    Args:
+        files: the recording's files.
+        state: results so far. The hash is added.
 
     Raises:
         DataError: a file is missing.
     """
-    if files.name not in opened.hashes:
-        _, map_path = _place(files, opened)
+    if files.name not in state.hashes:
+        _, map_path = _place(files, state)
         sources = (*files.tables, map_path)
 
-        def make() -> Entry:
+        def make() -> CacheEntry:
             digests = "".join(cache.digest(path) for path in sources)
             return {"hash": hashlib.sha256(digests.encode()).hexdigest()}, {}
 
         facts, _ = _cached(files.tracks, sources, make, "hash")
-        opened.hashes[files.name] = str(facts["hash"])
-    return opened.hashes[files.name]
+        state.hashes[files.name] = str(facts["hash"])
+    return state.hashes[files.name]
 
 
-def _place(files: RecordingFiles, opened: Opened) -> tuple[Meta, Path]:
-    if files.name not in opened.places:
+def _place(files: RecordingFiles, state: ReaderState) -> tuple[Meta, Path]:
+    if files.name not in state.places:
         files.check_complete()
         if isinstance(files, LevelxFiles):
             meta = levelx.read_recording_meta(files.recording_meta)
-            map_path = levelx.find_map(files, meta, opened.maps_below)
+            map_path = levelx.find_map(files, meta, state.maps_by_folder)
         else:
             meta = interaction.read_meta(files)
-            map_path = interaction.find_map(files, meta, opened.maps_below)
-        opened.places[files.name] = (meta, map_path)
-    return opened.places[files.name]
+            map_path = interaction.find_map(files, meta, state.maps_by_folder)
+        state.places[files.name] = (meta, map_path)
+    return state.places[files.name]
 
 
 def _recording(files: RecordingFiles, meta: Meta, road_map: RoadMap) -> Recording:
@@ -112,19 +125,19 @@ def _recording(files: RecordingFiles, meta: Meta, road_map: RoadMap) -> Recordin
     )
 
 
-def _track_entry(files: RecordingFiles, meta: Meta) -> Entry:
+def _track_entry(files: RecordingFiles, meta: Meta) -> CacheEntry:
     scale = None
     if isinstance(files, InteractionFiles):
         table, rate_hz = read_interaction(files)
         repairs = list(table.repairs)
     else:
         assert isinstance(meta, RecordingMeta)
-        table, rate_hz = read_tracks(files), meta.frame_rate_hz
+        table, rate_hz = read_levelx(files), meta.frame_rate_hz
         repairs = list(table.repairs)
         if files.background is not None:
             scale = _scale(files, files.background, meta, table)
             if scale is None:
-                repairs.append(f"{files.background.name} left out: its scale cannot be told")
+                repairs.append(f"{files.background.name} left out: its scale is unknown")
     last_frames = table.first_frames + np.diff(table.starts) - 1
     facts = {
         "frame_rate_hz": rate_hz,
@@ -136,9 +149,9 @@ def _track_entry(files: RecordingFiles, meta: Meta) -> Entry:
 
 
 def _scale(
-    files: LevelxFiles, picture: Path, meta: RecordingMeta, table: TrackTable
+    files: LevelxFiles, background: Path, meta: RecordingMeta, table: TrackTable
 ) -> float | None:
-    size = _png_size(picture)
+    size = _png_size(background)
     return levelx.metres_per_pixel(files, meta, size, table.states[:, :2]) if size else None
 
 
@@ -156,7 +169,7 @@ def _road_map(path: Path, origin: Origin) -> RoadMap:
     )
 
 
-def _map_entry(path: Path, origin: Origin) -> Entry:
+def _map_entry(path: Path, origin: Origin) -> CacheEntry:
     road_map = read_lanelet2(path, origin)
     arrays = {name: getattr(road_map, name) for name in _MAP_COLUMNS}
     for name in _MAP_PARTS:
@@ -165,35 +178,37 @@ def _map_entry(path: Path, origin: Origin) -> Entry:
     return {"repairs": list(road_map.repairs)}, arrays
 
 
-def _cached(path: Path, sources: Sequence[Path], make: Callable[[], Entry], salt: object) -> Entry:
-    """What `make` returns, from the cache if the sources are as they were.
+def _cached(
+    path: Path, sources: Sequence[Path], make: Callable[[], CacheEntry], salt: object
+) -> CacheEntry:
+    """The result of `make`, from the cache if it is there and no source has changed since.
 
-    Where the cache cannot be written to, files are read anew each time, and a warning says so.
+    If the cache cannot be written, a warning says so and `make` is called every time.
     """
     current = cache.stamp(sources)
     try:
-        kept = cache.entry(cache.cache_folder(), path, salt)
+        cached = cache.entry_path(cache.cache_folder(), path, salt)
     except DataError as error:
-        warnings.warn(f"nothing is kept for next time: {error}", stacklevel=2)
+        warnings.warn(f"results are not cached: {error}", stacklevel=2)
         return _read_only(make())
-    if (found := cache.load(kept, current)) is not None:
+    if (found := cache.load(cached, current)) is not None:
         return found
     made = make()
     try:
-        cache.save(kept, current, *made)
+        cache.save(cached, current, *made)
     except OSError as error:
-        warnings.warn(f"nothing is kept for next time: {kept}: {error.strerror}", stacklevel=2)
-    return cache.load(kept, current) or _read_only(made)
+        warnings.warn(f"results are not cached: {cached}: {error.strerror}", stacklevel=2)
+    return cache.load(cached, current) or _read_only(made)
 
 
-def _read_only(made: Entry) -> Entry:
+def _read_only(made: CacheEntry) -> CacheEntry:
     for array in made[1].values():
         array.flags.writeable = False
     return made
 
 
 def _png_size(path: Path) -> tuple[int, int] | None:
-    """Width and height from the file's header; None if it is no PNG."""
+    """Width and height from the file's header; None if it is not a PNG file."""
     with path.open("rb") as file:
         head = file.read(24)
     if head[:8] != b"\x89PNG\r\n\x1a\n" or len(head) < 24:

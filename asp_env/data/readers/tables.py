@@ -1,7 +1,4 @@
-"""Columns of a CSV file by name, and the exact line of whatever is wrong with it.
-
-MERGED: From the times of rows to frames and their rate.
-"""
+"""CSV tables: columns by name, the exact line of every fault, and frames from time stamps."""
 
 import csv
 import gzip
@@ -20,38 +17,64 @@ from jaxtyping import Float, Int
 from asp_env.errors import DataError
 
 Kind = Literal["whole", "number", "text"]
-"""What the cells of a column must be: whole numbers, finite numbers, or anything."""
+"""What the cells of a column must be: whole numbers, finite numbers, or any text."""
 
 ROWS_PER_CHUNK = 250_000
-"""Bounds the memory that parsing takes, whatever the length of the file."""
+"""Rows that are parsed at a time, which bounds memory. Chosen by hand."""
+
+LOWEST_HZ = 1.0
+HIGHEST_HZ = 250.0
+"""Frame rates outside of this range indicate times that are not in milliseconds."""
+
+ROUNDING_MS = 1.0
+"""Error of a time, since times are whole milliseconds."""
+
+JITTER = 0.1
+"""Error of a time in addition, as a share of a frame. Chosen by hand: above the jitter of cameras,
+far below half a frame."""
 
 _BLOCK_BYTES = 1 << 22
 _DTYPES = {"whole": np.dtype(np.int64), "number": np.dtype(np.float64), "text": np.dtype(object)}
 
 
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Clock:
+    """The frame of each row, and the frame rate."""
+
+    frames: Int[np.ndarray, " rows"]
+    """Frames, counted from the earliest row."""
+    rate_hz: float
+
+    @property
+    def step_s(self) -> float:
+        """Seconds between two frames."""
+        return 1.0 / self.rate_hz
+
+
 def read_columns(
     path: Path, columns: Mapping[str, Kind], *, optional: frozenset[str] = frozenset()
 ) -> Iterator[dict[str, np.ndarray]]:
-    """The named columns of a CSV file (plain or `.gz`), a chunk of rows at a time.
+    """Reads columns of a CSV file (plain or `.gz`), a chunk of rows at a time.
 
     Args:
-        path: the file; its first line names the columns, in any order.
-        columns: what the cells of each wanted column must be.
+        path: the file. Its first line names the columns, in any order.
+        columns: kind of the cells of each column to read.
         optional: those of `columns` that may be absent.
 
     Yields:
         Arrays (rows,) by name: int64, float64 (finite) or str objects.
 
     Raises:
-        DataError: the file is absent, damaged or has no rows; where a line is wrong it is named.
+        DataError: the file is missing, damaged or without rows. The message names the line, if a
+            single line is wrong.
     """
     try:
         header = _header(path)
-        wanted = _wanted(path, header, columns, optional)
-        if not _evenly_filled(path, len(header)):
-            _diagnose(path, header, wanted)
+        present = _present(path, header, columns, optional)
+        if not _has_even_rows(path, len(header)):
+            _diagnose(path, header, present)
         any_rows = False
-        for chunk in _chunks(path, wanted):
+        for chunk in _chunks(path, present):
             any_rows = True
             yield chunk
         if not any_rows:
@@ -68,33 +91,96 @@ def read_columns(
 
 
 def read_table(path: Path, columns: Mapping[str, Kind]) -> dict[str, np.ndarray]:
-    """All rows of `read_columns` at once, for small files.
+    """Reads columns of a small CSV file at once.
 
     Raises:
-        DataError: as `read_columns`.
+        DataError: see `read_columns`.
     """
     chunks = list(read_columns(path, columns))
     return {name: np.concatenate([chunk[name] for chunk in chunks]) for name in columns}
 
 
 def find_line(path: Path, cells: Mapping[str, object], *, occurrence: int = 1) -> int:
-    """The number of the line whose named cells read as given, numbers compared as numbers.
+    """Finds a line by the content of some of its cells.
 
     Args:
         path: the file.
-        cells: what the line's cells hold, by column.
-        occurrence: which of several such lines.
+        cells: content by column. Numbers are compared by value.
+        occurrence: which of several matching lines to find, from 1.
 
     Returns:
-        The line's number from 1; 0 if there is none.
+        The number of the line, from 1; 0 if there is none.
     """
-    columns = {name: at for at, name in enumerate(_header(path))}
+    columns = {name: index for index, name in enumerate(_header(path))}
     for number, row in _lines(path):
         if number > 1 and all(_same(row[columns[name]], cells[name]) for name in cells):
             occurrence -= 1
             if not occurrence:
                 return number
     return 0
+
+
+def read_clock(
+    tracks: Int[np.ndarray, " rows"],
+    times_ms: Float[np.ndarray, " rows"],
+    located: Callable[[int, str], str],
+) -> Clock:
+    """Determines the frame of each row, and the frame rate, from the rows' times.
+
+    A frame lasts as long as the median step between rows of a track. The rate is a whole number if
+    one explains all times to the millisecond, since 30 Hz are steps of 33 and 34 ms.
+
+    Args:
+        tracks: track of each row. Rows are sorted by track, then time.
+        times_ms: time of each row, strictly increasing within a track.
+        located: called with a row and a text; returns the row's file and line, followed by the
+            text with `{track}` and `{time}` filled in. It begins error messages.
+
+    Raises:
+        DataError: no track has two rows, the rate is impossible, or a row lies between frames.
+    """
+    steps_ms = np.diff(times_ms)[np.diff(tracks) == 0]
+    if not len(steps_ms):
+        raise DataError(
+            located(0, "no track has a second row")
+            + ", so there is no frame rate; copy the file again or remove the recording"
+        )
+    step_ms = float(np.median(steps_ms))
+    if not LOWEST_HZ <= 1000.0 / step_ms <= HIGHEST_HZ:
+        raise DataError(
+            located(0, "timestamp_ms of its rows")
+            + f" and later rows are {step_ms:g} apart, which makes {1000.0 / step_ms:g} Hz; "
+            f"expected {LOWEST_HZ:g} to {HIGHEST_HZ:g} Hz and times in milliseconds"
+        )
+    known_ms, inverse = np.unique(times_ms, return_inverse=True)
+    since_ms = known_ms - known_ms[0]
+    single = np.abs(steps_ms - step_ms) <= ROUNDING_MS + JITTER * step_ms
+    step_ms = float(steps_ms[single].mean())
+    whole_hz = round(1000.0 / step_ms)
+    frames = np.round(since_ms * whole_hz / 1000.0)
+    if np.abs(since_ms - frames * 1000.0 / whole_hz).max() <= min(ROUNDING_MS, 0.25 * step_ms):
+        clock = Clock(frames=frames.astype(np.int64)[inverse], rate_hz=float(whole_hz))
+        double = (np.diff(tracks) == 0) & (np.diff(clock.frames) == 0)
+        if double.any():
+            raise DataError(
+                located(int(double.argmax()) + 1, "a second row of track {track} at {time} ms")
+                + f", less than a frame of {step_ms:g} ms after the first; remove one of the two"
+            )
+        return clock
+
+    apart = np.diff(known_ms) / step_ms
+    counts = np.round(apart)
+    off = (counts < 1) | (np.abs(apart - counts) > JITTER + ROUNDING_MS / step_ms)
+    if off.any():
+        late = int(np.flatnonzero(times_ms == known_ms[int(off.argmax()) + 1])[0])
+        raise DataError(
+            located(late, "timestamp_ms is {time}")
+            + f", {np.diff(known_ms)[int(off.argmax())]:g} ms after the previous time; expected "
+            f"multiples of {step_ms:g} ms as between most rows: correct the line or remove it"
+        )
+    frames = np.concatenate([[0], np.cumsum(counts)])
+    rate_hz = 1000.0 * float(frames[-1] / since_ms[-1])
+    return Clock(frames=frames.astype(np.int64)[inverse], rate_hz=rate_hz)
 
 
 def _open(path: Path) -> io.BufferedIOBase:
@@ -107,7 +193,7 @@ def _header(path: Path) -> list[str]:
     raise DataError(f"{path}: is empty; expected a table with a header; copy it again")
 
 
-def _wanted(
+def _present(
     path: Path, header: list[str], columns: Mapping[str, Kind], optional: frozenset[str]
 ) -> dict[str, Kind]:
     missing = [name for name in columns if name not in header and name not in optional]
@@ -119,8 +205,8 @@ def _wanted(
     return {name: kind for name, kind in columns.items() if name in header}
 
 
-def _evenly_filled(path: Path, num_columns: int) -> bool:
-    """Whether there are as many commas as the lines call for: a pass at memory speed."""
+def _has_even_rows(path: Path, num_columns: int) -> bool:
+    """Whether the number of commas fits the number of lines. Much faster than parsing."""
     commas = lines = 0
     last = b"\n"
     with _open(path) as file:
@@ -131,12 +217,12 @@ def _evenly_filled(path: Path, num_columns: int) -> bool:
     return commas == (lines + (last != b"\n")) * (num_columns - 1)
 
 
-def _chunks(path: Path, wanted: Mapping[str, Kind]) -> Iterator[dict[str, np.ndarray]]:
-    texts = [name for name, kind in wanted.items() if kind == "text"]
+def _chunks(path: Path, columns: Mapping[str, Kind]) -> Iterator[dict[str, np.ndarray]]:
+    texts = [name for name, kind in columns.items() if kind == "text"]
     reader = pd.read_csv(
         path,
-        usecols=lambda name: name.strip() in wanted,
-        dtype={name: str if kind == "text" else np.float64 for name, kind in wanted.items()},
+        usecols=lambda name: name.strip() in columns,
+        dtype={name: str if kind == "text" else np.float64 for name, kind in columns.items()},
         chunksize=ROWS_PER_CHUNK,
         index_col=False,
         encoding="utf-8-sig",
@@ -148,9 +234,9 @@ def _chunks(path: Path, wanted: Mapping[str, Kind]) -> Iterator[dict[str, np.nda
             if not len(frame):
                 continue
             frame.columns = frame.columns.str.strip()
-            if lost := [name for name in wanted if name not in frame]:
-                raise ValueError(f"a line break stands before {lost[0]!r} in the header")
-            yield {name: _checked(frame[name], kind) for name, kind in wanted.items()}
+            if missing := [name for name in columns if name not in frame]:
+                raise ValueError(f"there is a line break before {missing[0]!r} in the header")
+            yield {name: _checked(frame[name], kind) for name, kind in columns.items()}
 
 
 def _checked(column: pd.Series, kind: Kind) -> np.ndarray:
@@ -158,14 +244,14 @@ def _checked(column: pd.Series, kind: Kind) -> np.ndarray:
         return column.to_numpy(dtype=object)
     cells = column.to_numpy()
     if not np.isfinite(cells).all():
-        raise ValueError("a cell is no number")
+        raise ValueError("a cell is not a number")
     if kind == "whole" and not (cells == np.floor(cells)).all():
-        raise ValueError("a cell is no whole number")
+        raise ValueError("a cell is not a whole number")
     return cells.astype(_DTYPES[kind])
 
 
 def _diagnose(path: Path, header: list[str], columns: Mapping[str, Kind]) -> None:
-    """Names the first line that is wrong, if any: slow, and only for files that are."""
+    """Raises an error that names the first wrong line, if any. Slow: for damaged files only."""
     kinds: list[tuple[int, str, Kind]] = [
         (header.index(name), name, kind) for name, kind in columns.items() if name in header
     ]
@@ -175,17 +261,18 @@ def _diagnose(path: Path, header: list[str], columns: Mapping[str, Kind]) -> Non
         if len(row) != len(header):
             raise DataError(
                 f"{path}, line {number}: has {len(row)} fields, expected {len(header)} as in the "
-                "header; the line is cut or damaged: copy the file again"
+                "header; the line is truncated or damaged: copy the file again"
             )
-        for at, name, kind in kinds:
-            if fault := _fault(row[at], kind):
+        for index, name, kind in kinds:
+            if expected := _expected(row[index], kind):
                 raise DataError(
-                    f"{path}, line {number}: {name} is {row[at]!r}, expected {fault}; "
-                    "mend the line or remove it"
+                    f"{path}, line {number}: {name} is {row[index]!r}, expected {expected}; "
+                    "correct the line or remove it"
                 )
 
 
-def _fault(cell: str, kind: Kind) -> str:
+def _expected(cell: str, kind: Kind) -> str:
+    """What a cell should be instead; empty if it is valid."""
     if kind == "text":
         return ""
     try:
@@ -198,11 +285,11 @@ def _fault(cell: str, kind: Kind) -> str:
 
 
 def _lines(path: Path) -> Iterator[tuple[int, list[str]]]:
-    """(line number from 1, cells) of every line that is not blank."""
+    """Number, from 1, and cells of every line that is not blank."""
     with _open(path) as file:
         for number, line in enumerate(file, start=1):
             text = line.decode("utf-8-sig", "replace").rstrip("\r\n")
-            try:  # line by line, so that a quote that is never closed spoils its own alone
+            try:  # line by line, so that an unclosed quote affects no other line
                 row = next(csv.reader([text.replace("\0", "?").replace("\r", "?")]), [])
             except csv.Error as error:
                 raise DataError(f"{path}, line {number}: cannot be read: {error}") from error
@@ -218,91 +305,3 @@ def _same(cell: str, value: object) -> bool:
 
 def _one_line(error: BaseException) -> str:
     return " ".join(str(error).split()) or type(error).__name__
-
-
-LOWEST_HZ = 1.0
-HIGHEST_HZ = 250.0
-
-ROUNDING_MS = 1.0
-"""Times may be off by this, since they are whole milliseconds."""
-
-JITTER = 0.1
-"""And by this share of a frame."""
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Clock:
-    """The frame of each row, and how fast they follow one another."""
-
-    frames: Int[np.ndarray, " rows"]
-    """The earliest row is at frame 0."""
-    rate_hz: float
-
-    @property
-    def step_s(self) -> float:
-        """From one frame to the next."""
-        return 1.0 / self.rate_hz
-
-
-def read_clock(
-    tracks: Int[np.ndarray, " rows"],
-    times_ms: Float[np.ndarray, " rows"],
-    where: Callable[[int, str], str],
-) -> Clock:
-    """The clock that rows were taken by.
-
-    A frame lasts as long as most steps of tracks do. The rate is a whole number if one explains
-    all times to the millisecond, since 30 Hz are steps of 33 and 34 ms.
-
-    Args:
-        tracks: of each row; rows are sorted by track, then time.
-        times_ms: of each row, one of a track at a time.
-        where: starts the message on what is wrong with a row; is given its number, and a text in
-            which `{track}` and `{time}` are filled in.
-
-    Raises:
-        DataError: there is no step in any track, the rate is impossible, or a row lies between
-            frames.
-    """
-    steps_ms = np.diff(times_ms)[np.diff(tracks) == 0]
-    if not len(steps_ms):
-        raise DataError(
-            where(0, "no track has a second row")
-            + ", so that no frame rate can be told; copy the file again or remove the recording"
-        )
-    step_ms = float(np.median(steps_ms))
-    if not LOWEST_HZ <= 1000.0 / step_ms <= HIGHEST_HZ:
-        raise DataError(
-            where(0, "timestamp_ms of its rows")
-            + f" and those after are {step_ms:g} apart, which makes {1000.0 / step_ms:g} Hz; "
-            f"expected {LOWEST_HZ:g} to {HIGHEST_HZ:g} Hz, so times in milliseconds"
-        )
-    known_ms, at_time = np.unique(times_ms, return_inverse=True)
-    since_ms = known_ms - known_ms[0]
-    single = np.abs(steps_ms - step_ms) <= ROUNDING_MS + JITTER * step_ms
-    step_ms = float(steps_ms[single].mean())
-    whole_hz = round(1000.0 / step_ms)
-    frames = np.round(since_ms * whole_hz / 1000.0)
-    if np.abs(since_ms - frames * 1000.0 / whole_hz).max() <= min(ROUNDING_MS, 0.25 * step_ms):
-        clock = Clock(frames=frames.astype(np.int64)[at_time], rate_hz=float(whole_hz))
-        again = (np.diff(tracks) == 0) & (np.diff(clock.frames) == 0)
-        if again.any():
-            raise DataError(
-                where(int(again.argmax()) + 1, "a second row of track {track} at {time} ms")
-                + f", less than a frame of {step_ms:g} ms after the first; remove one of the two"
-            )
-        return clock
-
-    apart = np.diff(known_ms) / step_ms
-    counts = np.round(apart)
-    off = (counts < 1) | (np.abs(apart - counts) > JITTER + ROUNDING_MS / step_ms)
-    if off.any():
-        late = int(np.flatnonzero(times_ms == known_ms[int(off.argmax()) + 1])[0])
-        raise DataError(
-            where(late, "timestamp_ms is {time}")
-            + f", {np.diff(known_ms)[int(off.argmax())]:g} ms after the one before; expected "
-            f"multiples of {step_ms:g} ms as between most rows: mend the line or remove it"
-        )
-    frames = np.concatenate([[0], np.cumsum(counts)])
-    rate_hz = 1000.0 * float(frames[-1] / since_ms[-1])
-    return Clock(frames=frames.astype(np.int64)[at_time], rate_hz=rate_hz)

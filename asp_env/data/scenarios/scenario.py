@@ -1,4 +1,4 @@
-"""Where, when and who: the table of episodes that can be driven."""
+"""Scenarios: the episodes that can be driven, as a table with a filter language."""
 
 import dataclasses
 import difflib
@@ -6,7 +6,6 @@ import math
 import re
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
-from typing import Protocol, runtime_checkable
 
 import numpy as np
 from jaxtyping import Bool, Float, Int, Shaped
@@ -15,21 +14,26 @@ from asp_env.data.recording import Recording, frames_per_tick
 from asp_env.data.scenarios.tags import COLUMNS, TAGS, describe
 from asp_env.errors import AspEnvError, unknown_name
 
-TEXTS = ("recording", "location")
-"""What is compared as text, with `=` and `!=` alone."""
+MAX_LENGTH_S = 15.0
+"""Longest scenario. Chosen by hand."""
 
+MIN_LENGTH_S = 4.0
+"""Shortest scenario. Chosen by hand."""
+
+MIN_DISTANCE_M = 10.0
+"""Shortest distance that the ego drives in a scenario. Chosen by hand: parking is left out."""
+
+TEXT_COLUMNS = ("recording", "location")
+"""Columns of text, which are compared by `=` and `!=` only."""
 
 _UNITS = ("_s", "_m", "_mps", "_deg")
 
-
-_SHORT = {name.removesuffix(unit): name for name in COLUMNS for unit in _UNITS}
-"""Columns under the names that leave their unit out, and under their own."""
-
+_COLUMN_OF = {name.removesuffix(unit): name for name in COLUMNS for unit in _UNITS}
+"""Column by its name, with or without the unit."""
 
 _COMPARISON = re.compile(r"([^<>=!]*)(>=|<=|!=|>|<|=)([^<>=!]*)")
 
-
-_COMPARE = {
+_OPERATORS = {
     ">=": np.greater_equal,
     "<=": np.less_equal,
     ">": np.greater,
@@ -39,35 +43,44 @@ _COMPARE = {
 }
 
 
-@runtime_checkable
-class Table(Protocol):
-    """What is filtered: an `asp_env.data.scenarios.scenario.ScenarioSet`."""
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Scenario:
+    """An episode that can be driven: an ego and a period of a recording."""
 
-    def __len__(self) -> int:
-        """How many rows there are."""
-        ...
+    source: str
+    """The data as the user named them."""
+    recording: int
+    """Index of the recording in its source."""
+    recording_name: str
+    start_tick: int
+    """The tick of the first observation, which follows the history."""
+    length: int
+    """Number of recorded ticks after `start_tick`."""
+    ego_id: int
+    """Track id of the ego."""
+    seed: int = 0
+    """Seed of the episode's random generator, for drivers that sample."""
+    tags: tuple[str, ...] = ()
 
-    def has(self, tag: str) -> Bool[np.ndarray, " n"]:
-        """Which rows carry a tag."""
-        ...
-
-    def column(self, name: str) -> Shaped[np.ndarray, " n"]:
-        """A column of numbers or names."""
-        ...
+    @property
+    def name(self) -> str:
+        """A readable name, unique within the source and valid as a file name."""
+        place = self.recording_name.replace("/", "_")
+        return f"{place}-{self.ego_id}-{self.start_tick}"
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Condition:
-    """A tag that is there or not, or a column compared with a value."""
+    """A tag that a scenario must or must not have, or a column compared with a value."""
 
     name: str
+    """Name of the tag or column."""
     operator: str
-    """`=` and `!=` for tags, too."""
+    """A key of `_OPERATORS`; of tags, `=` (has the tag) or `!=` (does not have it)."""
     value: float | str | None
     """None for tags."""
 
     def __str__(self) -> str:
-        """As it is written."""
         if self.value is None:
             return self.name if self.operator == "=" else f"!{self.name}"
         value = self.value if isinstance(self.value, str) else f"{self.value:g}"
@@ -76,24 +89,24 @@ class Condition:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class ScenarioFilter:
-    """Conditions of which every clause must hold; a clause holds where one of its conditions does.
+    """A conjunction of clauses, each of which is a disjunction of conditions.
 
-    In words: conditions with `,` between clauses and `|` between the conditions of one, such as
+    Written as text, `,` separates clauses and `|` the conditions of a clause, as in
     `left|right,yielding,!standing-start,length>=8,density>5,recording=00`. A condition is a tag
-    (`asp_env.data.scenarios.tags.TAGS`), a tag that is not there (`!tag`), or a column
-    (`asp_env.data.scenarios.tags.COLUMNS`; the unit may be left out) compared by one of
-    `>= <= > < = !=` with a number; `recording` and `location` are compared with names. Empty words
-    ask for nothing, so that every scenario fits.
+    (`asp_env.data.scenarios.tags.TAGS`), a negated tag (`!tag`), or a column
+    (`asp_env.data.scenarios.tags.COLUMNS`, with or without its unit) compared by one of
+    `>= <= > < = !=` with a number; `recording` and `location` are compared with names. The empty
+    text matches every scenario.
     """
 
     clauses: tuple[tuple[Condition, ...], ...]
 
     @classmethod
     def parse(cls, text: str) -> "ScenarioFilter":
-        """Reads the words.
+        """Parses a filter.
 
         Raises:
-            AspEnvError: they are not understood; names that are not known list those that are.
+            AspEnvError: the text is not a filter; for an unknown name, the message lists all names.
         """
         if not text.strip():
             return cls(clauses=())
@@ -105,127 +118,42 @@ class ScenarioFilter:
         )
 
     def __str__(self) -> str:
-        """The words, in one spelling."""
         return ",".join(map(_clause_text, self.clauses))
 
-    def holds(self, table: Table) -> Bool[np.ndarray, " n"]:
-        """(n,) which rows of a `ScenarioSet` fit."""
-        fits = np.ones(len(table), dtype=bool)
+    def matches(self, scenarios: "ScenarioSet") -> Bool[np.ndarray, " n"]:
+        """Mask of the scenarios that match."""
+        mask = np.ones(len(scenarios), dtype=bool)
         for clause in self.clauses:
-            fits &= _clause_holds(clause, table)
-        return fits
+            mask &= _clause_matches(clause, scenarios)
+        return mask
 
-    def explain(self, table: Table) -> str:
-        """How many rows each clause would leave by itself."""
+    def explain(self, scenarios: "ScenarioSet") -> str:
+        """The number of scenarios that each clause alone matches, as text."""
         counts = (
-            f"{_clause_text(clause)} {int(_clause_holds(clause, table).sum())}"
+            f"{_clause_text(clause)} {int(_clause_matches(clause, scenarios).sum())}"
             for clause in self.clauses
         )
         return ", ".join(counts)
 
 
-def _clause_text(clause: tuple[Condition, ...]) -> str:
-    return "|".join(map(str, clause))
-
-
-def _clause_holds(clause: tuple[Condition, ...], table: Table) -> Bool[np.ndarray, " n"]:
-    fits = np.zeros(len(table), dtype=bool)
-    for each in clause:
-        if each.value is None:
-            fits |= table.has(each.name) == (each.operator == "=")
-        else:
-            fits |= _COMPARE[each.operator](table.column(each.name), each.value)
-    return fits
-
-
-def _condition(words: str, text: str) -> Condition:
-    if words.startswith("!") or not set(words) & set("<>="):
-        tag = words.removeprefix("!").strip()
-        if not tag:
-            raise AspEnvError(
-                f"scenarios {text!r}: a condition is empty; expected tags and comparisons with "
-                "commas between them, such as left,length>=8"
-            )
-        if tag not in TAGS:
-            raise unknown_name("scenario tag", tag, TAGS)
-        return Condition(name=tag, operator="!=" if words.startswith("!") else "=", value=None)
-    match = _COMPARISON.fullmatch(words)
-    if match is None:
-        raise AspEnvError(
-            f"scenarios {text!r}: {words!r} is not understood; expected a tag, !tag, or a column "
-            "compared with a value, such as length>=8"
-        )
-    name, operator, value = (part.strip() for part in match.groups())
-    name = _SHORT.get(name, name)
-    if name in TEXTS:
-        return _text_condition(name, operator, value)
-    if name not in COLUMNS:
-        raise unknown_name("scenario column", name, (*COLUMNS, *TEXTS))
-    try:
-        number = float(value)
-    except ValueError:
-        number = math.nan
-    if math.isnan(number):
-        raise AspEnvError(f"scenarios {text!r}: {name}{operator}{value}: expected a number")
-    return Condition(name=name, operator=operator, value=number)
-
-
-def _text_condition(name: str, operator: str, value: str) -> Condition:
-    if operator not in ("=", "!=") or not value:
-        raise AspEnvError(
-            f"scenarios: {name}{operator}{value}: expected {name}=NAME or {name}!=NAME"
-        )
-    return Condition(name=name, operator=operator, value=value)
-
-
-MAX_LENGTH_S = 15.0
-MIN_LENGTH_S = 4.0
-MIN_DISTANCE_M = 10.0
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Scenario:
-    """One episode: an ego in a stretch of a recording."""
-
-    source: str
-    """DATA as the user named it."""
-    recording: int
-    """Index of the recording in its source."""
-    recording_name: str
-    start_tick: int
-    """The tick of the first observation; its history lies before it."""
-    length: int
-    """How many steps the recording provides after `start_tick`."""
-    ego_id: int
-    seed: int = 0
-    """Seeds the generator of this episode, for drivers that draw."""
-    tags: tuple[str, ...] = ()
-
-    @property
-    def name(self) -> str:
-        """A readable name, unique within the source, which may be a file's."""
-        place = self.recording_name.replace("/", "_")
-        return f"{place}-{self.ego_id}-{self.start_tick}"
-
-
 @dataclass(frozen=True, slots=True, kw_only=True)
 class ScenarioSet:
-    """Scenarios as a table of one row each, that can be filtered, sorted and sampled.
+    """A table of scenarios that can be filtered, sorted and sampled.
 
-    Rows are ordered by recording, track and start until they are ordered otherwise. A row is taken
-    as a `Scenario` by its number; columns are read as they are.
+    Rows are sorted by recording, track and start unless they have been sorted otherwise. An index
+    selects a row as a `Scenario`.
     """
 
     source: str
-    """DATA as the user named it."""
+    """The data as the user named them."""
     recordings: tuple[str, ...]
     """Names of the source's recordings."""
     locations: tuple[str, ...]
-    """Where each of them was made."""
+    """Location of each recording."""
     dt_s: float
     """Seconds per tick."""
     history: int
-    """Ticks of history before each start."""
+    """Number of ticks before each start that belong to the history."""
     recording: Int[np.ndarray, " n"]
     """Index into `recordings`."""
     ego_id: Int[np.ndarray, " n"]
@@ -233,16 +161,16 @@ class ScenarioSet:
     length: Int[np.ndarray, " n"]
     seed: Int[np.ndarray, " n"]
     tags: Bool[np.ndarray, "n tags"]
-    """Which of `TAGS` each has."""
+    """Which of `TAGS` each scenario has."""
     values: Float[np.ndarray, "n columns"]
-    """`COLUMNS` of each."""
+    """The `COLUMNS` of each scenario."""
 
     def __len__(self) -> int:
-        """How many there are."""
+        """Number of scenarios."""
         return len(self.recording)
 
     def __getitem__(self, index: int) -> Scenario:
-        """One of them."""
+        """The scenario of one row."""
         return Scenario(
             source=self.source,
             recording=int(self.recording[index]),
@@ -255,14 +183,14 @@ class ScenarioSet:
         )
 
     def __iter__(self) -> Iterator[Scenario]:
-        """All of them in order."""
+        """All scenarios in order."""
         return (self[index] for index in range(len(self)))
 
     def column(self, name: str) -> Shaped[np.ndarray, " n"]:
-        """One of `COLUMNS`, or `recording` or `location` as names.
+        """One of `COLUMNS`, or the names of the column `recording` or `location`.
 
         Raises:
-            AspEnvError: there is none of this name.
+            AspEnvError: the name is unknown.
         """
         if name in COLUMNS:
             return self.values[:, [*COLUMNS].index(name)]
@@ -272,21 +200,21 @@ class ScenarioSet:
         return np.array(texts[name], dtype=np.str_)[self.recording]
 
     def has(self, tag: str) -> Bool[np.ndarray, " n"]:
-        """Which of them carry a tag.
+        """Mask of the scenarios with a tag.
 
         Raises:
-            AspEnvError: there is no such tag.
+            AspEnvError: the tag is unknown.
         """
         if tag not in TAGS:
             raise unknown_name("scenario tag", tag, TAGS)
         return self.tags[:, TAGS.index(tag)]
 
     def counts(self) -> dict[str, int]:
-        """How many carry each tag."""
+        """Number of scenarios with each tag."""
         return dict(zip(TAGS, self.tags.sum(axis=0).tolist(), strict=True))
 
     def select(self, rows: Int[np.ndarray, " m"] | Bool[np.ndarray, " n"]) -> "ScenarioSet":
-        """The scenarios at some rows, in their order."""
+        """The scenarios at the given rows, in that order, or those of a mask."""
         return ScenarioSet(
             source=self.source,
             recordings=self.recordings,
@@ -302,43 +230,45 @@ class ScenarioSet:
             values=self.values[rows],
         )
 
-    def filtered(self, what: str | ScenarioFilter) -> "ScenarioSet":
-        """Those that fit, in their order, and with the seeds that they have.
+    def filtered(self, conditions: str | ScenarioFilter) -> "ScenarioSet":
+        """The scenarios that match a filter, in their order and with their seeds.
 
         Args:
-            what: a filter, or its words, such as `left,!standing-start,length>=8,density>5`.
+            conditions: a filter, as an object or as text, such as
+                `left,!standing-start,length>=8,density>5`.
 
         Raises:
-            AspEnvError: the words are not understood, or no scenario fits.
+            AspEnvError: the text is not a filter, or no scenario matches.
         """
-        wanted = ScenarioFilter.parse(what) if isinstance(what, str) else what
-        fits = wanted.holds(self)
-        if wanted.clauses and not fits.any():
+        if isinstance(conditions, str):
+            conditions = ScenarioFilter.parse(conditions)
+        mask = conditions.matches(self)
+        if conditions.clauses and not mask.any():
             raise AspEnvError(
-                f"scenarios {str(wanted)!r}: none of the {len(self)} of {self.source!r} fits "
-                f"(each condition alone: {wanted.explain(self)}); ask for less"
+                f"scenarios {str(conditions)!r}: none of the {len(self)} of {self.source!r} fits "
+                f"(each condition alone: {conditions.explain(self)}); use fewer conditions"
             )
-        return self.select(fits)
+        return self.select(mask)
 
     def tagged(self, tag: str) -> "ScenarioSet":
-        """Those that carry a tag; there may be none.
+        """The scenarios with a tag, possibly none.
 
         Raises:
-            AspEnvError: there is no such tag.
+            AspEnvError: the tag is unknown.
         """
         return self.select(self.has(tag))
 
     def sorted_by(self, column: str, *, descending: bool = False) -> "ScenarioSet":
-        """All of them by a column; those that are equal in it keep their order.
+        """All scenarios sorted by a column; the sort is stable.
 
         Raises:
-            AspEnvError: there is no such column.
+            AspEnvError: the column is unknown.
         """
         _, rank = np.unique(self.column(column), return_inverse=True)
         return self.select(np.argsort(-rank if descending else rank, kind="stable"))
 
     def sample(self, count: int, *, seed: int) -> "ScenarioSet":
-        """So many of them, drawn without replacement, in their order; all where there are fewer.
+        """At most `count` scenarios, sampled without replacement, in their order.
 
         Raises:
             AspEnvError: the count is less than 1.
@@ -349,20 +279,20 @@ class ScenarioSet:
         return self.select(np.sort(drawn))
 
     def evenly_spaced(self, count: int) -> "ScenarioSet":
-        """So many of them, evenly over all; all where there are fewer.
+        """At most `count` scenarios at evenly spaced rows.
 
         Raises:
             AspEnvError: the count is less than 1.
         """
         _check_count(count)
-        at = np.linspace(0, len(self) - 1, min(count, len(self))).round()
-        return self.select(at.astype(np.int64))
+        rows = np.linspace(0, len(self) - 1, min(count, len(self))).round()
+        return self.select(rows.astype(np.int64))
 
     def by_name(self, name: str) -> Scenario:
-        """The one that is called so.
+        """The scenario with a name.
 
         Raises:
-            AspEnvError: none is.
+            AspEnvError: no scenario has this name; the message lists similar ones.
         """
         names = [each.name for each in self]
         if name in names:
@@ -373,11 +303,6 @@ class ScenarioSet:
         )
 
 
-def _check_count(count: int) -> None:
-    if count < 1:
-        raise AspEnvError(f"{count} scenarios: expected at least 1")
-
-
 def find_scenarios(
     recordings: Sequence[Recording],
     *,
@@ -386,12 +311,21 @@ def find_scenarios(
     history: int,
     allowed: Sequence[Bool[np.ndarray, " _"]] | None = None,
 ) -> ScenarioSet:
-    """Every stretch of a vehicle's track that is worth driving.
+    """Finds all scenarios.
 
-    A track of a predicted class is cut, from the first tick with `history` ticks behind it, into
-    windows of at most 15 s without overlap; those of at least 4 s in which the vehicle covers at
-    least 10 m are kept, with the tags and columns of `asp_env.data.scenarios.tags`. With `allowed`,
-    scenarios and their histories keep to the ticks that are so marked in each recording.
+    Each track of a predicted class that is not parked is cut into consecutive windows of at most
+    15 s, from the first tick that has a full history. Windows of at least 4 s in which the vehicle
+    drives at least 10 m become scenarios.
+
+    Args:
+        recordings: the recordings.
+        source: the data as the user named them.
+        dt_s: seconds per tick.
+        history: number of ticks of history before each start.
+        allowed: of each recording, a mask of the ticks that scenarios and histories may use.
+
+    Returns:
+        The scenarios with their tags and columns, sorted by recording, track and start.
     """
     found = []
     for number, recording in enumerate(recordings):
@@ -402,9 +336,9 @@ def find_scenarios(
             windows = _windows(first, last, history, dt_s, ticks_allowed)
             found += [(number, track, start, length) for start, length in windows]
     rows = np.array(found, dtype=np.int64).reshape(-1, 4)
-    every = make_scenarios(recordings, rows, source=source, dt_s=dt_s, history=history)
-    worth = every.select(every.column("distance_m") >= MIN_DISTANCE_M)
-    return dataclasses.replace(worth, seed=np.arange(len(worth)))
+    scenarios = make_scenarios(recordings, rows, source=source, dt_s=dt_s, history=history)
+    scenarios = scenarios.select(scenarios.column("distance_m") >= MIN_DISTANCE_M)
+    return dataclasses.replace(scenarios, seed=np.arange(len(scenarios)))
 
 
 def make_scenarios(
@@ -416,24 +350,24 @@ def make_scenarios(
     history: int,
     seeds: Int[np.ndarray, " n"] | None = None,
 ) -> ScenarioSet:
-    """The table of some scenarios, with their tags and columns.
+    """A table of given scenarios, with their tags and columns.
 
     Args:
-        recordings: where they are.
-        rows: (recording, track, start tick, length) of each, both indices; within the track.
-        source: DATA as the user named it.
+        recordings: the recordings.
+        rows: recording index, track index, start tick and length of each; all within the track.
+        source: the data as the user named them.
         dt_s: seconds per tick.
-        history: ticks of history before each start.
-        seeds: of the episodes; numbers from 0 on by default.
+        history: number of ticks of history before each start.
+        seeds: seeds of the episodes, by default 0, 1, 2, …
     """
     tags = np.zeros((len(rows), len(TAGS)), dtype=bool)
     values = np.zeros((len(rows), len(COLUMNS)))
     ego_ids = np.zeros(len(rows), dtype=np.int64)
     for number in np.unique(rows[:, 0]).tolist():
-        mine, recording = rows[:, 0] == number, recordings[number]
+        mask, recording = rows[:, 0] == number, recordings[number]
         stride = frames_per_tick(recording.frame_rate_hz, dt_s)
-        tags[mine], values[mine] = describe(recording, *rows[mine, 1:].T, stride=stride)
-        ego_ids[mine] = recording.track_ids[rows[mine, 1]]
+        tags[mask], values[mask] = describe(recording, *rows[mask, 1:].T, stride=stride)
+        ego_ids[mask] = recording.track_ids[rows[mask, 1]]
     return ScenarioSet(
         source=source,
         recordings=tuple(recording.name for recording in recordings),
@@ -451,7 +385,13 @@ def make_scenarios(
 
 
 def track_ticks(recording: Recording, track: int, stride: int) -> tuple[int, int]:
-    """The first and the last tick at which a track is seen."""
+    """The first and the last tick of a track.
+
+    Args:
+        recording: the recording.
+        track: index of the track.
+        stride: frames per tick.
+    """
     first = -(-int(recording.first_frames[track]) // stride)
     return first, int(recording.last_frames[track]) // stride
 
@@ -459,10 +399,72 @@ def track_ticks(recording: Recording, track: int, stride: int) -> tuple[int, int
 def _windows(
     first: int, last: int, history: int, dt_s: float, allowed: Bool[np.ndarray, " ticks"] | None
 ) -> Iterator[tuple[int, int]]:
-    """(start, length) of the windows in every allowed stretch of the ticks first to last."""
+    """(start, length) of the windows within the allowed ones of the ticks first to last."""
     longest, shortest = int(MAX_LENGTH_S / dt_s + 1e-6), math.ceil(MIN_LENGTH_S / dt_s - 1e-6)
-    marked = np.ones(last - first + 1, dtype=bool) if allowed is None else allowed[first : last + 1]
-    edges = np.flatnonzero(np.diff(marked, prepend=False, append=False)) + first
+    usable = np.ones(last - first + 1, dtype=bool) if allowed is None else allowed[first : last + 1]
+    edges = np.flatnonzero(np.diff(usable, prepend=False, append=False)) + first
     for begin, end in edges.reshape(-1, 2).tolist():
         for start in range(begin + history, end - shortest, longest):
             yield start, min(longest, end - 1 - start)
+
+
+def _check_count(count: int) -> None:
+    if count < 1:
+        raise AspEnvError(f"{count} scenarios: expected at least 1")
+
+
+def _clause_text(clause: tuple[Condition, ...]) -> str:
+    return "|".join(map(str, clause))
+
+
+def _clause_matches(
+    clause: tuple[Condition, ...], scenarios: ScenarioSet
+) -> Bool[np.ndarray, " n"]:
+    mask = np.zeros(len(scenarios), dtype=bool)
+    for each in clause:
+        if each.value is None:
+            mask |= scenarios.has(each.name) == (each.operator == "=")
+        else:
+            mask |= _OPERATORS[each.operator](scenarios.column(each.name), each.value)
+    return mask
+
+
+def _condition(part: str, text: str) -> Condition:
+    """Parses one condition of the filter `text`."""
+    if part.startswith("!") or not set(part) & set("<>="):
+        tag = part.removeprefix("!").strip()
+        if not tag:
+            raise AspEnvError(
+                f"scenarios {text!r}: a condition is empty; expected tags and comparisons with "
+                "commas between them, such as left,length>=8"
+            )
+        if tag not in TAGS:
+            raise unknown_name("scenario tag", tag, TAGS)
+        return Condition(name=tag, operator="!=" if part.startswith("!") else "=", value=None)
+    match = _COMPARISON.fullmatch(part)
+    if match is None:
+        raise AspEnvError(
+            f"scenarios {text!r}: {part!r} is not understood; expected a tag, !tag, or a column "
+            "compared with a value, such as length>=8"
+        )
+    name, operator, value = (group.strip() for group in match.groups())
+    name = _COLUMN_OF.get(name, name)
+    if name in TEXT_COLUMNS:
+        return _text_condition(name, operator, value)
+    if name not in COLUMNS:
+        raise unknown_name("scenario column", name, (*COLUMNS, *TEXT_COLUMNS))
+    try:
+        number = float(value)
+    except ValueError:
+        number = math.nan
+    if math.isnan(number):
+        raise AspEnvError(f"scenarios {text!r}: {name}{operator}{value}: expected a number")
+    return Condition(name=name, operator=operator, value=number)
+
+
+def _text_condition(name: str, operator: str, value: str) -> Condition:
+    if operator not in ("=", "!=") or not value:
+        raise AspEnvError(
+            f"scenarios: {name}{operator}{value}: expected {name}=NAME or {name}!=NAME"
+        )
+    return Condition(name=name, operator=operator, value=value)

@@ -1,48 +1,48 @@
-"""Roundabouts of a map: rings of lanes that lead into one another around a common centre.
+"""Tags and measures of scenarios, computed from the recording by exact rules.
 
-Lanes are of one ring where each can be reached from the other along successors. They make a
-roundabout if nine tenths of their length turns about its middle, in one sense, within 35° of the
-direction that a circle about it has there, and no point is over 100 m or over three times as far
-from the middle as another.
+Only the ticks of the scenario count, from the first observation to the last tick. The ego's route
+is its recorded track until that ends, then straight on (`asp_env.geometry.route_along`). "Other
+agents" are all except parked ones. An agent is *on the route* while its centre is nearer to the
+route than half the sum of both widths. A *leader* is a vehicle or bicycle on the route ahead of the
+ego that heads within 45° of the route or stands. An agent *enters the route from the side* at a
+tick if it is on the route, was not on it one tick before, is ahead of the ego's front on the
+recorded part of the route, and moves at 0.5 m/s or more at an angle of at least 20° to the route,
+in either direction.
 
-MERGED: The rules of `asp_env.data.scenarios.tags`, compiled, with their thresholds.
+`left`, `right`, `straight`: the heading turns by more than 30° to the left in total, to the right,
+    or by less; every scenario has one of these. Headings below 0.5 m/s are ignored.
+`u-turn`: the heading turns by more than 150° in total, and the scenario is no `roundabout`.
+`standing-start`: the ego is slower than 0.5 m/s at the first tick.
+`stopping`: the ego stands, below 0.5 m/s, for at least 1 s without interruption, after it has
+    driven at 2 m/s or more.
+`following`: at more than half of the ticks at which the ego drives at 0.5 m/s or more, there is a
+    leader, and the gap to it is at most 3 s at the ego's speed, or at most 5 m.
+`yielding`: an agent enters the route from the side at most 20 m ahead of the ego's front, with no
+    leader in between, and the ego's front reaches that place up to 5 s after the agent was last on
+    the route at an angle of at least 20° to it. Between 3 s before the agent entered and the ego's
+    arrival, the ego is slowest no later than 1 s after the agent was last on the route. Its speed
+    is then below 0.5 m/s or at most 0.6 of its highest speed in the 5 s before, and it arrives at
+    least 1 m/s faster than that.
+`crossing-vru`: a pedestrian, bicycle or animal crosses the centre of the recorded route at most
+    30 m ahead of the ego's front, at 0.5 m/s or more and at an angle of at least 30° to the route,
+    in either direction.
+`roundabout`: the ego drives at least 10 m along a roundabout of the map, within 2 m of the centre
+    line of one of its lanes and heading within 45° of it.
+`roundabout-entry`, `roundabout-exit`: a `roundabout` that the ego enters; that it leaves.
 
-All kernels of one file, because numba's cache watches only the file of the kernel that is called
-from Python; `project` alone is everybody's.
-MERGED: What happens in a scenario, as the recording shows it: tags and measures, by exact rules.
+Recordings have no traffic signals, so waiting at a signal while others cross is `yielding`, too.
 
-All rules look at the ticks of the drive alone, the first observation and the last tick included.
-The ego's way is where it went until its track ends, then straight on (`route_along`). Others are
-road users that are not parked. One is on the way while its centre is nearer to it than half of both
-widths together, and a leader if it is a vehicle or bicycle on the way ahead that heads within 45°
-of it or stands. One comes onto the way from the side if it was not on it one tick before and is
-now, ahead of the ego's front, where the way is a recorded one, at 0.5 m/s or more and at an angle
-of at least 20° to it, in either sense.
+A roundabout is a ring of lanes, each of which leads to the others along successors, around a common
+centre. On at least nine tenths of its points the direction of travel, all clockwise or all
+counter-clockwise, is within 35° of the tangent of a circle about the ring's centroid. No point is
+more than 100 m from the centroid, or more than three times as far as another point.
 
-`left`, `right`, `straight`: the heading turns by over 30° in all to the left, to the right, or by
-    less; every scenario has one of them. Headings below 0.5 m/s do not count.
-`u-turn`: it turns by over 150° in all, and the scenario is no `roundabout`.
-`standing-start`: below 0.5 m/s at the first tick.
-`stopping`: stands, below 0.5 m/s, for at least 1 s in a row after having driven at 2 m/s or more.
-`following`: at over half of the ticks at which the ego drives at 0.5 m/s or more there is a leader,
-    and the gap to it is at most 3 s at the ego's speed, or at most 5 m.
-`yielding`: somebody comes onto the way from the side at most 20 m ahead of the ego's front, with no
-    leader in between, and the ego's front gets to that place within 5 s after the other was last on
-    the way at an angle of at least 20° to it. From 3 s before the other came until it gets there
-    the ego is slowest no later than 1 s after that, below 0.5 m/s or at 0.6 or less of its highest
-    speed in the 5 s before, and it gets there at least 1 m/s faster.
-`crossing-vru`: a pedestrian, bicycle or animal passes over the middle of the way at most 30 m ahead
-    of the ego's front, where the way is a recorded one, at 0.5 m/s or more and at an angle of at
-    least 30° to it, in either sense.
-`roundabout`: drives at least 10 m along a ring of the map (`asp_env.data.scenarios.tags`), within
-    2 m of the middle of one of its lanes and heading within 45° of it.
-`roundabout-entry`, `roundabout-exit`: a `roundabout` in which it comes onto the ring; leaves it.
-
-Signals are in no recording, so who waits at one while others cross is `yielding`, too.
+All kernels are in this file, because numba's cache checks only the file of the kernel that Python
+calls; `asp_env.geometry` is the exception.
 """
 
 import math
-from typing import no_type_check
+from typing import NamedTuple, no_type_check
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
@@ -51,343 +51,80 @@ from numba import njit
 from asp_env.data.classes import PREDICTED, VULNERABLE, AgentClass
 from asp_env.data.recording import Recording
 from asp_env.data.road_map import RoadMap
-from asp_env.geometry import project, resample, route_along
-
-MAX_RADIUS_M = 100.0
-MAX_RADIUS_RATIO = 3.0
-SHARE_ALONG = 0.9
-RING_ALONG_RAD = np.radians(35)
-
-
-def ring_points(road_map: RoadMap) -> Float[np.ndarray, "points 3"]:
-    """[x m, y m, direction rad] at most 1 m apart along the lanes of all roundabouts of a map."""
-    found = [np.zeros((0, 3))]
-    for ring in _rings(road_map):
-        lanes = [_directed(road_map.lanes[int(lane)]) for lane in np.flatnonzero(ring)]
-        points = np.concatenate(lanes)
-        if _turns_about_its_middle(points):
-            found.append(points)
-    return np.concatenate(found)
-
-
-def _rings(road_map: RoadMap) -> list[Bool[np.ndarray, " lanes"]]:
-    """Which lanes each ring has: strongly connected parts of the graph of successors."""
-    count = len(road_map.lanes)
-    reach = np.zeros((count, count), dtype=bool)
-    reach[road_map.successors[:, 0], road_map.successors[:, 1]] = True
-    for _ in range(max(count, 1).bit_length()):
-        reach |= (reach.astype(np.float32) @ reach.astype(np.float32)) > 0
-    mutual = reach & reach.T
-    rings, seen = [], np.zeros(count, dtype=bool)
-    for lane in np.flatnonzero(mutual.diagonal()):
-        if not seen[lane]:
-            rings.append(mutual[lane])
-            seen |= mutual[lane]
-    return rings
-
-
-def _directed(lane: Float[np.ndarray, "n 2"]) -> Float[np.ndarray, "m 3"]:
-    """Points about 1 m apart with the direction to the next."""
-    points = np.concatenate([resample(lane, 1.0), lane[-1:]])
-    step = np.diff(points, axis=0)
-    direction = np.arctan2(step[:, 1], step[:, 0])
-    return np.column_stack([points[:-1], direction])
-
-
-def _turns_about_its_middle(points: Float[np.ndarray, "n 3"]) -> bool:
-    out = points[:, :2] - points[:, :2].mean(axis=0)
-    radius = np.hypot(*out.T)
-    if radius.max() > MAX_RADIUS_M or radius.max() > MAX_RADIUS_RATIO * radius.min():
-        return False
-    # sine of the angle from the way out to the direction: 1 where it turns left about the middle
-    across = (out[:, 0] * np.sin(points[:, 2]) - out[:, 1] * np.cos(points[:, 2])) / radius
-    limit = np.cos(RING_ALONG_RAD)
-    return bool(max((across >= limit).mean(), (across <= -limit).mean()) >= SHARE_ALONG)
-
-
-TURN_RAD = math.pi / 6
-U_TURN_RAD = math.radians(150)
-STANDING_MPS = 0.5
-STANDS_FOR_S = 1.0
-DRIVEN_MPS = 2.0
-LEADER_S = 3.0
-LEADER_M = 5.0
-ALONG_RAD = math.pi / 4
-FROM_SIDE_RAD = math.radians(20)
-ACROSS_RAD = math.radians(30)
-YIELDS_WITHIN_M = 20.0
-YIELDS_BEFORE_S = 3.0
-YIELDS_AFTER_S = 5.0
-SLOWEST_AFTER_S = 1.0
-SLOWED_SHARE = 0.6
-SLOWED_OVER_S = 5.0
-GOES_ON_MPS = 1.0
-CROSSES_WITHIN_M = 30.0
-RING_M = 10.0
-RING_HALF_WIDTH_M = 2.0
-DENSE_WITHIN_M = 30.0
-
-BEYOND_M = 60.0
-"""The way goes on straight for this far where the track ends."""
-LEADER_BIT, VULNERABLE_BIT, PRESENT_BIT = 1, 2, 4
-"""What a track may be to an ego, as bits."""
-
-_NEAR_WAY_M = 8.0
-"""Whoever is further from the way than this is no more than off it."""
-_LOOK_AHEAD_M = 60
-_LONGEST_M = 25
-"""Centres are further apart than bumpers by this at most."""
-_LOOK_BACK_M = 10
-_COARSE_M = 4
-"""Who is near the way is told from every fourth of its points, and where by all."""
-_ROUNDING = 1e-6
-
-(
-    _LEFT, _RIGHT, _STRAIGHT, _U_TURN, _STANDING_START, _STOPPING, _FOLLOWING, _YIELDING,
-    _CROSSING_VRU, _ROUNDABOUT, _ENTRY, _EXIT,
-) = range(12)  # fmt: skip
-_LENGTH, _DISTANCE, _FASTEST, _TURN, _DENSITY, _AGENTS = range(6)
-
-
-@njit(cache=True)
-@no_type_check
-def describe_all(
-    states, starts, first, last, sizes, roles, tracks, ticks, lengths, stride, dt_s,
-    ways, way_starts, ring, tags, values,
-):  # fmt: skip
-    """Fills tags and values of some drives in one recording.
-
-    Args:
-        states: (rows, 4) of all tracks.
-        starts: (tracks + 1,) row of each track's first state.
-        first: (tracks,) first frames.
-        last: (tracks,) last frames.
-        sizes: (tracks, 2) length and width, m.
-        roles: (tracks,) bits; 0 for who is left out.
-        tracks: (n,) of the egos.
-        ticks: (n,) of the first observations.
-        lengths: (n,) in ticks.
-        stride: frames per tick.
-        dt_s: seconds per tick.
-        ways: points of all egos' ways, 1 m apart, back to back.
-        way_starts: (n + 1,) where each begins.
-        ring: (points, 3) of roundabouts, [x, y, direction].
-        tags: (n, tags) receives.
-        values: (n, columns) receives.
-    """
-    for i in range(len(tracks)):
-        e, count, frame = tracks[i], lengths[i] + 1, ticks[i] * stride
-        row = starts[e] + frame - first[e]
-        ego = states[row : row + (count - 1) * stride + 1 : stride]
-        way = ways[way_starts[i] : way_starts[i + 1]]
-        arcs = np.empty(count)
-        near = 0.0
-        for t in range(count):
-            if t > 0:
-                near += math.hypot(ego[t, 0] - ego[t - 1, 0], ego[t, 1] - ego[t - 1, 1])
-            arcs[t], _, _ = project(way, len(way), ego[t, 0], ego[t, 1], near, 15.0)
-            near = max(arcs[t], 0.0)
-        _alone(ego, dt_s, tags[i], values[i])
-        _on_rings(ego, ring, tags[i])
-        tags[i, _U_TURN] &= not tags[i, _ROUNDABOUT]
-        end = frame + (count - 1) * stride
-        others = np.flatnonzero((roles > 0) & (first <= end) & (last >= frame))
-        others = others[others != e]
-        placed = np.full((len(others), count, 4), np.nan)
-        within = 0
-        for k in range(len(others)):
-            o = others[k]
-            rows = states[starts[o] : starts[o + 1]]
-            seen, close = _place(rows, first[o], frame, stride, ego, arcs, way, placed[k])
-            values[i, _AGENTS] += seen
-            within += close
-        values[i, _DENSITY] = within / count
-        # the way as it was recorded ends where the straight piece begins
-        way_end = len(way) - 1 - BEYOND_M
-        widths = 0.5 * (sizes[e, 1] + sizes[others, 1])
-        leader = _leaders(ego, arcs, sizes[e], sizes[others], roles[others], placed, tags[i])
-        for k in range(len(others)):
-            vulnerable = (roles[others[k]] & VULNERABLE_BIT) > 0
-            _crossings(
-                ego, arcs, 0.5 * sizes[e, 0], way_end, widths[k], vulnerable, placed[k], leader,
-                dt_s, tags[i],
-            )  # fmt: skip
-
-
-@njit(cache=True)
-@no_type_check
-def _wrap(angle):
-    return (angle + math.pi) % (2.0 * math.pi) - math.pi
-
-
-@njit(cache=True)
-@no_type_check
-def _alone(ego, dt_s, tags, values):
-    """Turns, standing, stopping, and measures."""
-    count, turned, distance, fastest = len(ego), 0.0, 0.0, 0.0
-    driven, stood, heading = False, 0, math.nan
-    for t in range(count):
-        if t > 0:
-            distance += math.hypot(ego[t, 0] - ego[t - 1, 0], ego[t, 1] - ego[t - 1, 1])
-        speed = abs(ego[t, 3])
-        if speed >= STANDING_MPS:
-            if not math.isnan(heading):
-                turned += _wrap(ego[t, 2] - heading)
-            heading = ego[t, 2]
-        fastest = max(fastest, speed)
-        driven |= speed >= DRIVEN_MPS
-        stood = stood + 1 if speed < STANDING_MPS else 0
-        # n ticks in a row span n - 1 steps
-        tags[_STOPPING] |= driven and (stood - 1) * dt_s >= STANDS_FOR_S - _ROUNDING
-    tags[_LEFT], tags[_RIGHT] = turned > TURN_RAD, turned < -TURN_RAD
-    tags[_STRAIGHT] = abs(turned) <= TURN_RAD
-    tags[_U_TURN] = abs(turned) > U_TURN_RAD
-    tags[_STANDING_START] = abs(ego[0, 3]) < STANDING_MPS
-    values[_LENGTH], values[_DISTANCE] = (count - 1) * dt_s, distance
-    values[_FASTEST], values[_TURN] = fastest, math.degrees(turned)
-
-
-@njit(cache=True)
-@no_type_check
-def _on_rings(ego, ring, tags):
-    """Roundabouts: where it drives along their lanes."""
-    along_m, was_on, enters, leaves = 0.0, False, False, False
-    for t in range(len(ego)):
-        x, y, heading = ego[t, 0], ego[t, 1], ego[t, 2]
-        on = False
-        for j in range(len(ring)):
-            dx, dy = ring[j, 0] - x, ring[j, 1] - y
-            if dx * dx + dy * dy <= RING_HALF_WIDTH_M * RING_HALF_WIDTH_M:
-                on |= abs(_wrap(ring[j, 2] - heading)) <= ALONG_RAD
-        if t > 0:
-            enters |= on and not was_on
-            leaves |= was_on and not on
-            if on and was_on:
-                along_m += math.hypot(x - ego[t - 1, 0], y - ego[t - 1, 1])
-        was_on = on
-    tags[_ROUNDABOUT] = along_m >= RING_M
-    tags[_ENTRY] = enters and along_m >= RING_M
-    tags[_EXIT] = leaves and along_m >= RING_M
-
-
-@njit(cache=True)
-@no_type_check
-def _place(rows, first, frame, stride, ego, arcs, way, placed):
-    """Where another is along the ego's way; (whether it is there at all, at how many ticks near).
-
-    `placed` (ticks, 4) receives arc length, offset, angle to the way and speed: not a number where
-    it is not there, an infinite offset where it is far from the way.
-    """
-    seen, close = False, 0
-    for t in range(len(ego)):
-        at = frame + t * stride - first
-        if at < 0 or at >= len(rows):
-            continue
-        seen = True
-        x, y = rows[at, 0], rows[at, 1]
-        close += math.hypot(x - ego[t, 0], y - ego[t, 1]) <= DENSE_WITHIN_M
-        placed[t, 1] = np.inf
-        nearest, best = 0, np.inf
-        low = max(0, int(arcs[t]) - _LOOK_BACK_M)
-        ahead = max(_LOOK_AHEAD_M, int(LEADER_S * ego[t, 3]) + _LONGEST_M)
-        for j in range(low, min(len(way), int(arcs[t]) + ahead), _COARSE_M):
-            dx, dy = way[j, 0] - x, way[j, 1] - y
-            if dx * dx + dy * dy < best:
-                nearest, best = j, dx * dx + dy * dy
-        if best <= _NEAR_WAY_M * _NEAR_WAY_M:
-            arc, offset, heading = project(way, len(way), x, y, nearest, 2.0 * _COARSE_M)
-            placed[t, 0], placed[t, 1] = arc, offset
-            placed[t, 2], placed[t, 3] = _wrap(rows[at, 2] - heading), rows[at, 3]
-    return seen, close
-
-
-@njit(cache=True)
-@no_type_check
-def _leaders(ego, arcs, size, sizes, roles, placed, tags):
-    """Following; (ticks,) arc length of the nearest leader, infinite where nobody leads."""
-    nearest = np.full(len(ego), np.inf)
-    moves, follows = 0, 0
-    for t in range(len(ego)):
-        gap = np.inf
-        for k in range(len(placed)):
-            arc, offset, angle, speed = placed[k, t]
-            on_way = abs(offset) < 0.5 * (size[1] + sizes[k, 1]) and arc > arcs[t]
-            along = abs(angle) < ALONG_RAD or abs(speed) < STANDING_MPS
-            if on_way and along and roles[k] & LEADER_BIT:
-                nearest[t] = min(nearest[t], arc)
-                gap = min(gap, arc - arcs[t] - 0.5 * (size[0] + sizes[k, 0]))
-        if ego[t, 3] >= STANDING_MPS:
-            moves += 1
-            follows += gap <= max(LEADER_S * ego[t, 3], LEADER_M)
-    tags[_FOLLOWING] = follows * 2 > moves
-    return nearest
-
-
-@njit(cache=True)
-@no_type_check
-def _moves_off(placed, least):
-    """Whether it moves at an angle to the way, neither along nor against it."""
-    return least <= abs(placed[2]) <= math.pi - least and abs(placed[3]) >= STANDING_MPS
-
-
-@njit(cache=True)
-@no_type_check
-def _crossings(ego, arcs, front, way_end, reach, vulnerable, placed, leader, dt_s, tags):
-    """Crossing and yielding: one other road user, which is on the way within `reach` of it."""
-    for t in range(1, len(ego)):
-        arc, offset, before = placed[t, 0], placed[t, 1], placed[t - 1, 1]
-        ahead = arc - arcs[t] - front
-        if not (_moves_off(placed[t], FROM_SIDE_RAD) and ahead > 0.0 and arc <= way_end):
-            continue
-        # over the middle, not from one side of a bend to the other
-        over = before * offset <= 0.0 and abs(before - offset) <= _NEAR_WAY_M
-        over &= _moves_off(placed[t], ACROSS_RAD) and ahead <= CROSSES_WITHIN_M
-        tags[_CROSSING_VRU] |= vulnerable and over
-        comes = abs(before) >= reach and abs(offset) < reach
-        if comes and ahead <= YIELDS_WITHIN_M and arc <= leader[t]:
-            cleared = t
-            while cleared + 1 < len(ego) and abs(placed[cleared + 1, 1]) < reach:
-                if abs(placed[cleared + 1, 2]) < FROM_SIDE_RAD:
-                    break
-                cleared += 1
-            tags[_YIELDING] |= _yields(ego[:, 3], arcs, arc - front, t, cleared, dt_s)
-
-
-@njit(cache=True)
-@no_type_check
-def _yields(speeds, arcs, place_m, came, cleared, dt_s):
-    """Whether the ego slows for who came at one tick and was last on its way at another."""
-    there = came
-    while there < len(arcs) and arcs[there] < place_m:
-        there += 1
-    late = (there - cleared) * dt_s
-    if there == len(arcs) or not 0.0 < late <= YIELDS_AFTER_S + _ROUNDING:
-        return False
-    slowest = max(0, came - int(YIELDS_BEFORE_S / dt_s + _ROUNDING))
-    slowest += np.argmin(speeds[slowest : there + 1])
-    slow = speeds[slowest]
-    before = max(0, slowest - int(SLOWED_OVER_S / dt_s + _ROUNDING))
-    slowed = slow < STANDING_MPS or slow <= SLOWED_SHARE * speeds[before : slowest + 1].max()
-    in_time = (slowest - cleared) * dt_s <= SLOWEST_AFTER_S + _ROUNDING
-    return slowed and in_time and speeds[there] >= slow + GOES_ON_MPS
-
+from asp_env.geometry import project, resample, route_along, wrap_scalar
 
 TAGS = (
     *("left", "right", "straight", "u-turn"),
     *("standing-start", "stopping", "following", "yielding", "crossing-vru"),
     *("roundabout", "roundabout-entry", "roundabout-exit"),
 )
-"""In the order of the rules' columns."""
+"""Names of the tags, in the order of the columns of `describe`."""
 
 COLUMNS = {
-    "length_s": "how long the recording goes on after the first observation",
-    "distance_m": "how far the ego goes",
-    "max_speed_mps": "its highest speed",
-    "turn_deg": "by how much its heading turns in all while it does not stand, left positive",
-    "density": "how many others are within 30 m of it, on average over the ticks",
-    "agents": "how many others are there at any tick",
+    "length_s": "how long the recording continues after the first observation",
+    "distance_m": "distance that the ego drives",
+    "max_speed_mps": "highest speed of the ego",
+    "turn_deg": "total change of the ego's heading while it does not stand, left positive",
+    "density": "number of other agents within 30 m of the ego, mean over the ticks",
+    "agents": "number of other agents that are present at any tick",
 }
-"""Measures and what they are, in the order of the rules' columns."""
+"""Names of the measures with their descriptions, in the order of the columns of `describe`."""
+
+# Thresholds of the rules above, chosen by hand. Those that appear in the rules have no other text.
+
+TURN_RAD = math.pi / 6
+"""A change of heading beyond this is a turn."""
+
+U_TURN_RAD = math.radians(150)
+
+MANOEUVRE_STANDING_MPS = 0.5
+"""Agents slower than this stand, as far as tags are concerned; their headings are ignored."""
+
+STOP_DURATION_S = 1.0
+DRIVING_MPS = 2.0
+LEADER_GAP_S = 3.0
+LEADER_GAP_M = 5.0
+SAME_DIRECTION_RAD = math.pi / 4
+SIDE_ENTRY_RAD = math.radians(20)
+CROSSING_RAD = math.radians(30)
+YIELD_AHEAD_M = 20.0
+YIELD_BEFORE_S = 3.0
+YIELD_ARRIVAL_S = 5.0
+YIELD_SLOWEST_S = 1.0
+YIELD_SPEED_SHARE = 0.6
+YIELD_SPEED_OVER_S = 5.0
+YIELD_SPEED_GAIN_MPS = 1.0
+CROSSING_AHEAD_M = 30.0
+ROUNDABOUT_M = 10.0
+ROUNDABOUT_HALF_WIDTH_M = 2.0
+DENSITY_RADIUS_M = 30.0
+MAX_RADIUS_M = 100.0
+MAX_RADIUS_RATIO = 3.0
+TANGENTIAL_SHARE = 0.9
+TANGENTIAL_RAD = np.radians(35)
+
+BEYOND_M = 60.0
+"""The route continues straight for this far beyond the end of the track."""
+
+_LEADER_BIT, _VULNERABLE_BIT, _PRESENT_BIT = 1, 2, 4
+
+_NEAR_ROUTE_M = 8.0
+"""Agents farther from the route than this are not projected onto it."""
+_LOOK_AHEAD_M = 60
+"""Agents are projected onto at least this length of the route ahead of the ego."""
+_LONGEST_M = 25
+"""Longest distance between a centre and a bumper, for both vehicles together."""
+_LOOK_BACK_M = 10
+"""Agents are projected onto this length of the route behind the ego."""
+_COARSE_M = 4
+"""Spacing of the points of the route of which the nearest is found before the exact projection."""
+_ROUNDING = 1e-6
+
+(
+    _LEFT, _RIGHT, _STRAIGHT, _U_TURN, _STANDING_START, _STOPPING, _FOLLOWING, _YIELDING,
+    _CROSSING_VRU, _ROUNDABOUT, _ENTRY, _EXIT,
+) = range(12)  # fmt: skip
+_LENGTH, _DISTANCE, _MAX_SPEED, _TURN, _DENSITY, _AGENTS = range(6)
 
 
 def describe(
@@ -398,49 +135,412 @@ def describe(
     *,
     stride: int,
 ) -> tuple[Bool[np.ndarray, "n tags"], Float[np.ndarray, "n columns"]]:
-    """(n, `TAGS`) and (n, `COLUMNS`) of some drives of a recording.
+    """Tags and measures of scenarios of one recording.
 
     Args:
-        recording: where they are.
+        recording: the recording.
         tracks: indices of the egos' tracks.
-        start_ticks: of the first observations.
-        lengths: in ticks; all of these must be within the egos' tracks.
+        start_ticks: ticks of the first observations.
+        lengths: lengths in ticks; all ticks must be within the egos' tracks.
         stride: frames per tick.
+
+    Returns:
+        Which of `TAGS` each scenario has, and its `COLUMNS`.
     """
     tags = np.zeros((len(tracks), len(TAGS)), dtype=bool)
     values = np.zeros((len(tracks), len(COLUMNS)))
     first = recording.first_frames.astype(np.int64)
-    ways = [np.zeros((0, 2), dtype=np.float32)]
+    routes = [np.zeros((0, 2), dtype=np.float32)]
     for track, tick in zip(tracks.tolist(), start_ticks.tolist(), strict=True):
         ahead = recording.track(track)[tick * stride - first[track] :: stride]
-        ways.append(route_along(ahead, beyond_m=BEYOND_M))
-    describe_all(
-        np.array(recording.states),  # copies of what may be read-only: one kernel for all
-        recording.starts.astype(np.int64),
-        first,
-        recording.last_frames.astype(np.int64),
-        np.array(recording.sizes),
-        _roles(recording),
-        tracks.astype(np.int64),
-        start_ticks.astype(np.int64),
-        lengths.astype(np.int64),
+        routes.append(route_along(ahead, beyond_m=BEYOND_M))
+    _describe_all(
+        _Tracks(
+            states=np.array(recording.states),  # copies of read-only arrays: one compiled kernel
+            starts=recording.starts.astype(np.int64),
+            first=first,
+            last=recording.last_frames.astype(np.int64),
+            sizes=np.array(recording.sizes),
+            roles=_roles(recording),
+        ),
+        _Drives(
+            tracks=tracks.astype(np.int64),
+            ticks=start_ticks.astype(np.int64),
+            lengths=lengths.astype(np.int64),
+            routes=np.concatenate(routes),
+            route_starts=np.cumsum([len(route) for route in routes]),
+        ),
         stride,
         stride / recording.frame_rate_hz,
-        np.concatenate(ways),
-        np.cumsum([len(way) for way in ways]),
-        ring_points(recording.road_map),
+        roundabout_points(recording.road_map),
         tags,
         values,
     )
     return tags, values
 
 
+def roundabout_points(road_map: RoadMap) -> Float[np.ndarray, "points 3"]:
+    """Points at most 1 m apart on the lanes of all roundabouts of a map.
+
+    Returns:
+        [x m, y m, direction of travel rad].
+    """
+    found = [np.zeros((0, 3))]
+    for ring in _rings(road_map):
+        lanes = [_directed(road_map.lanes[int(lane)]) for lane in np.flatnonzero(ring)]
+        points = np.concatenate(lanes)
+        if _is_circular(points):
+            found.append(points)
+    return np.concatenate(found)
+
+
+def _rings(road_map: RoadMap) -> list[Bool[np.ndarray, " lanes"]]:
+    """Masks of the lanes of each ring: strongly connected components of the graph of successors."""
+    count = len(road_map.lanes)
+    reachable = np.zeros((count, count), dtype=bool)
+    reachable[road_map.successors[:, 0], road_map.successors[:, 1]] = True
+    for _ in range(max(count, 1).bit_length()):
+        reachable |= (reachable.astype(np.float32) @ reachable.astype(np.float32)) > 0
+    mutual = reachable & reachable.T
+    rings, assigned = [], np.zeros(count, dtype=bool)
+    for lane in np.flatnonzero(mutual.diagonal()):
+        if not assigned[lane]:
+            rings.append(mutual[lane])
+            assigned |= mutual[lane]
+    return rings
+
+
+def _directed(lane: Float[np.ndarray, "n 2"]) -> Float[np.ndarray, "m 3"]:
+    """Points about 1 m apart with the direction to the next point, rad."""
+    points = np.concatenate([resample(lane, 1.0), lane[-1:]])
+    step = np.diff(points, axis=0)
+    direction = np.arctan2(step[:, 1], step[:, 0])
+    return np.column_stack([points[:-1], direction])
+
+
+def _is_circular(points: Float[np.ndarray, "n 3"]) -> bool:
+    outward = points[:, :2] - points[:, :2].mean(axis=0)
+    radius = np.hypot(*outward.T)
+    if radius.max() > MAX_RADIUS_M or radius.max() > MAX_RADIUS_RATIO * radius.min():
+        return False
+    # sine of the angle from the outward vector to the direction: 1 on a counter-clockwise circle
+    sine = (outward[:, 0] * np.sin(points[:, 2]) - outward[:, 1] * np.cos(points[:, 2])) / radius
+    limit = np.cos(TANGENTIAL_RAD)
+    return bool(max((sine >= limit).mean(), (sine <= -limit).mean()) >= TANGENTIAL_SHARE)
+
+
 def _roles(recording: Recording) -> Int[np.ndarray, " tracks"]:
-    """What each track may be to an ego, as bits; 0 for parked vehicles."""
+    """Bits for what each agent can be to an ego; 0 for parked agents."""
     leads = [int(kind) for kind in PREDICTED | {AgentClass.BICYCLE, AgentClass.TRAILER}]
     vulnerable = [int(kind) for kind in VULNERABLE]
-    roles = np.full(len(recording), PRESENT_BIT, dtype=np.int64)
-    roles[np.isin(recording.classes, leads)] |= LEADER_BIT
-    roles[np.isin(recording.classes, vulnerable)] |= VULNERABLE_BIT
+    roles = np.full(len(recording), _PRESENT_BIT, dtype=np.int64)
+    roles[np.isin(recording.classes, leads)] |= _LEADER_BIT
+    roles[np.isin(recording.classes, vulnerable)] |= _VULNERABLE_BIT
     roles[recording.parked] = 0
     return roles
+
+
+class _Tracks(NamedTuple):
+    """The track table of a recording, as kernels use it."""
+
+    states: np.ndarray
+    """(rows, 4) [x m, y m, heading rad, speed m/s]."""
+    starts: np.ndarray
+    """(tracks + 1,) row of each track's first state."""
+    first: np.ndarray
+    """(tracks,) first frames."""
+    last: np.ndarray
+    """(tracks,) last frames."""
+    sizes: np.ndarray
+    """(tracks, 2) length and width, m."""
+    roles: np.ndarray
+    """(tracks,) bits; 0 for agents that are ignored."""
+
+
+class _Drives(NamedTuple):
+    """n scenarios of a recording."""
+
+    tracks: np.ndarray
+    """(n,) indices of the egos' tracks."""
+    ticks: np.ndarray
+    """(n,) ticks of the first observations."""
+    lengths: np.ndarray
+    """(n,) lengths in ticks."""
+    routes: np.ndarray
+    """(points, 2) all egos' routes, points 1 m apart, back to back."""
+    route_starts: np.ndarray
+    """(n + 1,) index of each route's first point."""
+
+
+@njit(cache=True)
+@no_type_check
+def _describe_all(tracks, drives, stride, dt_s, ring, tags, values):
+    """Computes the tags and measures of scenarios of one recording.
+
+    Args:
+        tracks: `_Tracks`.
+        drives: `_Drives`.
+        stride: frames per tick.
+        dt_s: seconds per tick.
+        ring: (points, 3) of roundabouts, [x m, y m, direction rad].
+        tags: (n, tags) output.
+        values: (n, columns) output.
+    """
+    for i in range(len(drives.tracks)):
+        e, count, frame = drives.tracks[i], drives.lengths[i] + 1, drives.ticks[i] * stride
+        row = tracks.starts[e] + frame - tracks.first[e]
+        ego = tracks.states[row : row + (count - 1) * stride + 1 : stride]
+        route = drives.routes[drives.route_starts[i] : drives.route_starts[i + 1]]
+        arcs = np.empty(count)
+        near = 0.0
+        for t in range(count):
+            if t > 0:
+                near += math.hypot(ego[t, 0] - ego[t - 1, 0], ego[t, 1] - ego[t - 1, 1])
+            arcs[t], _, _ = project(route, len(route), ego[t, 0], ego[t, 1], near, 15.0)
+            near = max(arcs[t], 0.0)
+        _tag_motion(ego, dt_s, tags[i], values[i])
+        _tag_roundabout(ego, ring, tags[i])
+        tags[i, _U_TURN] &= not tags[i, _ROUNDABOUT]
+        end = frame + (count - 1) * stride
+        others = np.flatnonzero((tracks.roles > 0) & (tracks.first <= end) & (tracks.last >= frame))
+        others = others[others != e]
+        placed = np.full((len(others), count, 4), np.nan)
+        ticks_near = 0
+        for k in range(len(others)):
+            o = others[k]
+            rows = tracks.states[tracks.starts[o] : tracks.starts[o + 1]]
+            present, near_ego = _place(
+                rows, tracks.first[o], frame, stride, ego, arcs, route, placed[k]
+            )
+            values[i, _AGENTS] += present
+            ticks_near += near_ego
+        values[i, _DENSITY] = ticks_near / count
+        route_end = len(route) - 1 - BEYOND_M  # of the recorded part
+        size, sizes, roles = tracks.sizes[e], tracks.sizes[others], tracks.roles[others]
+        reach = 0.5 * (size[1] + sizes[:, 1])
+        leader = _tag_following(ego, arcs, size, sizes, roles, placed, tags[i])
+        for k in range(len(others)):
+            vulnerable = (roles[k] & _VULNERABLE_BIT) > 0
+            _tag_crossing(
+                ego, arcs, 0.5 * size[0], route_end, reach[k], vulnerable, placed[k], leader,
+                dt_s, tags[i],
+            )  # fmt: skip
+
+
+@njit(cache=True)
+@no_type_check
+def _tag_motion(ego, dt_s, tags, values):
+    """Turns, standing, stopping, and the measures of the ego alone.
+
+    Args:
+        ego: (ticks, 4) states.
+        dt_s: seconds per tick.
+        tags: (tags,) output.
+        values: (columns,) output.
+    """
+    count, turned, distance, max_speed = len(ego), 0.0, 0.0, 0.0
+    has_driven, ticks_standing, heading = False, 0, math.nan
+    for t in range(count):
+        if t > 0:
+            distance += math.hypot(ego[t, 0] - ego[t - 1, 0], ego[t, 1] - ego[t - 1, 1])
+        speed = abs(ego[t, 3])
+        if speed >= MANOEUVRE_STANDING_MPS:
+            if not math.isnan(heading):
+                turned += wrap_scalar(ego[t, 2] - heading)
+            heading = ego[t, 2]
+        max_speed = max(max_speed, speed)
+        has_driven |= speed >= DRIVING_MPS
+        ticks_standing = ticks_standing + 1 if speed < MANOEUVRE_STANDING_MPS else 0
+        # n consecutive ticks span n - 1 steps
+        stands = (ticks_standing - 1) * dt_s >= STOP_DURATION_S - _ROUNDING
+        tags[_STOPPING] |= has_driven and stands
+    tags[_LEFT], tags[_RIGHT] = turned > TURN_RAD, turned < -TURN_RAD
+    tags[_STRAIGHT] = abs(turned) <= TURN_RAD
+    tags[_U_TURN] = abs(turned) > U_TURN_RAD
+    tags[_STANDING_START] = abs(ego[0, 3]) < MANOEUVRE_STANDING_MPS
+    values[_LENGTH], values[_DISTANCE] = (count - 1) * dt_s, distance
+    values[_MAX_SPEED], values[_TURN] = max_speed, math.degrees(turned)
+
+
+@njit(cache=True)
+@no_type_check
+def _tag_roundabout(ego, ring, tags):
+    """Roundabouts that the ego drives along, enters and leaves.
+
+    Args:
+        ego: (ticks, 4) states.
+        ring: (points, 3) of roundabouts, [x m, y m, direction rad].
+        tags: (tags,) output.
+    """
+    along_m, was_on, enters, leaves = 0.0, False, False, False
+    for t in range(len(ego)):
+        x, y, heading = ego[t, 0], ego[t, 1], ego[t, 2]
+        on = False
+        for j in range(len(ring)):
+            dx, dy = ring[j, 0] - x, ring[j, 1] - y
+            if dx * dx + dy * dy <= ROUNDABOUT_HALF_WIDTH_M * ROUNDABOUT_HALF_WIDTH_M:
+                on |= abs(wrap_scalar(ring[j, 2] - heading)) <= SAME_DIRECTION_RAD
+        if t > 0:
+            enters |= on and not was_on
+            leaves |= was_on and not on
+            if on and was_on:
+                along_m += math.hypot(x - ego[t - 1, 0], y - ego[t - 1, 1])
+        was_on = on
+    tags[_ROUNDABOUT] = along_m >= ROUNDABOUT_M
+    tags[_ENTRY] = enters and along_m >= ROUNDABOUT_M
+    tags[_EXIT] = leaves and along_m >= ROUNDABOUT_M
+
+
+@njit(cache=True)
+@no_type_check
+def _place(rows, first, frame, stride, ego, arcs, route, placed):
+    """Projects another agent onto the ego's route.
+
+    Args:
+        rows: (frames, 4) states of the other agent.
+        first: its first frame.
+        frame: the first frame of the scenario.
+        stride: frames per tick.
+        ego: (ticks, 4) states of the ego.
+        arcs: (ticks,) arc length of the ego, m.
+        route: (points, 2) of the ego, 1 m apart.
+        placed: (ticks, 4) output: arc length m, offset m, angle to the route rad and speed m/s; NaN
+            where the agent is absent, an infinite offset where it is far from the route.
+
+    Returns:
+        Whether the agent is present at any tick, and at how many ticks it is near the ego.
+    """
+    present, ticks_near = False, 0
+    for t in range(len(ego)):
+        row = frame + t * stride - first
+        if row < 0 or row >= len(rows):
+            continue
+        present = True
+        x, y = rows[row, 0], rows[row, 1]
+        ticks_near += math.hypot(x - ego[t, 0], y - ego[t, 1]) <= DENSITY_RADIUS_M
+        placed[t, 1] = np.inf
+        nearest, best = 0, np.inf
+        low = max(0, int(arcs[t]) - _LOOK_BACK_M)
+        ahead = max(_LOOK_AHEAD_M, int(LEADER_GAP_S * ego[t, 3]) + _LONGEST_M)
+        for j in range(low, min(len(route), int(arcs[t]) + ahead), _COARSE_M):
+            dx, dy = route[j, 0] - x, route[j, 1] - y
+            if dx * dx + dy * dy < best:
+                nearest, best = j, dx * dx + dy * dy
+        if best <= _NEAR_ROUTE_M * _NEAR_ROUTE_M:
+            arc, offset, heading = project(route, len(route), x, y, nearest, 2.0 * _COARSE_M)
+            placed[t, 0], placed[t, 1] = arc, offset
+            placed[t, 2], placed[t, 3] = wrap_scalar(rows[row, 2] - heading), rows[row, 3]
+    return present, ticks_near
+
+
+@njit(cache=True)
+@no_type_check
+def _tag_following(ego, arcs, size, sizes, roles, placed, tags):
+    """Following a leader.
+
+    Args:
+        ego: (ticks, 4) states.
+        arcs: (ticks,) arc length of the ego, m.
+        size: (2,) length and width of the ego, m.
+        sizes: (agents, 2) of the other agents.
+        roles: (agents,) bits of the other agents.
+        placed: (agents, ticks, 4) output of `_place`.
+        tags: (tags,) output.
+
+    Returns:
+        (ticks,) arc length of the nearest leader, m; infinite without a leader.
+    """
+    nearest = np.full(len(ego), np.inf)
+    ticks_moving, ticks_following = 0, 0
+    for t in range(len(ego)):
+        gap = np.inf
+        for k in range(len(placed)):
+            arc, offset, angle, speed = placed[k, t]
+            on_route = abs(offset) < 0.5 * (size[1] + sizes[k, 1]) and arc > arcs[t]
+            along = abs(angle) < SAME_DIRECTION_RAD or abs(speed) < MANOEUVRE_STANDING_MPS
+            if on_route and along and roles[k] & _LEADER_BIT:
+                nearest[t] = min(nearest[t], arc)
+                gap = min(gap, arc - arcs[t] - 0.5 * (size[0] + sizes[k, 0]))
+        if ego[t, 3] >= MANOEUVRE_STANDING_MPS:
+            ticks_moving += 1
+            ticks_following += gap <= max(LEADER_GAP_S * ego[t, 3], LEADER_GAP_M)
+    tags[_FOLLOWING] = ticks_following * 2 > ticks_moving
+    return nearest
+
+
+@njit(cache=True)
+@no_type_check
+def _moves_across(placed, least_rad):
+    """Whether an agent moves at an angle of at least `least_rad` to the route.
+
+    Args:
+        placed: (4,) one tick of the output of `_place`.
+        least_rad: smallest angle to the route or against it.
+    """
+    angle, speed = abs(placed[2]), abs(placed[3])
+    return least_rad <= angle <= math.pi - least_rad and speed >= MANOEUVRE_STANDING_MPS
+
+
+@njit(cache=True)
+@no_type_check
+def _tag_crossing(ego, arcs, front, route_end, reach, vulnerable, placed, leader, dt_s, tags):
+    """Crossing and yielding, for one other agent.
+
+    Args:
+        ego: (ticks, 4) states.
+        arcs: (ticks,) arc length of the ego, m.
+        front: distance from the ego's centre to its front, m.
+        route_end: arc length of the end of the recorded route, m.
+        reach: half the sum of both widths, m.
+        vulnerable: whether the other agent is a vulnerable road user.
+        placed: (ticks, 4) output of `_place`.
+        leader: (ticks,) arc length of the nearest leader, m.
+        dt_s: seconds per tick.
+        tags: (tags,) output.
+    """
+    for t in range(1, len(ego)):
+        arc, offset, before = placed[t, 0], placed[t, 1], placed[t - 1, 1]
+        ahead = arc - arcs[t] - front
+        if not (_moves_across(placed[t], SIDE_ENTRY_RAD) and ahead > 0.0 and arc <= route_end):
+            continue
+        # across the centre line, not from one side of a bend to the other
+        crosses = before * offset <= 0.0 and abs(before - offset) <= _NEAR_ROUTE_M
+        crosses &= _moves_across(placed[t], CROSSING_RAD) and ahead <= CROSSING_AHEAD_M
+        tags[_CROSSING_VRU] |= vulnerable and crosses
+        enters = abs(before) >= reach and abs(offset) < reach
+        if enters and ahead <= YIELD_AHEAD_M and arc <= leader[t]:
+            cleared = t
+            while cleared + 1 < len(ego) and abs(placed[cleared + 1, 1]) < reach:
+                if abs(placed[cleared + 1, 2]) < SIDE_ENTRY_RAD:
+                    break
+                cleared += 1
+            tags[_YIELDING] |= _yields(ego[:, 3], arcs, arc - front, t, cleared, dt_s)
+
+
+@njit(cache=True)
+@no_type_check
+def _yields(speeds, arcs, place_m, entered, cleared, dt_s):
+    """Whether the ego slows down for an agent that crosses its route.
+
+    Args:
+        speeds: (ticks,) of the ego, m/s.
+        arcs: (ticks,) arc length of the ego, m.
+        place_m: arc length of the ego's centre when its front is at the place of the crossing.
+        entered: tick at which the agent enters the route.
+        cleared: tick at which the agent is last on the route.
+        dt_s: seconds per tick.
+    """
+    arrival = entered
+    while arrival < len(arcs) and arcs[arrival] < place_m:
+        arrival += 1
+    late_s = (arrival - cleared) * dt_s
+    if arrival == len(arcs) or not 0.0 < late_s <= YIELD_ARRIVAL_S + _ROUNDING:
+        return False
+    slowest = max(0, entered - int(YIELD_BEFORE_S / dt_s + _ROUNDING))
+    slowest += np.argmin(speeds[slowest : arrival + 1])
+    slow = speeds[slowest]
+    before = max(0, slowest - int(YIELD_SPEED_OVER_S / dt_s + _ROUNDING))
+    highest = speeds[before : slowest + 1].max()
+    slowed = slow < MANOEUVRE_STANDING_MPS or slow <= YIELD_SPEED_SHARE * highest
+    in_time = (slowest - cleared) * dt_s <= YIELD_SLOWEST_S + _ROUNDING
+    return slowed and in_time and speeds[arrival] >= slow + YIELD_SPEED_GAIN_MPS

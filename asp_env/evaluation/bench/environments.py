@@ -1,4 +1,4 @@
-"""Rates of the environments as their users call them, beside a peer where one is installed."""
+"""Rates of the Gymnasium environments, beside highway-env if it is installed."""
 
 import importlib
 import importlib.util
@@ -18,40 +18,40 @@ PEER = "highway_env"
 PEER_ID = "intersection-v2"
 
 
-def environments(data: str, *, num_envs: int, write_bytes_per_s: float) -> list[Rate]:
-    """Single and batched environments, resets included, and highway-env's intersection.
+def environment_rates(data: str, *, num_envs: int, write_bytes_per_s: float) -> list[Rate]:
+    """Steps per second of single and batched environments, resets included.
 
     Args:
         data: DATA.
-        num_envs: of the batched ones.
-        write_bytes_per_s: what filling rasters reaches: their floor.
+        num_envs: Number of environments in a batch.
+        write_bytes_per_s: Bandwidth of filling rasters, the upper bound for raster observations.
     """
     bytes_each = 12 * 360 * 240
-    floor = {"beside": write_bytes_per_s / bytes_each, "beside_what": "only writing the pictures"}
-    peer, vehicles = _highway() if importlib.util.find_spec(PEER) else (None, 0)
-    highway = {} if peer is None else {"beside": peer, "beside_what": "highway-env"}
+    bound = {"reference_per_s": write_bytes_per_s / bytes_each, "reference": "write bandwidth"}
+    peer, vehicles = _peer() if importlib.util.find_spec(PEER) else (None, 0)
+    highway = {} if peer is None else {"reference_per_s": peer, "reference": "highway-env"}
     single = _single(data, ("vectors",), "log")
     reacting = _single(data, ("vectors",), "idm")
     vectors = _batched(data, ("vectors",), num_envs, VECTOR_STEPS)
     state = _batched(data, ("state",), num_envs, VECTOR_STEPS)
     raster = _batched(data, ("raster",), num_envs, RASTER_STEPS)
-    found = [
-        Rate(what="gym.make, vectors, log", per_s=single, unit="steps/s"),
-        Rate(what="gym.make, vectors, idm", per_s=reacting, unit="steps/s", **highway),
-        Rate(what=f"gym.make_vec of {num_envs}, state", per_s=state, unit="steps/s"),
-        Rate(what=f"gym.make_vec of {num_envs}, vectors 16 x 64", per_s=vectors, unit="steps/s"),
+    rates = [
+        Rate(name="gym.make, vectors, log", per_s=single, unit="steps/s"),
+        Rate(name="gym.make, vectors, idm", per_s=reacting, unit="steps/s", **highway),
+        Rate(name=f"gym.make_vec of {num_envs}, state", per_s=state, unit="steps/s"),
+        Rate(name=f"gym.make_vec of {num_envs}, vectors 16 x 64", per_s=vectors, unit="steps/s"),
         Rate(
-            what=f"gym.make_vec of {num_envs}, raster 12x360x240",
+            name=f"gym.make_vec of {num_envs}, raster 12x360x240",
             per_s=raster,
             unit="steps/s",
             bytes_each=bytes_each,
-            **floor,
+            **bound,
         ),
     ]
     if peer is not None:
-        told = f"highway-env {PEER_ID}, {vehicles:.0f} vehicles, 5 Hz (15 Hz inside)"
-        found.append(Rate(what=told, per_s=peer, unit="steps/s"))
-    return found
+        name = f"highway-env {PEER_ID}, {vehicles:.0f} vehicles, 5 Hz (15 Hz inside)"
+        rates.append(Rate(name=name, per_s=peer, unit="steps/s"))
+    return rates
 
 
 def _single(data: str, observations: Sequence[str], traffic: str) -> float:
@@ -96,10 +96,10 @@ def _batched(data: str, observations: Sequence[str], num_envs: int, steps: int) 
     return rate
 
 
-def _highway() -> tuple[float, float]:
-    """Steps per second of highway-env's intersection, and how many vehicles it had on average.
+def _peer() -> tuple[float, float]:
+    """Steps per second of highway-env's intersection, and its mean number of vehicles.
 
-    The same control rate, a kinematic bicycle, a table of 16 vehicles as observation.
+    It runs at the same control rate with a kinematic bicycle and observes 16 vehicles.
     """
     importlib.import_module(PEER)  # registers its environments
 
@@ -112,18 +112,18 @@ def _highway() -> tuple[float, float]:
         "duration": 1000,
     }
     env: gymnasium.Env[Any, Any] = gymnasium.make(PEER_ID, disable_env_checker=True, config=config)
-    road: Any = env.unwrapped
+    inner: Any = env.unwrapped
     env.reset(seed=0)
-    seen: list[int] = []
+    vehicles: list[int] = []
     action = np.zeros(2, dtype=np.float32)
 
     def drive() -> None:
         for _ in range(PEER_STEPS):
             *_, terminated, truncated, _ = env.step(action)
-            seen.append(len(road.road.vehicles))
+            vehicles.append(len(inner.road.vehicles))
             if terminated or truncated:
                 env.reset()
 
     rate = PEER_STEPS / median_s(drive)
     env.close()
-    return rate, float(np.mean(seen))
+    return rate, float(np.mean(vehicles))

@@ -1,7 +1,4 @@
-"""How speeds are measured: medians of processor time, beside the machine's memory bandwidth.
-
-MERGED: How long a forecast of a scene takes, by the number of agents that are asked of.
-"""
+"""Measurements: medians of processor time, memory bandwidth, and latencies of predictors."""
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
@@ -19,26 +16,45 @@ from asp_env.evaluation.selection import load_predictors, no_data_error, short_n
 
 REPEATS = 5
 COPY_BYTES = 256 * 2**20
+"""Size of a copy that exceeds all caches."""
+
+AGENTS = (1, 16, 64)
+"""Numbers of agents for which latencies are measured."""
+HORIZON_S = 3.0
+REFERENCE = "constant-velocity"
+WARM_UP = 3
+"""Calls that are not timed."""
+CALLS = 200
+MAX_DURATION_S = 20.0
+"""Calls end after this time, but not before `MIN_CALLS`. Chosen by hand."""
+MIN_CALLS = 10
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Rate:
-    """One line of the table."""
+    """A measured rate: a row of a table."""
 
-    what: str
+    name: str
     per_s: float
     unit: str
     bytes_each: int = 0
-    """Bytes that one of them writes at least; 0 where that says nothing."""
-    beside: float | None = None
-    """The rate of the same thing done in another way, of the same unit, in the same run."""
-    beside_what: str = ""
+    """Bytes that each item writes at least; 0 if this is not meaningful."""
+    reference_per_s: float | None = None
+    """Rate of a reference implementation in the same run, in the same unit."""
+    reference: str = ""
 
 
 def median_s(work: Callable[[], object], prepare: Callable[[], object] = lambda: None) -> float:
-    """Median processor time of several calls after one that is not counted.
+    """Median processor time of `REPEATS` calls after an untimed one.
 
-    Preparing is not timed. It is this process's time, so that others on the machine count less.
+    The time of this process alone is measured, which reduces the influence of other processes.
+
+    Args:
+        work: The function to time.
+        prepare: A function that is called before each call of `work` and is not timed.
+
+    Returns:
+        The time of a call, s.
     """
     durations = []
     for _ in range(1 + REPEATS):
@@ -50,74 +66,63 @@ def median_s(work: Callable[[], object], prepare: Callable[[], object] = lambda:
 
 
 def copy_bandwidth() -> float:
-    """Bytes per second that a large copy writes, on one core."""
+    """Bytes per second that a large copy writes on one core."""
     source, target = np.ones(COPY_BYTES, dtype=np.uint8), np.zeros(COPY_BYTES, dtype=np.uint8)
     return COPY_BYTES / median_s(lambda: np.copyto(target, source))
 
 
 def write_bandwidth() -> float:
-    """Bytes per second that filling one full raster after another writes: its floor."""
+    """Bytes per second that filling full-size rasters one after the other writes."""
     target = np.zeros((256, 12, 360, 240), dtype=np.uint8)
     return target.nbytes / median_s(lambda: target.fill(1))
 
 
-AGENTS = (1, 16, 64)
-HORIZON_S = 3.0
-REFERENCE = "constant-velocity"
-WARM_UP = 3
-CALLS = 200
-PATIENCE_S = 20.0
-"""A predictor that takes long is called less often, but no less than `FEWEST` times."""
-FEWEST = 10
-
-
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Latency:
-    """Of calls for so many agents."""
+    """Time that a predictor takes to forecast the agents of a scene."""
 
     predictor: str
     agents: int
     distinct: int
-    """How many of them are not the same one again."""
+    """Number of different agents; the others are repetitions."""
     calls: int
     median_s: float
     p99_s: float
-    """The 99th percentile; of fewer than 100 calls, near the longest."""
+    """The 99th percentile; near the maximum if there are fewer than 100 calls."""
     ratio: float
-    """The median over that of constant velocity in the same scene."""
+    """The median relative to that of constant velocity for the same scene."""
 
 
 def measure_latencies(
     recordings: Recordings, names: Sequence[str], *, dt_s: float
 ) -> list[Latency]:
-    """Latencies of constant velocity and of some predictors, each for 1, 16 and 64 agents.
+    """Measures constant velocity and other predictors for 1, 16 and 64 agents.
 
-    The scene is the tick of a recording with the most targets. Where it has fewer than are asked
-    of, they are asked of more than once: each is drawn and forecast anew.
+    The scene is the tick with the most targets. If it has fewer targets than agents are required,
+    targets are repeated; each repetition is rasterized and forecast separately.
 
     Args:
-        recordings: to take the scene from.
-        names: of predictors, as `load_predictor` takes them.
-        dt_s: the time step.
+        recordings: The recordings that the scene is taken from.
+        names: Names of predictors, as `load_predictor` takes them.
+        dt_s: Length of a tick.
 
     Raises:
-        AspEnvError: a predictor cannot be loaded or is handed the future, or nothing can be
-            forecast.
+        AspEnvError: A predictor cannot be loaded or is privileged, or there is no target.
     """
     all_names = list(dict.fromkeys((REFERENCE, *names)))
     predictors = load_predictors(all_names, horizon=ticks(HORIZON_S, dt_s), dt_s=dt_s)
-    if handed := [predictor.name for predictor in predictors if predictor.privileged]:
-        raise AspEnvError(f"--predictors: {handed[0]} is handed the future, which takes no time")
+    if privileged := [predictor.name for predictor in predictors if predictor.privileged]:
+        raise AspEnvError(f"--predictors: {privileged[0]} is privileged and computes no forecast")
     scene, short = busiest_scene(recordings, dt_s=dt_s), short_names(all_names)
-    found = []
+    latencies = []
     for agents in AGENTS:
-        asked = scene.with_targets(np.resize(scene.targets, (agents, 2)))
+        repeated = scene.with_targets(np.resize(scene.targets, (agents, 2)))
         reference_s = None
         for name, predictor in zip(all_names, predictors, strict=True):
-            durations = durations_s(lambda who=predictor, scene=asked: who.predict(scene))
+            durations = durations_s(lambda p=predictor, scene=repeated: p.predict(scene))
             median_s = float(np.median(durations))
             reference_s = median_s if reference_s is None else reference_s
-            found.append(
+            latencies.append(
                 Latency(
                     predictor=short[name],
                     agents=agents,
@@ -128,20 +133,43 @@ def measure_latencies(
                     ratio=median_s / reference_s,
                 )
             )
-    return found
+    return latencies
+
+
+def busiest_scene(recordings: Recordings, *, dt_s: float) -> Scene:
+    """The first of the ticks with the most targets, with all its targets.
+
+    Raises:
+        AspEnvError: There is no target.
+    """
+    index = index_snippets(recordings, dt_s=dt_s, horizon_s=dt_s)
+    if not len(index):
+        raise no_data_error("snippet")
+    keys = np.stack([index.recording, index.tick], axis=-1)
+    _, situation, count = np.unique(keys, axis=0, return_inverse=True, return_counts=True)
+    return gather_scene(recordings, index.select(situation.reshape(-1) == count.argmax()))
+
+
+def durations_s(call: Callable[[], object]) -> list[float]:
+    """Wall-clock times of up to `CALLS` calls after some untimed ones; fewer if they are slow."""
+    for _ in range(WARM_UP):
+        call()
+    durations: list[float] = []
+    while len(durations) < CALLS:
+        start = perf_counter()
+        call()
+        durations.append(perf_counter() - start)
+        if len(durations) >= MIN_CALLS and sum(durations) > MAX_DURATION_S:
+            break
+    return durations
 
 
 def latency_table(latencies: Sequence[Latency]) -> Table:
-    """For the terminal."""
+    """Latencies as a table for the terminal."""
     table = Table(title=f"one call of predict for all agents of a scene; reference: {REFERENCE}")
     for heading in (
-        "predictor",
-        "agents",
-        "distinct",
-        "median",
-        "99 % below",
-        "calls",
-        "x reference",
+        *("predictor", "agents", "distinct", "median", "99th percentile"),
+        *("calls", "x reference"),
     ):
         table.add_column(heading, justify="left" if heading == "predictor" else "right")
     for each in latencies:
@@ -155,31 +183,3 @@ def latency_table(latencies: Sequence[Latency]) -> Table:
             f"{each.ratio:.1f}",
         )
     return table
-
-
-def busiest_scene(recordings: Recordings, *, dt_s: float) -> Scene:
-    """The first of the ticks at which the most targets can be forecast, with all of them.
-
-    Raises:
-        AspEnvError: there is no target at all.
-    """
-    index = index_snippets(recordings, dt_s=dt_s, horizon_s=dt_s)
-    if not len(index):
-        raise no_data_error("snippet")
-    keys = np.stack([index.recording, index.tick], axis=-1)
-    _, situation, count = np.unique(keys, axis=0, return_inverse=True, return_counts=True)
-    return gather_scene(recordings, index.select(situation.reshape(-1) == count.argmax()))
-
-
-def durations_s(call: Callable[[], object]) -> list[float]:
-    """Of many calls after some that are not counted; fewer where they take long."""
-    for _ in range(WARM_UP):
-        call()
-    durations: list[float] = []
-    while len(durations) < CALLS:
-        start = perf_counter()
-        call()
-        durations.append(perf_counter() - start)
-        if len(durations) >= FEWEST and sum(durations) > PATIENCE_S:
-            break
-    return durations

@@ -28,7 +28,7 @@ from asp_env.metrics.driving.scores import driving_metrics
 from asp_env.metrics.masked import Masked
 from asp_env.planning.planner import Planner, load_planner
 from asp_env.sim.traffic.assignment import make_traffic
-from asp_env.sim.world import Ending, world_of
+from asp_env.sim.world import Ending, world_class
 
 EPISODES_AT_ONCE = 16
 """Number of scenarios in a work unit at most. Chosen by hand: units of one to a few seconds let
@@ -119,7 +119,7 @@ class Methods:
             "horizon_s": horizon_s,
             "dt_s": dt_s,
         }
-        world = world_of(data)
+        world = world_class(data)
         self.settings = EpisodeSettings(
             traffic=make_traffic(traffic, dt_s=dt_s, default=world.traffic),
             rules=find_rules(rules),

@@ -33,12 +33,13 @@ from asp_env.evaluation.closed_loop.comparison import (
     work_units,
 )
 from asp_env.evaluation.report import check_report_possible, write_report
-from asp_env.evaluation.results import Row, output_folder, write_manifest, write_metrics
+from asp_env.evaluation.results import Row, write_manifest, write_metrics
 from asp_env.evaluation.selection import PartChoice, no_data_error, short_names, ticks_to_evaluate
 from asp_env.evaluation.tables import driving_table
+from asp_env.files import atomic_folder
 from asp_env.metrics.driving.rules import DEFAULT_PRESET, RULES, Rules
 from asp_env.metrics.masked import Masked
-from asp_env.sim.world import world_of
+from asp_env.sim.world import world_class
 from asp_env.workers import WorkerPool
 
 REFERENCE = "constant-velocity"
@@ -87,7 +88,7 @@ class Drive:
             AspEnvError: an option or the data are bad, or a package is missing.
         """
         check_report_possible()
-        with output_folder(self.out) as folder:
+        with atomic_folder(self.out) as folder:
             result = drive(self)
             write_metrics(folder, result.rows)
             write_manifest(folder, "drive", **result.manifest)
@@ -124,7 +125,7 @@ def drive(config: Drive) -> ClosedLoopResult:
     """
     if config.jobs < 1:
         raise AspEnvError(f"--jobs {config.jobs}: expected at least 1 process")
-    config = replace(config, traffic=config.traffic or world_of(config.data).traffic)
+    config = replace(config, traffic=config.traffic or world_class(config.data).traffic)
     methods = Methods(  # raises errors before anything is computed
         data=config.data,
         planner=config.planner,

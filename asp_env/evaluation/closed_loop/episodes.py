@@ -102,7 +102,7 @@ def drive_episodes(
         num_episodes=len(scenarios),
         dt_s=settings.dt_s,
         history=settings.history,
-        kind=settings.world,
+        world_class=settings.world,
     )
     world = simulation.world
     generators = [np.random.default_rng(scenario.seed) for scenario in scenarios]

@@ -17,7 +17,7 @@ from asp_env.data.snippets import gather_window
 from asp_env.data.source import Recordings, open_data
 from asp_env.errors import AspEnvError, DataError
 from asp_env.render.film import MAX_SIDE_PX, Film, check_video_possible, frames_of, write_video
-from asp_env.render.window import Playing, play
+from asp_env.render.window import PlayerState, play
 
 SAME_PLACE_M = 1.0
 """Largest distance between the first position of a logged ego in its rollout and in DATA. Chosen by
@@ -63,7 +63,7 @@ class Watch:
             return
         films = make_films(rollouts, self.data)
         if self.video is None:
-            playing = Playing(films=films, speed=self.speed, whole_map=self.map)
+            playing = PlayerState(films=films, speed=self.speed, whole_map=self.map)
             play(playing, size_px=self.size, extent_m=self.follow)
             return
         extent_m = None if self.map else self.follow

@@ -25,7 +25,7 @@ from asp_env.evaluation.open_loop.scoring import (
     score_forecasts,
 )
 from asp_env.evaluation.report import ForecastExamples, check_report_possible, write_report
-from asp_env.evaluation.results import Row, output_folder, write_manifest, write_metrics
+from asp_env.evaluation.results import Row, write_manifest, write_metrics
 from asp_env.evaluation.selection import (
     PartChoice,
     load_predictors,
@@ -34,6 +34,7 @@ from asp_env.evaluation.selection import (
 )
 from asp_env.evaluation.statistics import Estimate
 from asp_env.evaluation.tables import open_loop_tables
+from asp_env.files import atomic_folder
 from asp_env.metrics.forecast.calibration import calibration_error, calibration_sums
 from asp_env.metrics.forecast.errors import MODE_RULES, ModeRule
 
@@ -80,7 +81,7 @@ class Evaluate:
             AspEnvError: an option or the data are bad, or a package is missing.
         """
         check_report_possible()
-        with output_folder(self.out) as folder:
+        with atomic_folder(self.out) as folder:
             result = evaluate(self)
             write_metrics(folder, result.rows)
             write_manifest(folder, "evaluate", **result.manifest)
@@ -254,7 +255,7 @@ def _examples(
         scene=scene,
         future=future,
         forecasts={
-            name: complete_forecast(predictor, scene, future, index.horizon)
+            name: complete_forecast(predictor, scene, future, index.horizon_ticks)
             for name, predictor in predictors.items()
         },
         captions=tuple(captions),

@@ -61,7 +61,7 @@ def gather_ground_truth(recordings: Sequence[Any], index: SnippetIndex) -> Groun
     """
     keys = np.stack([index.recording, index.tick], axis=-1)
     situations, inverse = np.unique(keys, axis=0, return_inverse=True)
-    offsets = np.arange(-index.history, index.horizon + 1)
+    offsets = np.arange(-index.history, index.horizon_ticks + 1)
     states, valid = gather_ticks(recordings, index, offsets)
     sizes = np.zeros((len(index), 2), dtype=np.float32)
     classes = np.zeros(len(index), dtype=np.int64)
@@ -83,8 +83,8 @@ def gather_ground_truth(recordings: Sequence[Any], index: SnippetIndex) -> Groun
             around.append((recording.sizes[tracks], agents, present))
     shape = (len(situations), max((len(each[0]) for each in around), default=0))
     agents_sizes = np.zeros((*shape, 2), dtype=np.float32)
-    agents = np.zeros((*shape, index.horizon, 4), dtype=np.float32)
-    agents_valid = np.zeros((*shape, index.horizon), dtype=bool)
+    agents = np.zeros((*shape, index.horizon_ticks, 4), dtype=np.float32)
+    agents_valid = np.zeros((*shape, index.horizon_ticks), dtype=bool)
     for number, each in enumerate(around):
         count = len(each[0])
         agents_sizes[number, :count], agents[number, :count], agents_valid[number, :count] = each
@@ -109,9 +109,9 @@ def _agents_after(
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Tracks (a), states (a, steps, 4) and presence (a, steps) of all agents after a tick."""
     stride = frames_per_tick(recording.frame_rate_hz, index.dt_s)
-    tracks = recording.tracks_between((tick + 1) * stride, (tick + index.horizon) * stride)
+    tracks = recording.tracks_between((tick + 1) * stride, (tick + index.horizon_ticks) * stride)
     window = gather_window(
-        recording, tracks, first_tick=tick + 1, num_ticks=index.horizon, stride=stride
+        recording, tracks, first_tick=tick + 1, num_ticks=index.horizon_ticks, stride=stride
     )
     return (tracks, *window)
 

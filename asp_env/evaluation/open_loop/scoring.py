@@ -16,7 +16,7 @@ from asp_env.data.classes import AgentClass
 from asp_env.data.predictor import Forecast, Predictor
 from asp_env.data.recording import ticks
 from asp_env.data.scene import Scene
-from asp_env.data.snippets import EVERY_S, Future, SnippetIndex, gather_scene
+from asp_env.data.snippets import SNIPPET_INTERVAL_S, Future, SnippetIndex, gather_scene
 from asp_env.errors import AspEnvError
 from asp_env.evaluation.open_loop.ground_truth import GroundTruth, gather_ground_truth
 from asp_env.metrics.forecast.calibration import brier, mixture_nll, nearest_modes
@@ -124,9 +124,9 @@ def score_forecasts(
         subsets.put(rows, truth)
         on_road = stays_on_road(truth)
         for name, predictor in predictors.items():
-            forecast = complete_forecast(predictor, scene, truth.future, index.horizon)
+            forecast = complete_forecast(predictor, scene, truth.future, index.horizon_ticks)
             sample = ForecastSample(
-                states=forecast.states[:, :, : index.horizon],
+                states=forecast.states[:, :, : index.horizon_ticks],
                 log_probs=forecast.log_probs,
                 now=scene.target_states,
             )
@@ -308,8 +308,8 @@ class ForecastHistory:
     """
 
     def __init__(self, index: SnippetIndex) -> None:
-        """Pairs every snippet with that of the same track `EVERY_S` seconds earlier."""
-        self.apart_ticks = ticks(EVERY_S, index.dt_s)
+        """Pairs every snippet with that of the same track `SNIPPET_INTERVAL_S` seconds earlier."""
+        self.apart_ticks = ticks(SNIPPET_INTERVAL_S, index.dt_s)
         count = len(index)
         order = np.lexsort((index.tick, index.track, index.recording))
         before, after = order[:-1], order[1:]

@@ -1,6 +1,24 @@
-"""A report that people look at: one self-contained file of HTML per run folder."""
+"""The report of a run: results read from its folder, and one self-contained page of HTML."""
 
 from asp_env.evaluation.report.page import check_report_possible, write_report
 from asp_env.evaluation.report.payload import ForecastExamples
+from asp_env.evaluation.report.results import (
+    MethodResult,
+    MetricNote,
+    Result,
+    Results,
+    metric_note,
+    read_results,
+)
 
-__all__ = ["ForecastExamples", "check_report_possible", "write_report"]
+__all__ = [
+    "ForecastExamples",
+    "MethodResult",
+    "MetricNote",
+    "Result",
+    "Results",
+    "check_report_possible",
+    "metric_note",
+    "read_results",
+    "write_report",
+]

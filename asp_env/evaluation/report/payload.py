@@ -1,7 +1,7 @@
-"""Maps, forecasts and drives as plain numbers for the page to draw.
+"""Maps, forecasts and rollouts as JSON values that the scripts of the page draw.
 
-Points are centimetres: the first one, then the steps from point to point, so that the text stays
-short. Headings are thousandths of a radian.
+Points are in centimetres: the first point, then the steps from point to point, which keeps the text
+short. Headings are in thousandths of a radian.
 """
 
 from collections.abc import Mapping
@@ -21,30 +21,33 @@ from asp_env.data.snippets import Future
 from asp_env.errors import AspEnvError, DataError
 
 FORECAST_POINT_S = 0.4
-"""Forecasts keep a point this often, and always the last one."""
+"""Time between the drawn points of a forecast; its last point is always drawn. Chosen by hand: a
+longer time bends sharp turns, a shorter one enlarges the file."""
 MIN_PICTURE_M = 50.0
 MAX_PICTURE_M = 110.0
+"""Bounds on the side of an example's picture. Chosen by hand."""
 MARGIN_M = 10.0
+"""Room around the targets of an example."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class ForecastExamples:
-    """Situations with what predictors said of them, to be shown as pictures over the map."""
+    """Situations with the forecasts of several predictors, shown as pictures over the map."""
 
     scene: Scene
-    """Each situation becomes a row of pictures."""
+    """Each of its situations becomes a row of pictures."""
     future: Future
-    """What the scene's targets went on to do."""
+    """The recorded future of the scene's targets."""
     forecasts: Mapping[str, Forecast]
-    """By predictor, of this very scene; each becomes a column of pictures."""
+    """Forecasts of this scene by predictor; each predictor becomes a column of pictures."""
     captions: tuple[str, ...]
-    """One for each situation."""
+    """A caption for each situation."""
 
     def __post_init__(self) -> None:
-        """Checks that the parts speak of the same scene.
+        """Checks that all parts have the same situations and targets.
 
         Raises:
-            AspEnvError: a count does not match.
+            AspEnvError: A count does not match.
         """
         situations, targets = len(self.scene.tick), len(self.scene.targets)
         if len(self.captions) != situations:
@@ -57,15 +60,14 @@ class ForecastExamples:
 
 
 class MapTable:
-    """Maps by the order in which they were asked for, each one kept once."""
+    """The maps of the page, each stored once and referenced by its number."""
 
     def __init__(self) -> None:
-        """An empty table."""
         self._numbers: dict[int, int] = {}
         self.payloads: list[dict[str, Any]] = []
 
     def number(self, road_map: RoadMap) -> int:
-        """The place of a map in the table."""
+        """The number of a map, which is added if it is new."""
         key = id(road_map)
         if key not in self._numbers:
             self._numbers[key] = len(self.payloads)
@@ -93,7 +95,7 @@ def _map_payload(road_map: RoadMap) -> dict[str, Any]:
 
 
 def _anticlockwise(rings: Ragged) -> list[np.ndarray]:
-    """Rings of one orientation, so that filling them together leaves no holes."""
+    """Rings of the same orientation: filled together, they leave no holes."""
     turned = []
     for number in range(len(rings)):
         x, y = rings[number].T
@@ -120,15 +122,24 @@ def _modes(
     ]
 
 
-def pictures_payload(examples: ForecastExamples, maps: MapTable) -> list[dict[str, Any]]:
-    """A row of pictures for each situation."""
+def examples_payload(examples: ForecastExamples, maps: MapTable) -> list[dict[str, Any]]:
+    """A row of pictures for each situation.
+
+    Args:
+        examples: The situations and their forecasts.
+        maps: The table that receives the maps.
+
+    Returns:
+        For each situation its caption, map, window, agents, targets, recorded future and, by
+        predictor, modes and final errors.
+    """
     return [_picture_row(examples, number, maps) for number in range(len(examples.captions))]
 
 
 def _picture_row(examples: ForecastExamples, number: int, maps: MapTable) -> dict[str, Any]:
     scene, future = examples.scene, examples.future
     targets = np.flatnonzero(scene.targets[:, 0] == number)
-    seen = np.flatnonzero(scene.valid[number, :, -1])
+    present = np.flatnonzero(scene.valid[number, :, -1])
     states = scene.states[number]
     centre, extent_m = _picture_window(scene, future, targets)
     return {
@@ -142,9 +153,9 @@ def _picture_row(examples: ForecastExamples, number: int, maps: MapTable) -> dic
                 *_poses(states[slot, -1]).tolist(),
                 _steps(states[slot, scene.valid[number, slot], :2]),
             ]
-            for slot in seen
+            for slot in present
         ],
-        "targets": [int(np.flatnonzero(seen == scene.targets[t, 1])[0]) for t in targets],
+        "targets": [int(np.flatnonzero(present == scene.targets[t, 1])[0]) for t in targets],
         "truth": [
             _steps(
                 np.concatenate(
@@ -171,7 +182,7 @@ def _picture_row(examples: ForecastExamples, number: int, maps: MapTable) -> dic
 def _picture_window(
     scene: Scene, future: Future, targets: np.ndarray
 ) -> tuple[tuple[float, float], float]:
-    """Centre and width of the square that shows the targets and their ways."""
+    """Centre and side of the square that shows the targets and their recorded future."""
     points = np.concatenate(
         [scene.target_states[targets, :2], future.states[targets][future.valid[targets]][:, :2]]
     )
@@ -184,7 +195,7 @@ def _picture_window(
 def _final_errors(
     forecast: Forecast, future: Future, targets: np.ndarray
 ) -> dict[str, float | None]:
-    """Mean FDE of the most probable mode, and of the nearest one, over the targets shown."""
+    """Mean FDE of the most probable and of the nearest mode over the targets of a situation."""
     steps = min(forecast.states.shape[2], future.states.shape[1])
     rows = targets[forecast.valid[targets] & future.valid[targets, steps - 1]]
     if not len(rows):
@@ -202,28 +213,33 @@ def _box(size: Float[np.ndarray, " 2"]) -> list[int]:
     return np.rint(100 * size).astype(np.int64).tolist()
 
 
-def drives_payload(
+def rollouts_payload(
     folder: Path, road_maps: Mapping[str, RoadMap], maps: MapTable
 ) -> list[dict[str, Any]]:
-    """All rollouts below a folder, in the order of their paths.
+    """All rollouts below a folder in the order of their paths.
+
+    Args:
+        folder: A sub-folder holds the rollouts of one method.
+        road_maps: Road maps by the name of the recording.
+        maps: The table that receives the maps.
 
     Raises:
-        DataError: a rollout cannot be read, or its recording's map was not handed over.
+        DataError: A rollout cannot be read, or the map of its recording is missing.
     """
-    drives = []
+    rollouts = []
     for path in sorted(folder.rglob("*.npz")):
         rollout = Rollout.load(path)
         name = rollout.scenario.recording_name
         if name not in road_maps:
             known = ", ".join(sorted(road_maps)) or "none"
             raise DataError(f"{path}: no map of recording {name!r} was given; given were {known}")
-        drive = _drive(rollout, maps.number(road_maps[name]))
         group = path.parent.relative_to(folder).as_posix()
-        drives.append({"driver": "" if group == "." else group, "name": path.stem} | drive)
-    return drives
+        head = {"driver": "" if group == "." else group, "name": path.stem}
+        rollouts.append(head | _rollout(rollout, maps.number(road_maps[name])))
+    return rollouts
 
 
-def _drive(rollout: Rollout, map_number: int) -> dict[str, Any]:
+def _rollout(rollout: Rollout, map_number: int) -> dict[str, Any]:
     return {
         "map": map_number,
         "tags": " · ".join(rollout.scenario.tags),
@@ -242,35 +258,35 @@ def _drive(rollout: Rollout, map_number: int) -> dict[str, Any]:
         "route": _steps(rollout.route),
         "plans": [_steps(plan) for plan in rollout.plans],
         "forecasts": _forecasts(rollout),
-        "events": _spells(rollout),
+        "events": _event_intervals(rollout),
     }
 
 
 def _track(rollout: Rollout, slot: int) -> dict[str, Any]:
-    """An agent's poses at the ticks from its first to its last one, null where it is not seen."""
-    seen = np.flatnonzero(rollout.valid[:, slot])
+    """Poses of an agent from its first to its last valid tick, None where it is not valid."""
+    ticks = np.flatnonzero(rollout.valid[:, slot])
     kind = AgentClass(int(rollout.classes[slot]))
     head = {"class": int(kind), "size": _box(rollout.sizes[slot])}
-    if not len(seen):
+    if not len(ticks):
         return head | {"first": 0, "poses": []}
-    first, last = int(seen[0]), int(seen[-1])
+    first, last = int(ticks[0]), int(ticks[-1])
     poses = _poses(rollout.states[first : last + 1, slot]).tolist()
     valid = rollout.valid[first : last + 1, slot]
     return head | {
         "first": first,
-        "poses": [pose if there else None for pose, there in zip(poses, valid, strict=True)],
+        "poses": [pose if present else None for pose, present in zip(poses, valid, strict=True)],
     }
 
 
 def _speeds(speeds_mps: Float[np.ndarray, " ticks"], valid: np.ndarray) -> list[float | None]:
     return [
-        round(float(speed), 2) if there else None
-        for speed, there in zip(speeds_mps, valid, strict=True)
+        round(float(speed), 2) if present else None
+        for speed, present in zip(speeds_mps, valid, strict=True)
     ]
 
 
-def _spells(rollout: Rollout) -> list[list]:
-    """[name, first tick, last tick] of every spell in which an event held."""
+def _event_intervals(rollout: Rollout) -> list[list]:
+    """[name, first tick, last tick] of every interval in which an event holds."""
     edges = np.diff(rollout.events.astype(np.int8), axis=0, prepend=0, append=0)
     return [
         [name, int(first), int(last) - 1]
@@ -282,9 +298,9 @@ def _spells(rollout: Rollout) -> list[list]:
 
 
 def _forecasts(rollout: Rollout) -> list[list]:
-    """For each tick its rows [slot, [[probability, points], …]]."""
-    told: list[list] = [[] for _ in range(len(rollout.states))]
+    """Forecasts [slot, [[probability, points], …]] by tick."""
+    forecasts: list[list] = [[] for _ in range(len(rollout.states))]
     for row, tick in enumerate(rollout.forecast_ticks):
         modes = _modes(rollout.forecast_states[row], rollout.forecast_log_probs[row], rollout.dt_s)
-        told[int(tick)].append([int(rollout.forecast_slots[row]), modes])
-    return told
+        forecasts[int(tick)].append([int(rollout.forecast_slots[row]), modes])
+    return forecasts

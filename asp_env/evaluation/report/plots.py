@@ -1,4 +1,4 @@
-"""Metrics as plotly figures, in JSON; the page colours text and grids by its theme."""
+"""Metrics as plotly figures in JSON; the page sets the colours of text and grids."""
 
 import math
 from collections.abc import Sequence
@@ -6,8 +6,15 @@ from collections.abc import Sequence
 import plotly.graph_objects as go
 from plotly.subplots import make_subplots
 
-from asp_env.evaluation.report.results import MethodResult, Result, distinct, entrants, note
-from asp_env.evaluation.report.tables import SELECTIONS, SUBSETS
+from asp_env.evaluation.report.results import (
+    SELECTIONS,
+    SUBSETS,
+    MethodResult,
+    Result,
+    distinct,
+    methods_of,
+    metric_note,
+)
 
 COLOURS = ("#e8590c", "#7048e8", "#0ca678", "#1c7ed6", "#d6336c", "#c99700", "#5c7cfa", "#74b816")
 PRIVILEGED_COLOUR = "#8a94a6"
@@ -15,29 +22,37 @@ PANELS_PER_ROW = 4
 
 
 def colours(predictors: Sequence[str]) -> dict[str, str]:
-    """A colour for each predictor, the same in plots and pictures."""
+    """A colour for each predictor, shared by plots and pictures."""
     return {name: COLOURS[number % len(COLOURS)] for number, name in enumerate(predictors)}
 
 
 def final_errors(results: Sequence[Result], colour: dict[str, str]) -> str | None:
-    """Bars of FDE by subset and predictor with their intervals, a panel per selection."""
+    """Bars of FDE with intervals by subset and method, a panel per selection.
+
+    Args:
+        results: Open-loop results; metrics other than FDE are ignored.
+        colour: The colour of each predictor.
+
+    Returns:
+        The figure as JSON, None if there is nothing to show.
+    """
     results = [r for r in results if r.metric == "FDE" and r.at_s is None and ":" not in r.subset]
     if not results:
         return None
     selections = distinct((r.selection for r in results), first=SELECTIONS)
     figure = _panels([selection.replace("-", " ") for selection in selections])
     for panel, selection in enumerate(selections, start=1):
-        for entrant in entrants(results):
-            mine = [r for r in results if (r.entrant, r.selection) == (entrant, selection)]
-            mine.sort(key=lambda r: SUBSETS.index(r.subset) if r.subset in SUBSETS else 9)
+        for method in methods_of(results):
+            group = [r for r in results if (r.method, r.selection) == (method, selection)]
+            group.sort(key=lambda r: SUBSETS.index(r.subset) if r.subset in SUBSETS else 9)
             bar = go.Bar(
-                name=entrant.label,
-                legendgroup=entrant.label,
+                name=method.label,
+                legendgroup=method.label,
                 showlegend=panel == 1,
-                x=[r.subset for r in mine],
-                y=_values(mine),
-                error_y=_whiskers(mine),
-                marker={"color": _colour(entrant, colour), "cornerradius": 3},
+                x=[r.subset for r in group],
+                y=_values(group),
+                error_y=_whiskers(group),
+                marker={"color": _colour(method, colour), "cornerradius": 3},
                 hovertemplate="%{y:.2f} m",
             )
             figure.add_trace(bar, row=1, col=panel)
@@ -47,7 +62,10 @@ def final_errors(results: Sequence[Result], colour: dict[str, str]) -> str | Non
 
 
 def errors_over_time(results: Sequence[Result], colour: dict[str, str]) -> str | None:
-    """Lines of metrics such as `L2@1s` over the time they speak of, with their intervals."""
+    """Lines of metrics such as `L2@1s` over the time ahead, with intervals.
+
+    The arguments and the return value are as for `final_errors`.
+    """
     results = [r for r in results if r.at_s is not None]
     subset = next(iter(distinct((r.subset for r in results), first=("moving", "all"))), None)
     if subset is None:
@@ -56,39 +74,42 @@ def errors_over_time(results: Sequence[Result], colour: dict[str, str]) -> str |
     selections = distinct((r.selection for r in results), first=SELECTIONS)
     figure = _panels([f"{s.replace('-', ' ')} · {subset} targets" for s in selections])
     for panel, selection in enumerate(selections, start=1):
-        for entrant in entrants(results):
-            mine = [r for r in results if (r.entrant, r.selection) == (entrant, selection)]
+        for method in methods_of(results):
+            group = [r for r in results if (r.method, r.selection) == (method, selection)]
             line = go.Scatter(
-                name=entrant.label,
-                legendgroup=entrant.label,
+                name=method.label,
+                legendgroup=method.label,
                 showlegend=panel == 1,
-                x=[r.at_s for r in mine],
-                y=_values(mine),
-                error_y=_whiskers(mine),
+                x=[r.at_s for r in group],
+                y=_values(group),
+                error_y=_whiskers(group),
                 mode="lines+markers",
-                line={"color": _colour(entrant, colour), "width": 2.5},
+                line={"color": _colour(method, colour), "width": 2.5},
                 marker={"size": 7},
                 hovertemplate="%{y:.2f} m",
             )
             figure.add_trace(line, row=1, col=panel)
     figure.update_layout(height=400, hovermode="x unified")
-    figure.update_xaxes(title_text="seconds ahead", rangemode="tozero")
+    figure.update_xaxes(title_text="time ahead, s", rangemode="tozero")
     figure.update_yaxes(rangemode="tozero")
-    figure.update_yaxes(title_text="distance to the truth, m", col=1)
+    figure.update_yaxes(title_text="error, m", col=1)
     return _finish(figure)
 
 
 def driving_metrics(results: Sequence[Result], colour: dict[str, str]) -> str | None:
-    """A panel per metric: a point with its interval for each planner and predictor."""
+    """A panel per metric with a point and an interval for each method.
+
+    The arguments and the return value are as for `final_errors`, with closed-loop results.
+    """
     subset = next(iter(distinct((r.subset for r in results), first=SUBSETS)), None)
     results = [r for r in results if r.subset == subset and r.value is not None and r.at_s is None]
     metrics = distinct(r.metric for r in results)
     if not metrics:
         return None
-    who = entrants(results)
+    methods = methods_of(results)
     columns = min(PANELS_PER_ROW, len(metrics))
     rows = math.ceil(len(metrics) / columns)
-    height = rows * (95 + 30 * len(who)) + 20
+    height = rows * (95 + 30 * len(methods)) + 20
     figure = make_subplots(
         rows=rows,
         cols=columns,
@@ -99,22 +120,22 @@ def driving_metrics(results: Sequence[Result], colour: dict[str, str]) -> str | 
     )
     for number, metric in enumerate(metrics):
         row, column = number // columns + 1, number % columns + 1
-        told = note(metric)
-        percent = told.unit == "%"
-        for entrant in who:
-            mine = [r for r in results if (r.entrant, r.metric) == (entrant, metric)]
+        note = metric_note(metric)
+        percent = note.unit == "%"
+        for method in methods:
+            group = [r for r in results if (r.method, r.metric) == (method, metric)]
             scale = 100.0 if percent else 1.0
             point = go.Scatter(
-                x=_values(mine, scale),
-                y=[entrant.label] * len(mine),
-                error_x=_whiskers(mine, scale),
+                x=_values(group, scale),
+                y=[method.label] * len(group),
+                error_x=_whiskers(group, scale),
                 mode="markers",
-                marker={"color": _colour(entrant, colour), "size": 10},
+                marker={"color": _colour(method, colour), "size": 10},
                 hovertemplate="%{x:.2f}<extra>%{y}</extra>",
                 showlegend=False,
             )
             figure.add_trace(point, row=row, col=column)
-        if percent and told.better == "higher":
+        if percent and note.better == "higher":
             figure.update_xaxes(range=[-4, 104], tickvals=[0, 50, 100], row=row, col=column)
         else:
             figure.update_xaxes(rangemode="tozero", nticks=5, row=row, col=column)
@@ -124,8 +145,10 @@ def driving_metrics(results: Sequence[Result], colour: dict[str, str]) -> str | 
 
 
 def _panel_title(metric: str) -> str:
-    arrow = {"lower": "↓", "higher": "↑", "neither": ""}[note(metric).better]
-    return " ".join(part for part in (note(metric).label, note(metric).unit, arrow) if part)
+    arrow = {"lower": "↓", "higher": "↑", "neither": ""}[metric_note(metric).better]
+    return " ".join(
+        part for part in (metric_note(metric).label, metric_note(metric).unit, arrow) if part
+    )
 
 
 def _panels(titles: Sequence[str]) -> go.Figure:
@@ -134,12 +157,12 @@ def _panels(titles: Sequence[str]) -> go.Figure:
     )
 
 
-def _colour(entrant: MethodResult, colour: dict[str, str]) -> str:
-    return colour.get(entrant.predictor, PRIVILEGED_COLOUR)
+def _colour(method: MethodResult, colour: dict[str, str]) -> str:
+    return colour.get(method.predictor, PRIVILEGED_COLOUR)
 
 
 def _values(results: Sequence[Result], scale: float = 1.0) -> list[float | None]:
-    """Plain numbers, so that the figure holds them as text and not as packed arrays."""
+    """Python numbers, which plotly writes as text rather than as packed arrays."""
     return [None if r.value is None else round(scale * r.value, 4) for r in results]
 
 

@@ -1,7 +1,4 @@
-"""What each metric says, in a line, and which way is better.
-
-MERGED: The long table of metrics, read and put in order for people.
-"""
+"""The results of a run as people read them: `metrics.csv` and what its metrics mean."""
 
 import csv
 import re
@@ -13,18 +10,35 @@ from typing import Literal
 from asp_env.errors import DataError
 from asp_env.evaluation.results import Row
 
+SELECTIONS = ("most-probable", "best-of-3", "")
+"""Selections of modes in the order of the tables; metrics of all modes together have none."""
+SUBSETS = ("all", "moving")
+"""The subsets of targets or episodes that come first."""
+COLUMNS = tuple(field.name for field in fields(Row))
+RENAMED_COLUMNS = {"preset": "recipe"}
+"""Columns of older run folders and their present names."""
+DETAILS = ("trained_on", "view", "recipe", "chaining", "traffic", "latency_ticks")
+"""Columns that distinguish methods of the same name."""
+
 Better = Literal["lower", "higher", "neither"]
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class MetricNote:
-    """How a metric is printed and read."""
+    """How a metric is named, explained and printed."""
 
     label: str
     unit: str
-    """`m`, `m²`, `%` (the value is a share of one), … or nothing."""
+    """`m`, `m²`, `%` (the value is a share of one), or empty."""
     better: Better
     text: str
+    """Definition in a sentence; empty for an unknown metric."""
+
+    @property
+    def unit_and_arrow(self) -> str:
+        """The unit, then an arrow that shows which way is better."""
+        arrow = {"lower": "↓", "higher": "↑", "neither": ""}[self.better]
+        return " ".join(part for part in (self.unit, arrow) if part)
 
     def format(self, value: float) -> str:
         """The value as text, without its unit."""
@@ -33,161 +47,16 @@ class MetricNote:
         return f"{value:.3f}" if 0 < abs(value) < 0.1 else f"{value:.2f}"
 
 
-def _note(label: str, unit: str, better: Better, text: str) -> MetricNote:
-    return MetricNote(label=label, unit=unit, better=better, text=text)
-
-
-NOTES = {
-    "FDE": _note("FDE", "m", "lower", "Distance from the forecast's last position to the truth."),
-    "FDE / constant velocity": _note(
-        "FDE / CV",
-        "",
-        "lower",
-        "FDE over constant velocity's on the same targets; paired interval.",
-    ),
-    "ADE": _note("ADE", "m", "lower", "Distance to the truth, averaged over the forecast's ticks."),
-    "L2": _note("L2", "m", "lower", "Distance to the truth so many seconds ahead."),
-    "MAE": _note("MAE", "m", "lower", "Mean absolute error of x and y over all ticks."),
-    "MSE": _note("MSE", "m²", "lower", "Mean squared error of x and y over all ticks."),
-    "miss": _note("Miss", "%", "lower", "Share of targets whose last position is over 2 m off."),
-    "brier-FDE": _note(
-        "Brier FDE", "m", "lower", "FDE plus (1 - p)², p being the judged mode's probability."
-    ),
-    "NLL": _note(
-        "NLL",
-        "nats",
-        "lower",
-        "Negative log density of the true end under Gaussians of 1 m around the modes' ends.",
-    ),
-    "ECE": _note(
-        "ECE",
-        "",
-        "lower",
-        "Expected calibration error of the modes' probabilities of ending nearest, in ten bins.",
-    ),
-    "Brier": _note(
-        "Brier", "", "lower", "Squared error of the modes' probabilities of ending nearest, summed."
-    ),
-    "off-road": _note(
-        "Off road",
-        "%",
-        "lower",
-        "Share of modes whose centre leaves the drivable area by over 0.3 m; of targets that keep "
-        "to it.",
-    ),
-    "overlap": _note(
-        "Overlap",
-        "%",
-        "lower",
-        "Share of modes whose box meets that of another road user where the two were recorded "
-        "apart.",
-    ),
-    "infeasible": _note(
-        "Infeasible",
-        "%",
-        "lower",
-        "Share of modes that accelerate by over 10.4 m/s² or curve by over 0.3 1/m.",
-    ),
-    "inconsistency": _note(
-        "Inconsistency",
-        "m",
-        "lower",
-        "Distance between most probable forecasts made 0.6 s apart, where they speak of one time.",
-    ),
-    "score": _note(
-        "Score",
-        "%",
-        "higher",
-        "The score of the preset that judged: its multipliers times its weighted mean, 0 to 100 %.",
-    ),
-    "score - constant-velocity": _note(
-        "Score - CV",
-        "%",
-        "higher",
-        "Score less that of the same planner with constant velocity; paired interval.",
-    ),
-    "no at-fault collision": _note(
-        "No fault",
-        "%",
-        "higher",
-        "Drives in which the ego hit nobody standing, nobody at its front and nobody at its side, "
-        "by the preset's rule; being hit from behind, or while standing, is no fault.",
-    ),
-    "no collision": _note(
-        "No contact", "%", "higher", "Drives in which the ego's box met nobody else's at all."
-    ),
-    "on road": _note(
-        "On road",
-        "%",
-        "higher",
-        "Drives without a corner further outside the drivable area than preset and log allow.",
-    ),
-    "on mapped road": _note(
-        "On the map", "%", "higher", "The same where the log's own way off the map excuses nothing."
-    ),
-    "progress": _note(
-        "Progress", "%", "higher", "Way made good, as a share of the recorded ego's."
-    ),
-    "making progress": _note(
-        "Makes way", "%", "higher", "Drives over at least a fifth of the recorded ego's way."
-    ),
-    "TTC": _note(
-        "TTC", "%", "higher", "Drives that always kept their time to any collision above 0.95 s."
-    ),
-    "direction": _note(
-        "Direction", "%", "higher", "100 % up to 2 m against the traffic within 1 s, 0 above 6 m."
-    ),
-    "right way": _note(
-        "Right way", "%", "higher", "Drives that stayed within 3.5 m of a way on from their start."
-    ),
-    "speed": _note(
-        "Speed limit", "%", "higher", "1 less the mean overspeed over 2.23 m/s, at least 0."
-    ),
-    "feasible": _note(
-        "Feasible", "%", "higher", "Drives within Waymax's bounds of acceleration and curvature."
-    ),
-    "no hit from behind": _note(
-        "No rear hit", "%", "higher", "Drives in which nobody ran into the ego from behind."
-    ),
-    "comfort": _note(
-        "Comfort", "%", "higher", "Drives within nuPlan's bounds of acceleration, jerk and yaw."
-    ),
-    "log divergence": _note(
-        "Off the log", "m", "neither", "Mean distance between the ego and the recorded one."
-    ),
-    "realism": _note(
-        "Realism",
-        "%",
-        "higher",
-        "How likely the recorded traffic is under the simulated one, by the weights of WOSAC 2025.",
-    ),
-    "route deviation": _note(
-        "Off the route", "m", "neither", "Mean distance to the way that the recorded ego took."
-    ),
-}
-"""By name in `metrics.csv`."""
-
-
-def note(metric: str) -> MetricNote:
-    """The note of a metric; an unknown one keeps its name and is ranked neither way."""
-    return NOTES.get(metric) or _note(metric, "", "neither", "")
-
-
-COLUMNS = tuple(field.name for field in fields(Row))
-DETAILS = ("trained_on", "view", "recipe", "chaining", "traffic", "latency_ticks")
-"""Columns that tell rows of one predictor or planner apart, where they differ."""
-
-
 @dataclass(frozen=True, slots=True, kw_only=True)
 class MethodResult:
-    """Who was measured: a row of a table, a colour in a plot."""
+    """The method that a result belongs to: a row of a table, a colour in a plot."""
 
     planner: str
     predictor: str
     details: tuple[str, ...] = ()
-    """What tells it from others of the same name."""
+    """Distinguish it from methods of the same name."""
     privileged: bool = False
-    """Whether it knew the recorded future."""
+    """Whether its planner or predictor is given the recorded future."""
 
     @property
     def name(self) -> str:
@@ -203,18 +72,18 @@ class MethodResult:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Result:
-    """One number of the table; None where it is missing."""
+    """One row of `metrics.csv`; a missing number is None."""
 
-    entrant: MethodResult
+    method: MethodResult
     data: str
     horizon_s: str
     fixed: tuple[str, ...]
-    """What is equal for all rows of the same kind, such as the traffic."""
+    """Details that all results of the same kind share, such as the traffic."""
     selection: str
     subset: str
     metric: str
     at_s: float | None
-    """The time that the metric speaks of, for one such as `L2@1s`, whose `metric` is `L2`."""
+    """Time ahead that the metric is evaluated at: 1.0 for `L2@1s`, whose `metric` is `L2`."""
     value: float | None
     low: float | None
     high: float | None
@@ -223,43 +92,63 @@ class Result:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Results:
-    """What a run measured."""
+    """All results of a run."""
 
     open_loop: tuple[Result, ...]
-    """About predictors alone."""
+    """Results of predictors without a planner."""
     driving: tuple[Result, ...]
 
     @property
     def predictors(self) -> list[str]:
-        """All predictors that do not know the future, by appearance."""
-        every = [result.entrant for result in (*self.open_loop, *self.driving)]
-        return distinct(e.predictor for e in every if e.predictor and not e.privileged)
+        """Predictors that are not privileged, in the order of their first results."""
+        methods = [result.method for result in (*self.open_loop, *self.driving)]
+        return distinct(m.predictor for m in methods if m.predictor and not m.privileged)
 
 
 def read_results(path: Path, *, privileged: Collection[str] = ()) -> Results:
-    """The table of metrics.
+    """Reads `metrics.csv`.
 
     Args:
-        path: of the file.
-        privileged: predictors and planners that were handed the recorded future.
+        path: The file. Names of columns in older files are understood.
+        privileged: Predictors and planners that were given the recorded future.
 
     Raises:
-        DataError: the file is missing, lacks a column, or holds text for a number.
+        DataError: The file is missing, lacks a column, or holds text for a number.
     """
     try:
         with path.open(newline="", encoding="utf-8") as file:
             reader = csv.DictReader(file)
+            columns = [RENAMED_COLUMNS.get(name, name) for name in reader.fieldnames or ()]
+            reader.fieldnames = columns
             rows = list(reader)
-            names = reader.fieldnames or ()
     except (OSError, ValueError, csv.Error) as error:
         raise DataError(f"{path}: not a table of metrics ({error})") from error
-    missing = [name for name in COLUMNS if name not in names]
+    missing = [name for name in COLUMNS if name not in columns]
     if missing:
         raise DataError(f"{path}: no column {missing[0]!r}, expected {', '.join(COLUMNS)}")
     return Results(
         open_loop=_results(path, [row for row in rows if not row["planner"]], privileged),
         driving=_results(path, [row for row in rows if row["planner"]], privileged),
     )
+
+
+def methods_of(results: Iterable[Result]) -> list[MethodResult]:
+    """The methods of some results: the expert, then other privileged methods, then the rest."""
+    methods = dict.fromkeys(result.method for result in results)
+    return sorted(methods, key=lambda method: (not method.privileged, method.planner != "expert"))
+
+
+def best_result(results: Iterable[Result], *, better: str) -> Result | None:
+    """The best result of a method that is not privileged, None if there is none."""
+    comparable = [r for r in results if r.value is not None and not r.method.privileged]
+    sign = 1 if better == "lower" else -1
+    return min(comparable, key=lambda r: sign * (r.value or 0.0), default=None)
+
+
+def distinct(values: Iterable[str], *, first: Sequence[str] = ()) -> list[str]:
+    """Each value once, those of `first` in front, the others in the order of appearance."""
+    rank = {value: position for position, value in enumerate(first)}
+    return sorted(dict.fromkeys(values), key=lambda value: rank.get(value, len(rank)))
 
 
 def _results(
@@ -291,7 +180,7 @@ def _result(
     except ValueError as error:
         raise DataError(f"{path}: metric {row['metric']!r}: {error}") from error
     return Result(
-        entrant=MethodResult(
+        method=MethodResult(
             planner=row["planner"],
             predictor=row["predictor"],
             details=tuple(details),
@@ -310,25 +199,208 @@ def _result(
 
 def _detail(column: str, value: str) -> str:
     if column == "latency_ticks":
-        return f"forecasts {value} ticks late"
+        return f"latency {value} ticks"
     return f"{column.replace('_', ' ')} {value}"
 
 
-def entrants(results: Iterable[Result]) -> list[MethodResult]:
-    """Those of some results: first the expert, then others who knew the future, then the rest."""
-    found = dict.fromkeys(result.entrant for result in results)
-    return sorted(found, key=lambda entrant: (not entrant.privileged, entrant.planner != "expert"))
+def metric_note(metric: str) -> MetricNote:
+    """The note of a metric; an unknown metric is named as in the file and is not ranked."""
+    return METRIC_NOTES.get(metric) or _note(metric, "", "neither", "")
 
 
-def distinct(values: Iterable[str], *, first: Sequence[str] = ()) -> list[str]:
-    """Each value once, by appearance, those of `first` in front."""
-    found = dict.fromkeys(values)
-    rank = {value: position for position, value in enumerate(first)}
-    return sorted(found, key=lambda value: rank.get(value, len(rank)))
+def _note(label: str, unit: str, better: Better, text: str) -> MetricNote:
+    return MetricNote(label=label, unit=unit, better=better, text=text)
 
 
-def best(results: Iterable[Result], *, better: str) -> Result | None:
-    """The best of those who did not know the future, None if there is none."""
-    fair = [r for r in results if r.value is not None and not r.entrant.privileged]
-    sign = 1 if better == "lower" else -1
-    return min(fair, key=lambda r: sign * (r.value or 0.0), default=None)
+METRIC_NOTES = {
+    "FDE": _note(
+        "FDE", "m", "lower", "Distance between the last forecast position and the true position."
+    ),
+    "FDE / constant velocity": _note(
+        "FDE / CV",
+        "",
+        "lower",
+        "FDE divided by that of constant velocity on the same targets; paired interval.",
+    ),
+    "ADE": _note(
+        "ADE", "m", "lower", "Mean distance between forecast and true positions over all ticks."
+    ),
+    "L2": _note(
+        "L2", "m", "lower", "Distance between forecast and true position at a given time ahead."
+    ),
+    "MAE": _note("MAE", "m", "lower", "Mean absolute error of x and y over all ticks."),
+    "MSE": _note("MSE", "m²", "lower", "Mean squared error of x and y over all ticks."),
+    "miss": _note(
+        "Miss rate",
+        "%",
+        "lower",
+        "Share of targets whose last forecast position is over 2 m from the true position.",
+    ),
+    "brier-FDE": _note(
+        "Brier FDE",
+        "m",
+        "lower",
+        "FDE plus (1 - p)², where p is the probability of the evaluated mode.",
+    ),
+    "NLL": _note(
+        "NLL",
+        "nats",
+        "lower",
+        "Negative log likelihood of the true last position under Gaussians of 1 m around the last "
+        "positions of all modes.",
+    ),
+    "ECE": _note(
+        "ECE",
+        "",
+        "lower",
+        "Expected calibration error, in ten bins, of the modes' probabilities of ending nearest "
+        "to the true last position.",
+    ),
+    "Brier": _note(
+        "Brier",
+        "",
+        "lower",
+        "Sum of the squared errors of the modes' probabilities of ending nearest to the true last "
+        "position.",
+    ),
+    "off-road": _note(
+        "Off road",
+        "%",
+        "lower",
+        "Share of modes whose centre leaves the drivable area by over 0.3 m, for targets that "
+        "stay inside it.",
+    ),
+    "overlap": _note(
+        "Overlap",
+        "%",
+        "lower",
+        "Share of modes whose box overlaps the recorded box of another agent, except pairs that "
+        "overlap in the recording.",
+    ),
+    "infeasible": _note(
+        "Infeasible",
+        "%",
+        "lower",
+        "Share of modes with an acceleration over 10.4 m/s² or a curvature over 0.3 1/m.",
+    ),
+    "inconsistency": _note(
+        "Inconsistency",
+        "m",
+        "lower",
+        "Mean distance between most probable forecasts made 0.6 s apart, over the ticks that both "
+        "cover.",
+    ),
+    "score": _note(
+        "Score",
+        "%",
+        "higher",
+        "Score of the rules: the product of their multipliers times their weighted mean.",
+    ),
+    "score - constant-velocity": _note(
+        "Score - CV",
+        "%",
+        "higher",
+        "Score minus that of the same planner with constant velocity; paired interval.",
+    ),
+    "no at-fault collision": _note(
+        "No at-fault",
+        "%",
+        "higher",
+        "Share of episodes without a collision that is the ego's fault under the rules: with a "
+        "standing agent, at the ego's front, or at its side where the rules say so. Collisions "
+        "from behind or while the ego stands do not count.",
+    ),
+    "no collision": _note(
+        "No collision",
+        "%",
+        "higher",
+        "Share of episodes in which the ego's box never overlaps that of another agent.",
+    ),
+    "on road": _note(
+        "On road",
+        "%",
+        "higher",
+        "Share of episodes in which no corner of the ego is further outside the drivable area "
+        "than the rules allow; where the recorded ego is outside it, as much is allowed.",
+    ),
+    "on mapped road": _note(
+        "On map",
+        "%",
+        "higher",
+        "As on road, but without the allowance for places where the recorded ego is outside.",
+    ),
+    "progress": _note(
+        "Progress",
+        "%",
+        "higher",
+        "Distance travelled along the route as a share of the recorded ego's, at most 100 %.",
+    ),
+    "making progress": _note(
+        "Min. progress", "%", "higher", "Share of episodes with a progress of at least 20 %."
+    ),
+    "TTC": _note(
+        "TTC",
+        "%",
+        "higher",
+        "Share of episodes in which the time to collision is always over 0.95 s.",
+    ),
+    "direction": _note(
+        "Direction",
+        "%",
+        "higher",
+        "100 % if the ego drives at most 2 m against the traffic within any 1 s, 50 % up to 6 m, "
+        "else 0 %.",
+    ),
+    "right way": _note(
+        "Right way",
+        "%",
+        "higher",
+        "Share of episodes in which the ego stays within 3.5 m of the lanes that continue from "
+        "its start or of the recorded route.",
+    ),
+    "speed": _note(
+        "Speed limit",
+        "%",
+        "higher",
+        "100 % minus the mean overspeed as a share of 2.23 m/s, at least 0 %.",
+    ),
+    "feasible": _note(
+        "Feasible",
+        "%",
+        "higher",
+        "Share of episodes within Waymax's bounds on acceleration and curvature.",
+    ),
+    "no hit from behind": _note(
+        "No rear hit",
+        "%",
+        "higher",
+        "Share of episodes in which no agent collides with the ego from behind.",
+    ),
+    "comfort": _note(
+        "Comfort",
+        "%",
+        "higher",
+        "Share of episodes within nuPlan's bounds on acceleration, jerk, yaw rate and yaw "
+        "acceleration.",
+    ),
+    "log divergence": _note(
+        "Log distance",
+        "m",
+        "neither",
+        "Mean distance between the ego and the recorded ego at the same ticks.",
+    ),
+    "realism": _note(
+        "Realism",
+        "%",
+        "higher",
+        "Likelihood of the recorded motion under the simulated traffic, with the weights of "
+        "WOSAC 2025.",
+    ),
+    "route deviation": _note(
+        "Route distance",
+        "m",
+        "neither",
+        "Mean distance between the ego and the recorded ego's route.",
+    ),
+}
+"""Notes by the name of the metric in `metrics.csv`."""

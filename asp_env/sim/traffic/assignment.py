@@ -1,4 +1,4 @@
-"""Who drives whom: a table from agents to drivers, merged by mask."""
+"""Assignment of agents to drivers: by id, by class, or by default."""
 
 import re
 from collections.abc import Mapping, Sequence
@@ -8,30 +8,40 @@ import numpy as np
 from jaxtyping import Bool
 
 from asp_env import registry
-from asp_env.data.classes import PREDICTED, AgentClass, parse_class
+from asp_env.data.classes import AgentClass, parse_class
 from asp_env.data.recording import DEFAULT_DT_S
 from asp_env.errors import AspEnvError, DataError
-from asp_env.sim.traffic import Control, Driver, DriverPlug
-from asp_env.sim.traffic.driver import no_control, resized, vehicles
+from asp_env.sim.traffic.driver import (
+    CONTROLLABLE,
+    Control,
+    Driver,
+    DriverPlug,
+    controllable_agents,
+    no_control,
+    resized,
+)
 from asp_env.sim.traffic.log import LogDriver
 from asp_env.sim.world import World
 
 TrafficSpec = str | Driver | Mapping[Any, str | Driver]
-"""A driver or its name, or a table from ids, names of classes and `default` to those."""
+"""A driver or its name, or a table from ids, names of classes and `default` to drivers or names."""
 
 DEFAULT = "default"
-DRIVABLE = PREDICTED | {AgentClass.BICYCLE}
+"""The key of the driver of all agents that no other key of a table covers."""
+
 _NEXT_PAIR = re.compile(r",(?=[^,:=]+=)")
 
-_KEYS = f"an agent's id, {', '.join(sorted(kind.name.lower() for kind in DRIVABLE))} or {DEFAULT}"
+_KEYS = (
+    f"an agent's id, {', '.join(sorted(kind.name.lower() for kind in CONTROLLABLE))} or {DEFAULT}"
+)
 
 
 class Traffic:
-    """Drivers side by side in one episode, each of its own agents.
+    """Several drivers in one episode, each with its own agents.
 
-    An agent has the driver of its id, else of its class, else the default one, from the reset of
-    its episode to its end. Only vehicles that are not parked are driven; all others are left to
-    the world.
+    From the start of its episode to the end, an agent has the driver of its id, else that of its
+    class, else the default one. Agents that drivers may not control (`controllable_agents`) are
+    left to the world.
     """
 
     def __init__(
@@ -42,14 +52,22 @@ class Traffic:
         by_class: Mapping[AgentClass, int],
         by_id: Mapping[int, int],
     ) -> None:
-        """A table of indices into `drivers`."""
+        """Creates a table.
+
+        Args:
+            drivers: the drivers, which the other arguments refer to by index.
+            default: driver of the agents that neither mapping covers.
+            by_class: driver of each class.
+            by_id: driver of each agent id.
+        """
         self.drivers = tuple(drivers)
         self._of_class = np.full(len(AgentClass), default)
-        for kind, number in by_class.items():
-            self._of_class[kind] = number
+        for kind, index in by_class.items():
+            self._of_class[kind] = index
         self._ids = np.array(sorted(by_id), dtype=np.int64)
         self._of_id = np.array([by_id[key] for key in sorted(by_id)], dtype=np.int64)
         self._masks = np.zeros((len(drivers), 0, 0), dtype=bool)
+        """The agents of each driver: (drivers, B, A)."""
 
     def reset(
         self,
@@ -57,27 +75,28 @@ class Traffic:
         reset_mask: Bool[np.ndarray, " b"],
         agent_mask: Bool[np.ndarray, "b a"] | None = None,
     ) -> None:
-        """Deals the agents of the new episodes."""
-        ids, driven = world.episodes.ids, vehicles(world) if agent_mask is None else agent_mask
-        number = self._of_class[world.episodes.classes]
+        """Assigns the agents of the new episodes; drivers without any agent are not reset."""
+        ids = world.episodes.ids
+        agents = controllable_agents(world) if agent_mask is None else agent_mask
+        index = self._of_class[world.episodes.classes]
         if len(self._ids):
-            at = np.searchsorted(self._ids, ids).clip(max=len(self._ids) - 1)
-            number = np.where(self._ids[at] == ids, self._of_id[at], number)
+            position = np.searchsorted(self._ids, ids).clip(max=len(self._ids) - 1)
+            index = np.where(self._ids[position] == ids, self._of_id[position], index)
         self._masks = resized(self._masks, (len(self.drivers), *ids.shape))
-        dealt = driven & (number == np.arange(len(self.drivers))[:, None, None])
-        self._masks[:, reset_mask] = dealt[:, reset_mask]
-        for driver, theirs in zip(self.drivers, self._masks, strict=True):
-            if theirs.any():
-                driver.reset(world, reset_mask, theirs.copy())
+        assigned = agents & (index == np.arange(len(self.drivers))[:, None, None])
+        self._masks[:, reset_mask] = assigned[:, reset_mask]
+        for driver, mask in zip(self.drivers, self._masks, strict=True):
+            if mask.any():
+                driver.reset(world, reset_mask, mask.copy())
 
     def control(self, world: World) -> Control:
-        """What all of them say, each of its own agents."""
+        """The controls of all drivers, merged; drivers without any agent are not called."""
         merged = no_control(world.episodes.ids.shape)
-        for driver, theirs in zip(self.drivers, self._masks, strict=True):
-            if theirs.any():
+        for driver, mask in zip(self.drivers, self._masks, strict=True):
+            if mask.any():
                 control = driver.control(world)
-                np.copyto(merged.actions, control.actions, where=control.driven[..., None])
-                np.logical_or(merged.driven, control.driven, out=merged.driven)
+                np.copyto(merged.actions, control.actions, where=control.controlled[..., None])
+                np.logical_or(merged.controlled, control.controlled, out=merged.controlled)
                 np.logical_or(merged.leaving, control.leaving, out=merged.leaving)
         return merged
 
@@ -85,15 +104,15 @@ class Traffic:
 def make_traffic(
     spec: TrafficSpec | None, *, dt_s: float = DEFAULT_DT_S, default: str = LogDriver.name
 ) -> Driver:
-    """The driver, or table of drivers, of all agents that the caller does not move.
+    """The driver, or table of drivers, of all agents that the caller does not control.
 
     Args:
-        spec: a driver, or the name of one such as `idm` or `predictor:ssp-asp:RUN`; or a table
-            `{"default": "idm", "truck": "log", 17: driver}`, which as text is
-            `default=idm,truck=log,17=policy`. None, and a table without a default, leave the
-            others to the world.
-        dt_s: the time step of the world to come, for drivers that depend on it.
-        default: the name of the driver that leaves everybody to the world to come.
+        spec: a driver, or a name such as `idm` or `predictor:ssp-asp:RUN`; or a table such as
+            `{"default": "idm", "truck": "log", 17: driver}`, which may be given as the text
+            `default=idm,truck=log,17=policy`. Without a default, the other agents have the driver
+            `default`; None means all agents.
+        dt_s: length of a tick, for drivers that depend on it.
+        default: name of the driver that leaves all agents to the world (`World.traffic`).
 
     Raises:
         AspEnvError: a name is unknown, or a key is neither an id, a vehicle's class nor `default`.
@@ -103,7 +122,7 @@ def make_traffic(
     if isinstance(spec, str):
         if "=" not in spec.partition(":")[0]:
             return _make_driver(spec, dt_s)
-        spec = _parse(spec)
+        spec = _parse_table(spec)
     if not isinstance(spec, Mapping):
         if not isinstance(spec, Driver):
             raise AspEnvError(f"traffic {spec!r}: expected the name of a driver or a table of them")
@@ -111,8 +130,7 @@ def make_traffic(
     return _make_table({DEFAULT: default, **spec}, dt_s)
 
 
-def _parse(text: str) -> dict[str, str]:
-    """`idm` stands for itself; `default=idm,17=log` for a table."""
+def _parse_table(text: str) -> dict[str, str]:
     table: dict[str, str] = {}
     for pair in _NEXT_PAIR.split(text):
         key, _, name = (part.strip() for part in pair.partition("="))
@@ -124,33 +142,33 @@ def _parse(text: str) -> dict[str, str]:
 
 def _make_table(spec: Mapping[Any, str | Driver], dt_s: float) -> Traffic:
     drivers: list[Driver] = []
-    numbers: dict[str | int, int] = {}
+    indices: dict[str | int, int] = {}
     by_class: dict[AgentClass, int] = {}
     by_id: dict[int, int] = {}
     default = 0
     for key, value in spec.items():
         name = value if isinstance(value, str) else id(value)
-        if name not in numbers:
-            numbers[name] = len(drivers)
+        if name not in indices:
+            indices[name] = len(drivers)
             drivers.append(make_traffic(value, dt_s=dt_s))
         if key == DEFAULT:
-            default = numbers[name]
+            default = indices[name]
         elif isinstance(key, str) and not key.isdigit():
-            by_class[_vehicle_class(key)] = numbers[name]
+            by_class[_controllable_class(key)] = indices[name]
         elif int(key) >= 0:
-            by_id[int(key)] = numbers[name]
+            by_id[int(key)] = indices[name]
         else:
             raise AspEnvError(f"traffic for {key}: expected {_KEYS}")
     return Traffic(drivers, default=default, by_class=by_class, by_id=by_id)
 
 
-def _vehicle_class(key: str) -> AgentClass:
+def _controllable_class(key: str) -> AgentClass:
     try:
         kind = parse_class(key)
     except DataError:
         raise AspEnvError(f"traffic for {key!r}: expected {_KEYS}") from None
-    if kind not in DRIVABLE:
-        raise AspEnvError(f"traffic for {key!r}: only vehicles are driven; expected {_KEYS}")
+    if kind not in CONTROLLABLE:
+        raise AspEnvError(f"traffic for {key!r}: only vehicles have drivers; expected {_KEYS}")
     return kind
 
 

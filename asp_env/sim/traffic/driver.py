@@ -1,4 +1,4 @@
-"""The socket for drivers, and what all of them need."""
+"""The socket for drivers, which control agents other than the ego, and what drivers share."""
 
 from dataclasses import dataclass
 from typing import Any, ClassVar, Generic, Protocol, TypeVar, runtime_checkable
@@ -12,29 +12,35 @@ from asp_env.errors import AspEnvError
 from asp_env.sim.world import World
 
 Value = TypeVar("Value")
-Made = TypeVar("Made", bound="BaseDriver")
+AnyDriver = TypeVar("AnyDriver", bound="BaseDriver")
 
-LEAVES_BEYOND_M = 10.0
-"""Where nobody was ever recorded within this distance, a driven agent leaves the episode."""
+CONTROLLABLE = PREDICTED | {AgentClass.BICYCLE}
+"""The classes of agents that drivers may control."""
+
+EXIT_MARGIN_M = 10.0
+"""A controlled agent leaves the episode this far outside the area of all recorded positions.
+Chosen by hand."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Control:
-    """What a driver wants its agents to do in the coming tick."""
+    """What a driver's agents do in the coming tick."""
 
     actions: Float[np.ndarray, "b a 2"]
-    driven: Bool[np.ndarray, "b a"]
-    """Who obeys them. Somebody who is not there yet stays away for as long as it is driven."""
+    """[acceleration m/s², steering rad]; zero for agents that are not controlled."""
+    controlled: Bool[np.ndarray, "b a"]
+    """Mask of agents that execute their action. An agent that is controlled before it appears stays
+    absent."""
     leaving: Bool[np.ndarray, "b a"]
-    """Who is gone from now on, or never comes."""
+    """Mask of agents that leave now, or that will never appear."""
 
 
 @runtime_checkable
 class Driver(Protocol):
-    """Moves some agents of one world. It may keep arrays between ticks, made anew by `reset`.
+    """Controls some agents of a world. It may store arrays between ticks, which `reset` renews.
 
-    A deep copy is a snapshot of its memory: recordings, predictors and whatever else never changes
-    should be shared by the copies (`Shared`).
+    A deep copy is a snapshot of its memory. Values that never change, such as recordings and
+    predictors, should be shared by the copies (`Shared`).
     """
 
     def reset(
@@ -43,118 +49,56 @@ class Driver(Protocol):
         reset_mask: Bool[np.ndarray, " b"],
         agent_mask: Bool[np.ndarray, "b a"] | None = None,
     ) -> None:
-        """The episodes at `reset_mask` have just begun; sizes of the world's arrays may have changed.
+        """Prepares for episodes that have just started; the sizes of arrays may have changed.
 
         Args:
-            world: what is driven in.
-            reset_mask: the new episodes. The others go on.
-            agent_mask: the agents of all episodes that are this driver's, fixed for an episode; by
-                default all vehicles but the ego.
+            world: the world with all episodes.
+            reset_mask: mask of the new episodes.
+            agent_mask: mask of the driver's agents in all episodes, constant during an episode; by
+                default `controllable_agents`.
+
+        Raises:
+            AspEnvError: the driver does not fit the world.
         """
         ...
 
     def control(self, world: World) -> Control:
-        """What its agents do from now to the next tick; nothing for anybody else."""
+        """What the driver's agents do from now to the next tick."""
         ...
 
 
 @runtime_checkable
 class DriverPlug(Protocol):
-    """What the registry holds under a driver's name."""
+    """What is registered under a driver's name in the entry point group `asp_env.drivers`."""
 
     def from_name(self, argument: str, *, dt_s: float) -> Driver:
-        """The driver for what stands behind the colon of its name, possibly nothing.
+        """Creates a driver.
+
+        Args:
+            argument: the part of the name after the first colon, possibly empty.
+            dt_s: length of a tick.
 
         Raises:
-            AspEnvError: the argument is missing, superfluous, or not understood.
+            AspEnvError: the argument is missing, superfluous or invalid.
         """
         ...
 
 
-class Shared(Generic[Value]):
-    """Something that all copies of its owner have in common, since it never changes."""
-
-    def __init__(self, value: Value) -> None:
-        """Holds the value."""
-        self.value = value
-
-    def __deepcopy__(self, memo: dict[int, Any]) -> "Shared[Value]":
-        """Itself."""
-        del memo
-        return self
-
-
-def vehicles(world: World) -> Bool[np.ndarray, "b a"]:
-    """Who can be driven: vehicles and bicycles that are not parked, but not the ego.
-
-    Pedestrians, animals, trailers and parked vehicles are always left to the world.
-    """
-    kinds = [int(kind) for kind in PREDICTED | {AgentClass.BICYCLE}]
-    episodes = world.episodes
-    found = np.isin(episodes.classes, kinds) & ~episodes.parked & (episodes.ids >= 0)
-    found[:, EGO] = False
-    return found
-
-
-def no_control(shape: tuple[int, int]) -> Control:
-    """Nobody is driven."""
-    return Control(
-        actions=np.zeros((*shape, 2), dtype=np.float32),
-        driven=np.zeros(shape, dtype=bool),
-        leaving=np.zeros(shape, dtype=bool),
-    )
-
-
-def resized(array: Shaped[np.ndarray, "..."], shape: tuple[int, ...]) -> Shaped[np.ndarray, "..."]:
-    """The array itself if it has that shape, else one that has, filled up with zeros."""
-    if array.shape == shape:
-        return array
-    out = np.zeros(shape, dtype=array.dtype)
-    common = tuple(slice(min(have, want)) for have, want in zip(array.shape, shape, strict=True))
-    out[common] = array[common]
-    return out
-
-
-def areas(world: World) -> Float[np.ndarray, "b 4"]:
-    """Of each episode, smallest x and y and largest x and y beyond which an agent leaves."""
-    numbers, index = np.unique(world.episodes.recording, return_inverse=True)
-    found = np.array([world.recordings[int(number)].extent_m for number in numbers])
-    return (found + LEAVES_BEYOND_M * np.array([-1, -1, 1, 1]))[index]
-
-
-def outside(
-    states: Float[np.ndarray, "b a 4"], area: Float[np.ndarray, "b 4"]
-) -> Bool[np.ndarray, "b a"]:
-    """Whose centre lies outside of its episode's area."""
-    x, y = states[..., 0], states[..., 1]
-    low_x, low_y, high_x, high_y = (area[:, i, None] for i in range(4))
-    return (x < low_x) | (x > high_x) | (y < low_y) | (y > high_y)
-
-
-def check_replayed(world: World, who: str) -> None:
-    """Refuses a world in which those whom nobody drives do not replay their log.
-
-    Raises:
-        AspEnvError: this is one.
-    """
-    if world.traffic != "log":
-        raise AspEnvError(
-            f"traffic {who}: in this world nobody replays a log, its vehicles drive themselves; "
-            f"use {world.traffic}, idm or predictor:NAME, or recordings in a folder as DATA"
-        )
-
-
 class BaseDriver:
-    """Drivers whose name says it all: what the registry asks of them."""
+    """Base of drivers without an argument: their plug."""
 
     name: ClassVar[str]
 
     @classmethod
-    def from_name(cls: type[Made], argument: str, *, dt_s: float) -> Made:
-        """The driver, which takes no argument.
+    def from_name(cls: type[AnyDriver], argument: str, *, dt_s: float) -> AnyDriver:
+        """Creates the driver.
+
+        Args:
+            argument: must be empty.
+            dt_s: not used.
 
         Raises:
-            AspEnvError: there is one.
+            AspEnvError: there is an argument.
         """
         del dt_s
         if argument:
@@ -162,3 +106,78 @@ class BaseDriver:
                 f"driver {cls.name} takes no argument, {argument!r} was given: use {cls.name}"
             )
         return cls()
+
+
+class Shared(Generic[Value]):
+    """A value that deep copies of its owner share, because it never changes."""
+
+    def __init__(self, value: Value) -> None:
+        self.value = value
+
+    def __deepcopy__(self, memo: dict[int, Any]) -> "Shared[Value]":
+        del memo
+        return self
+
+
+def no_control(shape: tuple[int, int]) -> Control:
+    """A control of no agents, of shape (B, A)."""
+    return Control(
+        actions=np.zeros((*shape, 2), dtype=np.float32),
+        controlled=np.zeros(shape, dtype=bool),
+        leaving=np.zeros(shape, dtype=bool),
+    )
+
+
+def controllable_agents(world: World) -> Bool[np.ndarray, "b a"]:
+    """Mask of agents that drivers may control: vehicles and bicycles, not parked, not the ego.
+
+    The world always moves pedestrians, animals, trailers and parked vehicles.
+    """
+    episodes = world.episodes
+    mask = np.isin(episodes.classes, [int(kind) for kind in CONTROLLABLE])
+    mask &= ~episodes.parked & (episodes.ids >= 0)
+    mask[:, EGO] = False
+    return mask
+
+
+def exit_bounds(world: World) -> Float[np.ndarray, "b 4"]:
+    """The area of each episode beyond which agents leave: [min x, min y, max x, max y], m."""
+    numbers, index = np.unique(world.episodes.recording, return_inverse=True)
+    extents = np.array([world.recordings[int(number)].extent_m for number in numbers])
+    return (extents + EXIT_MARGIN_M * np.array([-1, -1, 1, 1]))[index]
+
+
+def outside_bounds(
+    states: Float[np.ndarray, "b a 4"], bounds: Float[np.ndarray, "b 4"]
+) -> Bool[np.ndarray, "b a"]:
+    """Mask of agents whose centre is outside the bounds [min x, min y, max x, max y], m."""
+    x, y = states[..., 0], states[..., 1]
+    min_x, min_y, max_x, max_y = (bounds[:, i, None] for i in range(4))
+    return (x < min_x) | (x > max_x) | (y < min_y) | (y > max_y)
+
+
+def resized(array: Shaped[np.ndarray, "..."], shape: tuple[int, ...]) -> Shaped[np.ndarray, "..."]:
+    """The array itself if it has this shape, else a cropped copy padded with zeros."""
+    if array.shape == shape:
+        return array
+    out = np.zeros(shape, dtype=array.dtype)
+    common = tuple(slice(min(sizes)) for sizes in zip(array.shape, shape, strict=True))
+    out[common] = array[common]
+    return out
+
+
+def require_replay(world: World, driver: str) -> None:
+    """Checks that uncontrolled agents replay their recorded tracks.
+
+    Args:
+        world: the world to check.
+        driver: name of the driver that requires it, for the message.
+
+    Raises:
+        AspEnvError: they do not.
+    """
+    if world.traffic != "log":
+        raise AspEnvError(
+            f"traffic {driver}: this world replays no tracks, its vehicles drive themselves; "
+            f"use {world.traffic}, idm or predictor:NAME, or recordings in a folder as DATA"
+        )

@@ -1,7 +1,7 @@
-"""Agents that move as recorded: position by position, or by the actions of their log.
+"""Drivers without a model: of recorded traffic, of self-driving worlds, and of the caller's agents.
 
-MERGED: Agents that the world itself drives.
-MERGED: Agents of the caller.
+`log` and `own` leave all agents to the world, `log-actions` executes recorded actions, and `policy`
+reserves its agents for the caller.
 """
 
 from typing import no_type_check
@@ -15,18 +15,18 @@ from asp_env.errors import AspEnvError
 from asp_env.sim.traffic.driver import (
     BaseDriver,
     Control,
-    areas,
-    check_replayed,
+    controllable_agents,
+    exit_bounds,
     no_control,
-    outside,
+    outside_bounds,
+    require_replay,
     resized,
-    vehicles,
 )
 from asp_env.sim.world import World
 
 
 class LogDriver(BaseDriver):
-    """Everybody moves exactly as recorded."""
+    """All agents replay their recorded tracks."""
 
     name = "log"
 
@@ -36,86 +36,21 @@ class LogDriver(BaseDriver):
         reset_mask: Bool[np.ndarray, " b"],
         agent_mask: Bool[np.ndarray, "b a"] | None = None,
     ) -> None:
-        """Nothing to prepare.
+        """Checks that the world replays tracks.
 
         Raises:
-            AspEnvError: the world replays nobody.
+            AspEnvError: it does not.
         """
         del reset_mask, agent_mask
-        check_replayed(world, self.name)
+        require_replay(world, self.name)
 
     def control(self, world: World) -> Control:
-        """Nobody is driven: the world replays."""
+        """No agent is controlled."""
         return no_control(world.episodes.ids.shape)
 
 
-@njit(cache=True)
-@no_type_check
-def _logged(wanted, lasts, agent_mask, valid, now, elapsed, actions, driven, leaving):
-    for b in range(len(now)):
-        step = min(elapsed[b], lasts.shape[1] - 1)
-        for a in range(agent_mask.shape[1]):
-            if not agent_mask[b, a]:
-                continue
-            if lasts[b, step, a]:
-                driven[b, a] = True
-                actions[b, a, 0], actions[b, a, 1] = wanted[b, step, a, 0], wanted[b, step, a, 1]
-            elif valid[b, now[b], a]:
-                leaving[b, a] = True
-
-
-class LogActionsDriver(BaseDriver):
-    """Vehicles carry out the actions inferred from their log, whatever comes of it.
-
-    A vehicle leaves when its log ends.
-    """
-
-    name = "log-actions"
-
-    def __init__(self) -> None:
-        """A driver without agents; `reset` gives it some."""
-        self._agent_mask = np.zeros((0, 0), dtype=bool)
-        self._actions = np.zeros((0, 0, 0, 2), dtype=np.float32)
-        self._lasts = np.zeros((0, 0, 0), dtype=bool)
-
-    def reset(
-        self,
-        world: World,
-        reset_mask: Bool[np.ndarray, " b"],
-        agent_mask: Bool[np.ndarray, "b a"] | None = None,
-    ) -> None:
-        """Infers the actions of the new episodes' logs."""
-        self._agent_mask = vehicles(world) if agent_mask is None else agent_mask
-        episodes = world.episodes
-        states, valid = (
-            episodes.log_states[reset_mask, world.history :],
-            episodes.log_valid[reset_mask],
-        )
-        valid = valid[:, world.history :]
-        shape = (len(world), valid.shape[1] - 1, valid.shape[2])
-        self._lasts = resized(self._lasts, shape)
-        self._actions = resized(self._actions, (*shape, 2))
-        lasts = valid[:, :-1] & valid[:, 1:] & self._agent_mask[reset_mask][:, None]
-        lengths = np.maximum(episodes.sizes[reset_mask, None, :, 0], 0.1)
-        actions = inverse(states[:, :-1], states[:, 1:], lengths, world.dt_s)
-        self._actions[reset_mask], self._lasts[reset_mask] = (
-            np.where(lasts[..., None], actions, 0),
-            lasts,
-        )
-
-    def control(self, world: World) -> Control:
-        """The logged actions of this tick; somebody who leaves a gap in its log is gone."""
-        episodes = world.episodes
-        out = no_control(episodes.ids.shape)
-        _logged(
-            self._actions, self._lasts, self._agent_mask, episodes.valid, world.now, episodes.elapsed,
-            out.actions, out.driven, out.leaving,
-        )  # fmt: skip
-        return out
-
-
 class OwnDriver(BaseDriver):
-    """Everybody is left to a world whose vehicles drive themselves."""
+    """All agents are left to a world whose vehicles drive themselves."""
 
     name = "own"
 
@@ -125,10 +60,10 @@ class OwnDriver(BaseDriver):
         reset_mask: Bool[np.ndarray, " b"],
         agent_mask: Bool[np.ndarray, "b a"] | None = None,
     ) -> None:
-        """Nothing to prepare.
+        """Checks that the vehicles of the world drive themselves.
 
         Raises:
-            AspEnvError: the world has no drivers of its own.
+            AspEnvError: they do not.
         """
         del reset_mask, agent_mask
         if world.traffic != self.name:
@@ -138,23 +73,23 @@ class OwnDriver(BaseDriver):
             )
 
     def control(self, world: World) -> Control:
-        """Nobody is driven by anybody else."""
+        """No agent is controlled."""
         return no_control(world.episodes.ids.shape)
 
 
-class PolicyDriver(BaseDriver):
-    """The caller moves its agents by `Simulation.step_agents`.
+class LogActionsDriver(BaseDriver):
+    """Vehicles execute the actions inferred from their tracks, regardless of where these lead.
 
-    At a tick at which the caller does not, an agent goes on as it is: no acceleration, no steering.
-    One that comes 10 m beyond all recorded positions then leaves.
+    A vehicle leaves when its track ends.
     """
 
-    name = "policy"
+    name = "log-actions"
 
     def __init__(self) -> None:
-        """A driver without agents; `reset` gives it some."""
         self._agent_mask = np.zeros((0, 0), dtype=bool)
-        self._areas = np.zeros((0, 4))
+        self._actions = np.zeros((0, 0, 0, 2), dtype=np.float32)
+        """[acceleration m/s², steering rad] from each tick to the next: (B, ticks, A, 2)."""
+        self._action_valid = np.zeros((0, 0, 0), dtype=bool)
 
     def reset(
         self,
@@ -162,15 +97,91 @@ class PolicyDriver(BaseDriver):
         reset_mask: Bool[np.ndarray, " b"],
         agent_mask: Bool[np.ndarray, "b a"] | None = None,
     ) -> None:
-        """Remembers whose the agents are."""
-        self._agent_mask = vehicles(world) if agent_mask is None else agent_mask
-        self._areas = resized(self._areas, (len(world), 4))
-        self._areas[reset_mask] = areas(world)[reset_mask]
+        """Infers the actions of the new episodes' tracks."""
+        self._agent_mask = controllable_agents(world) if agent_mask is None else agent_mask
+        episodes = world.episodes
+        states = episodes.log_states[reset_mask, world.history :]
+        valid = episodes.log_valid[reset_mask][:, world.history :]
+        shape = (len(world), valid.shape[1] - 1, valid.shape[2])
+        self._action_valid = resized(self._action_valid, shape)
+        self._actions = resized(self._actions, (*shape, 2))
+        both = valid[:, :-1] & valid[:, 1:] & self._agent_mask[reset_mask][:, None]
+        lengths = np.maximum(episodes.sizes[reset_mask, None, :, 0], 0.1)
+        actions = inverse(states[:, :-1], states[:, 1:], lengths, world.dt_s)
+        self._actions[reset_mask] = np.where(both[..., None], actions, 0)
+        self._action_valid[reset_mask] = both
 
     def control(self, world: World) -> Control:
-        """Straight on, for those whom the caller leaves alone."""
+        """The recorded actions of this tick; a vehicle whose track has a gap leaves."""
+        episodes = world.episodes
+        control = no_control(episodes.ids.shape)
+        _recorded_control(
+            *(self._actions, self._action_valid, self._agent_mask),
+            *(episodes.valid, world.now, episodes.elapsed),
+            *(control.actions, control.controlled, control.leaving),
+        )
+        return control
+
+
+@njit(cache=True)
+@no_type_check
+def _recorded_control(
+    recorded, recorded_valid, agent_mask, valid, now, elapsed, actions, controlled, leaving
+):
+    """Fills in a control with the recorded actions of the present tick.
+
+    Args:
+        recorded: (B, T, A, 2) recorded actions [acceleration m/s², steering rad].
+        recorded_valid: (B, T, A) mask of recorded actions.
+        agent_mask: (B, A) mask of the driver's agents.
+        valid: (B, K, A) mask of present agents.
+        now: (B,) index of the present tick on the axis K.
+        elapsed: (B,) index of the present tick on the axis T.
+        actions: (B, A, 2), written.
+        controlled: (B, A), written.
+        leaving: (B, A), written.
+    """
+    for b in range(len(now)):
+        step = min(elapsed[b], recorded_valid.shape[1] - 1)
+        for a in range(agent_mask.shape[1]):
+            if not agent_mask[b, a]:
+                continue
+            if recorded_valid[b, step, a]:
+                controlled[b, a] = True
+                actions[b, a, 0] = recorded[b, step, a, 0]
+                actions[b, a, 1] = recorded[b, step, a, 1]
+            elif valid[b, now[b], a]:
+                leaving[b, a] = True
+
+
+class PolicyDriver(BaseDriver):
+    """Reserves its agents for the caller of `Simulation.step_agents`.
+
+    An agent that the caller does not control at a tick continues without acceleration or steering.
+    It leaves 10 m outside the area of all recorded positions.
+    """
+
+    name = "policy"
+
+    def __init__(self) -> None:
+        self._agent_mask = np.zeros((0, 0), dtype=bool)
+        self._bounds = np.zeros((0, 4))
+
+    def reset(
+        self,
+        world: World,
+        reset_mask: Bool[np.ndarray, " b"],
+        agent_mask: Bool[np.ndarray, "b a"] | None = None,
+    ) -> None:
+        """Stores the agents and the bounds of the new episodes."""
+        self._agent_mask = controllable_agents(world) if agent_mask is None else agent_mask
+        self._bounds = resized(self._bounds, (len(world), 4))
+        self._bounds[reset_mask] = exit_bounds(world)[reset_mask]
+
+    def control(self, world: World) -> Control:
+        """Zero actions for all present agents."""
         episodes, rows = world.episodes, np.arange(len(world))
-        driven = self._agent_mask & episodes.valid[rows, world.now]
-        leaving = driven & outside(episodes.states[rows, world.now], self._areas)
-        nothing = no_control(driven.shape)
-        return Control(actions=nothing.actions, driven=driven & ~leaving, leaving=leaving)
+        present = self._agent_mask & episodes.valid[rows, world.now]
+        leaving = present & outside_bounds(episodes.states[rows, world.now], self._bounds)
+        actions = no_control(present.shape).actions
+        return Control(actions=actions, controlled=present & ~leaving, leaving=leaving)

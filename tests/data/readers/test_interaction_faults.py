@@ -1,4 +1,4 @@
-"""Whatever is wrong with INTERACTION's files: one line that names file and line, others open."""
+"""Damaged files of the INTERACTION layout: one line that names file and line; others open."""
 
 from collections.abc import Callable
 from pathlib import Path
@@ -15,7 +15,7 @@ from asp_env.data.readers.interaction import (
     read_interaction,
     read_meta,
 )
-from asp_env.data.readers.levelx import TrackTable
+from asp_env.data.readers.layout import TrackTable
 from asp_env.data.source import open_data
 from asp_env.errors import DataError
 from tests.data.interaction_files import (
@@ -27,19 +27,19 @@ from tests.data.interaction_files import (
     write_taf_bw,
 )
 
-VEHICLES, WALKERS, META = "vehicle_tracks_000.csv", "pedestrian_tracks_000.csv", "meta_data.csv"
+VEHICLES, PEDESTRIANS, META = "vehicle_tracks_000.csv", "pedestrian_tracks_000.csv", "meta_data.csv"
 
 
 @pytest.fixture
 def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-    """A good recording with pedestrians and another one, and a cache of its own."""
+    """A valid recording with pedestrians and another one without, and an empty cache."""
     monkeypatch.setenv("ASP_ENV_CACHE", str(tmp_path / "cache"))
     folder = write_folder(tmp_path / "folder", recordings=2)
     write_recording(folder, pedestrians=walk("P1", (0, 0), (0, 1), 20))
     return folder
 
 
-def cell(name: str, line: int, column: int, value: str) -> Callable[[Path], None]:
+def set_cell(name: str, line: int, column: int, value: str) -> Callable[[Path], None]:
     """A fault: one cell of a line (from 1) reads `value`."""
 
     def apply(folder: Path) -> None:
@@ -52,8 +52,8 @@ def cell(name: str, line: int, column: int, value: str) -> Callable[[Path], None
     return apply
 
 
-def content(name: str, change: Callable[[str], str]) -> Callable[[Path], None]:
-    """A fault: what a file holds is changed as a whole."""
+def change_content(name: str, change: Callable[[str], str]) -> Callable[[Path], None]:
+    """A fault: the whole content of a file is changed."""
 
     def apply(folder: Path) -> None:
         path = next(folder.rglob(name))
@@ -62,9 +62,9 @@ def content(name: str, change: Callable[[str], str]) -> Callable[[Path], None]:
     return apply
 
 
-def line_again(name: str, line: int) -> Callable[[Path], None]:
-    """A fault: a line is there twice, the second time at the end."""
-    return content(name, lambda text: text + text.splitlines()[line - 1] + "\n")
+def repeat_line(name: str, line: int) -> Callable[[Path], None]:
+    """A fault: a line is repeated at the end."""
+    return change_content(name, lambda text: text + text.splitlines()[line - 1] + "\n")
 
 
 def remove(pattern: str) -> Callable[[Path], None]:
@@ -78,26 +78,26 @@ def scaled_times(by: float) -> Callable[[Path], None]:
     def change(text: str) -> str:
         head, *lines = text.splitlines()
         cells = [line.split(",") for line in lines]
-        told = [",".join([*c[:2], f"{float(c[2]) * by:g}", *c[3:]]) for c in cells]
-        return "\n".join([head, *told]) + "\n"
+        scaled = [",".join([*c[:2], f"{float(c[2]) * by:g}", *c[3:]]) for c in cells]
+        return "\n".join([head, *scaled]) + "\n"
 
-    return content(VEHICLES, change)
+    return change_content(VEHICLES, change)
 
 
 def few_rows(count: int) -> Callable[[Path], None]:
-    """A fault: a vehicle is seen for some frames and nobody else at all."""
+    """A fault: there are only the first rows of one vehicle."""
 
     def apply(folder: Path) -> None:
-        remove(WALKERS)(folder)
-        content(VEHICLES, lambda text: "\n".join(text.splitlines()[: count + 1]))(
+        remove(PEDESTRIANS)(folder)
+        change_content(VEHICLES, lambda text: "\n".join(text.splitlines()[: count + 1]))(
             folder / "recorded_trackfiles"
         )
 
     return apply
 
 
-def meta(row: str, header: str = "id,originLat,originLon") -> Callable[[Path], None]:
-    """A fault: metadata that say this."""
+def set_metadata(row: str, header: str = "id,originLat,originLon") -> Callable[[Path], None]:
+    """A fault: metadata with this row."""
 
     def apply(folder: Path) -> None:
         (folder / "recorded_trackfiles" / PLACE / META).write_text(f"{header}\n{row}\n")
@@ -106,77 +106,89 @@ def meta(row: str, header: str = "id,originLat,originLon") -> Callable[[Path], N
 
 
 FAULTS = {
-    "column missing": (cell(VEHICLES, 1, 4, "x_m"), [VEHICLES, "lacks the column 'x'", "x_m"]),
-    "no times": (cell(VEHICLES, 1, 2, "t"), [VEHICLES, "lacks the column 'timestamp_ms'"]),
-    "column of pedestrians missing": (cell(WALKERS, 1, 5, "lat"), [WALKERS, "'y'"]),
-    "NaN position": (cell(VEHICLES, 11, 4, "nan"), [f"{VEHICLES}, line 11", "x is 'nan'"]),
-    "NaN heading": (cell(VEHICLES, 11, 8, "NaN"), [f"{VEHICLES}, line 11", "psi_rad", "finite"]),
-    "empty cell": (cell(VEHICLES, 30, 5, ""), [f"{VEHICLES}, line 30", "y is ''", "a number"]),
-    "word": (cell(WALKERS, 9, 4, "here"), [f"{WALKERS}, line 9", "x is 'here'"]),
-    "half an id": (cell(VEHICLES, 9, 0, "1.5"), [f"{VEHICLES}, line 9", "whole number"]),
+    "column missing": (set_cell(VEHICLES, 1, 4, "x_m"), [VEHICLES, "lacks the column 'x'", "x_m"]),
+    "no times": (set_cell(VEHICLES, 1, 2, "t"), [VEHICLES, "lacks the column 'timestamp_ms'"]),
+    "column of pedestrians missing": (set_cell(PEDESTRIANS, 1, 5, "lat"), [PEDESTRIANS, "'y'"]),
+    "NaN position": (set_cell(VEHICLES, 11, 4, "nan"), [f"{VEHICLES}, line 11", "x is 'nan'"]),
+    "NaN heading": (
+        set_cell(VEHICLES, 11, 8, "NaN"),
+        [f"{VEHICLES}, line 11", "psi_rad", "finite"],
+    ),
+    "empty cell": (set_cell(VEHICLES, 30, 5, ""), [f"{VEHICLES}, line 30", "y is ''", "a number"]),
+    "word": (set_cell(PEDESTRIANS, 9, 4, "here"), [f"{PEDESTRIANS}, line 9", "x is 'here'"]),
+    "half an id": (set_cell(VEHICLES, 9, 0, "1.5"), [f"{VEHICLES}, line 9", "whole number"]),
     "cut line": (
-        content(VEHICLES, lambda text: text[:-30]),
+        change_content(VEHICLES, lambda text: text[:-30]),
         [f"{VEHICLES}, line 274", "fields, expected 11", "copy the file again"],
     ),
-    "long line": (cell(VEHICLES, 9, 3, "car,car"), [f"{VEHICLES}, line 9", "has 12 fields"]),
-    "empty file": (content(VEHICLES, lambda _: ""), [VEHICLES, "is empty"]),
-    "empty pedestrians": (content(WALKERS, lambda _: ""), [WALKERS, "is empty"]),
+    "long line": (set_cell(VEHICLES, 9, 3, "car,car"), [f"{VEHICLES}, line 9", "has 12 fields"]),
+    "empty file": (change_content(VEHICLES, lambda _: ""), [VEHICLES, "is empty"]),
+    "empty pedestrians": (change_content(PEDESTRIANS, lambda _: ""), [PEDESTRIANS, "is empty"]),
     "header alone": (
-        content(VEHICLES, lambda text: text.splitlines()[0] + "\n"),
+        change_content(VEHICLES, lambda text: text.splitlines()[0] + "\n"),
         [VEHICLES, "has a header but no rows"],
     ),
     "unknown agent_type": (
-        cell(VEHICLES, 12, 3, "ufo"),
+        set_cell(VEHICLES, 12, 3, "ufo"),
         [f"{VEHICLES}, line 12", "unknown class 'ufo'", "car"],
     ),
-    "unknown agent_type on foot": (cell(WALKERS, 3, 3, ""), [f"{WALKERS}, line 3", "class ''"]),
+    "unknown agent_type of a pedestrian": (
+        set_cell(PEDESTRIANS, 3, 3, ""),
+        [f"{PEDESTRIANS}, line 3", "class ''"],
+    ),
     "row twice": (
-        line_again(VEHICLES, 20),
+        repeat_line(VEHICLES, 20),
         [f"{VEHICLES}, line 275", "second row of track 1 at 1800 ms", "remove one"],
     ),
     "row of a pedestrian twice": (
-        line_again(WALKERS, 4),
-        [f"{WALKERS}, line 22", "second row of track P1 at 200 ms"],
+        repeat_line(PEDESTRIANS, 4),
+        [f"{PEDESTRIANS}, line 22", "second row of track P1 at 200 ms"],
     ),
     "seconds": (scaled_times(0.001), [f"{VEHICLES}, line 2", "0.1 apart", "10000 Hz"]),
     "microseconds": (scaled_times(1000), [f"{VEHICLES}, line 2", "0.01 Hz", "milliseconds"]),
     "one time for all": (scaled_times(0), [f"{VEHICLES}, line 3", "second row of track 1 at 0"]),
     "between frames": (
-        cell(VEHICLES, 15, 2, "1350"),
+        set_cell(VEHICLES, 15, 2, "1350"),
         [f"{VEHICLES}, line 15", "timestamp_ms is 1350", "multiples of 100 ms"],
     ),
-    "another clock on foot": (
-        cell(WALKERS, 15, 2, "1340"),
-        [f"{WALKERS}, line 15", "timestamp_ms is 1340", "multiples of 100 ms"],
+    "another clock of pedestrians": (
+        set_cell(PEDESTRIANS, 15, 2, "1340"),
+        [f"{PEDESTRIANS}, line 15", "timestamp_ms is 1340", "multiples of 100 ms"],
     ),
-    "a row a track": (
+    "one row in each track": (
         few_rows(1),
-        [f"{VEHICLES}, line 2", "no track has a second row", "no frame rate can be told"],
+        [f"{VEHICLES}, line 2", "no track has a second row", "so there is no frame rate"],
     ),
-    "tracks of no length": (
+    "tracks too short": (
         few_rows(3),
         [VEHICLES, "no track lasts 0.5 s without a gap or jump"],
     ),
-    "pedestrians alone": (remove(VEHICLES), [VEHICLES, "no such file", f"{WALKERS} is there"]),
+    "pedestrians alone": (remove(VEHICLES), [VEHICLES, "no such file", f"{PEDESTRIANS} exists"]),
     "no map": (remove("*.osm"), [f"no map for location {PLACE}", f"maps/{PLACE}.osm"]),
     "map without lanelets": (
         lambda folder: write_map(folder, text="<osm></osm>") and None,
         [f"{PLACE}.osm", "has no lanelets"],
     ),
     "map of another place": (
-        meta("0,49.0,8.4"),
+        set_metadata("0,49.0,8.4"),
         [f"{PLACE}.osm", "expected it at its recordings' origin 49.0000, 8.4000", META],
     ),
-    "metadata of others": (meta("7,0,0"), [META, "no row whose id is 000"]),
-    "metadata without origin": (meta("0,0", "id,originLat"), [META, "lacks", "'originLon'"]),
-    "origin that is no number": (meta("0,0,east"), [f"{META}, line 2", "originLon is 'east'"]),
-    "origin off the globe": (meta("0,95,0"), [META, "originLat is 95", "-90 to 90"]),
+    "metadata of another recording": (set_metadata("7,0,0"), [META, "no row whose id is 000"]),
+    "metadata without origin": (
+        set_metadata("0,0", "id,originLat"),
+        [META, "lacks", "'originLon'"],
+    ),
+    "origin that is not a number": (
+        set_metadata("0,0,east"),
+        [f"{META}, line 2", "originLon is 'east'"],
+    ),
+    "origin off the globe": (set_metadata("0,95,0"), [META, "originLat is 95", "-90 to 90"]),
 }
 
 
 @pytest.mark.parametrize("name", FAULTS)
-def test_fault(folder: Path, name: str) -> None:
-    """Each fault is one line with what it takes to find it; only that recording suffers."""
+def test_each_fault_is_one_line(folder: Path, name: str) -> None:
+    """It names what is needed to find the fault; other recordings open."""
     spoil, expected = FAULTS[name]
     spoil(folder)
     recordings = open_data(folder)
@@ -191,7 +203,7 @@ def test_fault(folder: Path, name: str) -> None:
 
 
 def outcome(files: InteractionFiles) -> tuple[TrackTable, float] | str:
-    """What is read of a recording, or what is said of it."""
+    """The tracks and frame rate of a recording, or the error message."""
     try:
         read_meta(files)
         return read_interaction(files)
@@ -201,23 +213,24 @@ def outcome(files: InteractionFiles) -> tuple[TrackTable, float] | str:
 
 @settings(suppress_health_check=[HealthCheck.function_scoped_fixture])
 @given(
-    name=st.sampled_from([VEHICLES, WALKERS, META]),
-    at=st.floats(0, 1, exclude_max=True),
-    gone=st.integers(0, 40),
-    put=st.one_of(
+    name=st.sampled_from([VEHICLES, PEDESTRIANS, META]),
+    position=st.floats(0, 1, exclude_max=True),
+    removed=st.integers(0, 40),
+    inserted=st.one_of(
         st.binary(max_size=6),
         st.sampled_from([b"\n", b",", b'"', b"-", b"e9", b"1e400", b"nan", b"\xff\xfe", b"\r"]),
     ),
 )
-def test_any_damage(tmp_path: Path, name: str, at: float, gone: int, put: bytes) -> None:
-    """Whatever bytes are lost or changed: a recording of finite numbers, or one line on it."""
+def test_damaged_bytes_give_valid_states_or_one_line(
+    tmp_path: Path, name: str, position: float, removed: int, inserted: bytes
+) -> None:
     folder = tmp_path / "fuzzed"
     write_recording(folder, pedestrians=walk("P1", (0, 0), (0, 1), 20))
-    meta("0,0.0,0.0")(folder)
+    set_metadata("0,0.0,0.0")(folder)
     (path,) = folder.rglob(name)
     content = path.read_bytes()
-    begin = int(at * len(content))
-    path.write_bytes(content[:begin] + put + content[begin + gone :])
+    begin = int(position * len(content))
+    path.write_bytes(content[:begin] + inserted + content[begin + removed :])
     (files,) = find_recordings(folder)
     found = outcome(files)
     if isinstance(found, str):
@@ -232,20 +245,25 @@ def test_any_damage(tmp_path: Path, name: str, at: float, gone: int, put: bytes)
     assert (table.first_frames >= 0).all()
 
 
-def test_exit_status(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    """`inspect` shows the good ones, names the fault, and ends with status 2."""
+def test_inspect_shows_the_others_and_names_the_fault(
+    folder: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     FAULTS["NaN position"][0](folder)
     assert main(["inspect", str(folder)]) == 2
-    told = capsys.readouterr()
-    assert f"{PLACE}/001" in told.out
-    assert "Faults: 1" in told.out
-    assert told.err.startswith("asp-env: ")
-    assert told.err.count("\n") == 1
+    captured = capsys.readouterr()
+    assert f"{PLACE}/001" in captured.out
+    assert "Faults: 1" in captured.out
+    assert captured.err.startswith("asp-env: ")
+    assert captured.err.count("\n") == 1
 
 
-def test_taf_bw_without_metadata(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """A map in Germany of tracks that tell no origin: said, not drawn 5,000 km off."""
+def test_a_map_far_from_the_origin_is_refused(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A map in Germany, and tracks without metadata, whose origin is (0, 0)."""
     monkeypatch.setenv("ASP_ENV_CACHE", str(tmp_path / "cache"))
     (write_taf_bw(tmp_path / "data") / META).unlink()
-    with pytest.raises(DataError, match=r"lies about 49\.0051, 8\.4\d+, expected .*0\.0000, 0\.0"):
+    with pytest.raises(
+        DataError, match=r"lies at about 49\.0051, 8\.4\d+, expected .*0\.0000, 0\.0"
+    ):
         open_data(tmp_path / "data")[0]

@@ -1,47 +1,46 @@
-"""TAF-BW as published, beside the same recordings that others smoothed into the inD layout."""
+"""TAF-BW as published, compared with the same recordings in the inD layout, smoothed by others."""
 
 import gymnasium as gym
 import numpy as np
 import pytest
 from gymnasium.utils.env_checker import check_env
 
-import asp_env
 from asp_env.data.classes import AgentClass
 from asp_env.data.recording import Recording
 from asp_env.data.snippets import find_snippets
-from asp_env.data.source import Recordings
+from asp_env.data.source import Recordings, open_data
 from asp_env.evaluation.inspect import drift_m
 from asp_env.geometry import wrap_angle
 from tests.real_data import real_data
 
-SAME = {
+SAME_RECORDINGS = {
     "k733_2020-09-15/000": "00",
     "k729_2022-03-16/004": "05",
     "k729_2022-03-16/013": "14",
 }
-"""Of recordings in TAF-BW's own layout: their ids in the inD layout."""
+"""Names of recordings in TAF-BW's own layout, and their ids in the inD layout."""
 
-ON_FOOT = (AgentClass.BICYCLE, AgentClass.PEDESTRIAN)
+VULNERABLE = (AgentClass.BICYCLE, AgentClass.PEDESTRIAN)
 
 
 @pytest.fixture(scope="module")
 def published() -> Recordings:
     """The recordings as published."""
-    return asp_env.load(real_data("taf_bw"))
+    return open_data(real_data("taf_bw"))
 
 
 @pytest.fixture(scope="module")
 def smoothed() -> Recordings:
-    """All recordings of the same place, in the inD layout."""
-    return asp_env.load(real_data("karlsruhe"))
+    """All recordings of the same location, in the inD layout."""
+    return open_data(real_data("karlsruhe"))
 
 
-def both(recording: Recording, other: Recording) -> tuple[np.ndarray, np.ndarray]:
-    """The vehicles' states of both where tracks run within 1 m of one another, row by row."""
-    ours, theirs = [], []
-    for j in np.flatnonzero(~np.isin(other.classes, ON_FOOT)).tolist():
+def matching_states(recording: Recording, other: Recording) -> tuple[np.ndarray, np.ndarray]:
+    """The vehicles' states in both, row by row, where tracks run within 1 m of each other."""
+    states, other_states = [], []
+    for j in np.flatnonzero(~np.isin(other.classes, VULNERABLE)).tolist():
         pairs = []
-        for i in np.flatnonzero(~np.isin(recording.classes, ON_FOOT)).tolist():
+        for i in np.flatnonzero(~np.isin(recording.classes, VULNERABLE)).tolist():
             first = max(recording.first_frames[i], other.first_frames[j])
             end = min(recording.last_frames[i], other.last_frames[j]) + 1
             if end - first > 5:
@@ -50,22 +49,24 @@ def both(recording: Recording, other: Recording) -> tuple[np.ndarray, np.ndarray
                 pairs.append((float(np.median(np.hypot(*(one - two)[:, :2].T))), one, two))
         apart, one, two = min(pairs, key=lambda pair: pair[0])
         assert apart < 1.0
-        ours.append(one)
-        theirs.append(two)
-    return np.concatenate(ours).astype(float), np.concatenate(theirs).astype(float)
+        states.append(one)
+        other_states.append(two)
+    return np.concatenate(states).astype(float), np.concatenate(other_states).astype(float)
 
 
-@pytest.mark.parametrize("name", SAME)
-def test_agrees_with_the_smoothed(published: Recordings, smoothed: Recordings, name: str) -> None:
-    """Positions to centimetres, speeds and headings of what moves as far as their noise goes."""
+@pytest.mark.parametrize("name", SAME_RECORDINGS)
+def test_states_agree_with_smoothed_recordings(
+    published: Recordings, smoothed: Recordings, name: str
+) -> None:
+    """Positions to centimetres, speeds and headings of moving vehicles to their noise."""
     recording = published[published.names.index(name)]
-    other = smoothed[smoothed.names.index(SAME[name])]
+    other = smoothed[smoothed.names.index(SAME_RECORDINGS[name])]
     assert recording.frame_rate_hz == other.frame_rate_hz == 10
     assert recording.speed_limit_mps == pytest.approx(other.speed_limit_mps)
     np.testing.assert_allclose(
         recording.road_map.lanes.points, other.road_map.lanes.points, atol=1e-3
     )
-    one, two = both(recording, other)
+    one, two = matching_states(recording, other)
     apart_m = np.hypot(*(one - two)[:, :2].T)
     apart_mps = np.abs(np.abs(one[:, 3]) - np.abs(two[:, 3]))
     moves = np.abs(one[:, 3]) > 1
@@ -75,14 +76,14 @@ def test_agrees_with_the_smoothed(published: Recordings, smoothed: Recordings, n
     assert (np.percentile(apart_deg, [50, 90]) < [0.6, 5.0]).all()
 
 
-def test_drift_floor(published: Recordings) -> None:
-    """Actions inferred from these states lead along the track: 90 % of what moves to 0.2 m in 6 s.
+def test_inferred_actions_lead_along_the_tracks(published: Recordings) -> None:
+    """After 6 s, 90 % of the moving targets have drifted by less than 0.2 m.
 
-    Of the states in the inD layout 90 % lie within 4.3 m.
+    In the inD layout 90 % drift by less than 4.3 m.
     """
     metres, moves = [], []
     for recording in published:
-        index = find_snippets(recording, dt_s=0.2, history=15, horizon=30, every=3)
+        index = find_snippets(recording, dt_s=0.2, history=15, horizon_ticks=30, interval_ticks=3)
         apart, moving = drift_m(recording, *index, dt_s=0.2, horizon=30)
         metres.append(apart)
         moves.append(moving)
@@ -91,18 +92,17 @@ def test_drift_floor(published: Recordings) -> None:
     assert np.percentile(moving_m, 90) < 0.2
 
 
-def test_faults_of_the_files_are_told(published: Recordings) -> None:
-    """Tracker jumps of k733; no vehicle of it is turned around, though velocities are scaled."""
-    told = " ".join(published[published.names.index("k733_2020-09-15/000")].repairs)
-    assert "jumps of over 1.5 m in tracks, split there: 34 after 28000 ms" in told
-    assert "point backwards" not in told
+def test_jumps_are_repaired(published: Recordings) -> None:
+    """Tracker jumps of k733 are reported; no vehicle is reversed, though velocities are scaled."""
+    repairs = " ".join(published[published.names.index("k733_2020-09-15/000")].repairs)
+    assert "jumps of over 1.5 m in tracks, split there: 34 after 28000 ms" in repairs
+    assert "point backwards" not in repairs
     for recording in published:
         assert (recording.states[:, 3] > -1.0).all()
         assert (np.abs(recording.states[:, 3]) < 30).all()
 
 
-def test_environment(published: Recordings) -> None:
-    """The environment passes Gymnasium's checker on them."""
+def test_the_environment_passes_gymnasiums_checker(published: Recordings) -> None:
     env = gym.make("asp_env/Replay-v0", data=published.source)
     check_env(env.unwrapped, skip_render_check=True)
     env.close()

@@ -1,4 +1,4 @@
-"""Lanelet2 maps: frame, direction, topology, and what is mended."""
+"""Lanelet2 maps: frame, direction, topology, and repairs."""
 
 import math
 from collections.abc import Mapping, Sequence
@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from hypothesis import given
 
-from asp_env.data.readers.lanelet2 import Origin, project, read_lanelet2
+from asp_env.data.readers.lanelet2 import Origin, read_lanelet2, to_local
 from asp_env.data.road_map import LineType, RoadMap
 from asp_env.data.source import open_data
 from tests.data.levelx_files import ORIGIN_M, osm, two_lane_road
@@ -24,14 +24,14 @@ Lanelets = dict[str, tuple[Mapping[str, str], Mapping[str, str]]]
 
 
 def read(folder: Path, text: str) -> RoadMap:
-    """The map that a file with this content gives."""
+    """The map in a file with this content."""
     path = folder / "place.osm"
     path.write_text(text)
     return read_lanelet2(path, ORIGIN)
 
 
 def street(count: int, *, gap_m: float = 0.0, swapped: int = -1) -> str:
-    """Lanelets 0, 1, … of 10 m one behind the other along +x, 4 m wide about y = 0."""
+    """Lanelets 0, 1, … of 10 m in a row along +x, 4 m wide about y = 0."""
     ways: Ways = {}
     lanelets: Lanelets = {}
     for number in range(count):
@@ -44,23 +44,23 @@ def street(count: int, *, gap_m: float = 0.0, swapped: int = -1) -> str:
 
 
 def test_projection() -> None:
-    """On the equator the zone's middle, 9° east, lies at (500 km, 0 km) of zone 32."""
+    """On the equator the centre of zone 32, 9° east, is at (500 km, 0 km)."""
     origin = Origin(x_m=499_990.0, y_m=-5.0, longitude_deg=9.0, latitude_deg=0.0)
-    np.testing.assert_allclose(project(np.zeros(1), np.full(1, 9.0), origin), [[10.0, 5.0]])
+    np.testing.assert_allclose(to_local(np.zeros(1), np.full(1, 9.0), origin), [[10.0, 5.0]])
 
 
 @pytest.mark.parametrize(
     ("longitude", "latitude", "epsg"),
     [(6.1, 50.8, 32632), (5.99, 50.8, 32631), (8.4, 49.0, 32632), (18.4, -33.9, 32734)],
 )
-def test_zone(longitude: float, latitude: float, epsg: int) -> None:
+def test_utm_zone(longitude: float, latitude: float, epsg: int) -> None:
     """Zones are 6° wide from -180°, and counted from 32701 in the south."""
     origin = Origin(x_m=0.0, y_m=0.0, longitude_deg=longitude, latitude_deg=latitude)
     assert origin.epsg == epsg
 
 
 def test_two_lane_road(tmp_path: Path) -> None:
-    """Left on the left: the southern lane runs east at y = -21.75, the northern one west."""
+    """The southern lane runs east at y = -21.75, the northern one west."""
     road = read(tmp_path, two_lane_road())
     np.testing.assert_allclose(road.lanes[0], [(0, -21.75), (60, -21.75), (120, -21.75)], atol=1e-4)
     np.testing.assert_allclose(road.lanes[1], [(120, -18.25), (60, -18.25), (0, -18.25)], atol=1e-4)
@@ -85,10 +85,10 @@ def _area(ring: np.ndarray) -> float:
     turn=st.floats(-math.pi, math.pi),
     bend=st.floats(-0.2, 0.2),
 )
-def test_how_ways_are_drawn_does_not_matter(
+def test_the_order_of_a_ways_nodes_does_not_matter(
     tmp_path_factory: pytest.TempPathFactory, flips: list[bool], turn: float, bend: float
 ) -> None:
-    """Two lanes of a bend either way, ways drawn in any direction: roles alone tell where to."""
+    """Two opposite lanes of a bend, with ways drawn in any direction: only the roles count."""
     angles = turn + bend * np.arange(6)
     middle = np.cumsum(10.0 * np.stack([np.cos(angles), np.sin(angles)], axis=-1), axis=0)
     across = 3.5 * np.stack([-np.sin(angles), np.cos(angles)], axis=-1)
@@ -106,34 +106,33 @@ def test_how_ways_are_drawn_does_not_matter(
 
 @pytest.mark.parametrize(("gap_m", "edges"), [(0.0, [[0, 1], [1, 2]]), (0.4, [[0, 1], [1, 2]])])
 def test_successors(tmp_path: Path, gap_m: float, edges: list[list[int]]) -> None:
-    """Ends that share their nodes, or lie within 0.5 m, meet."""
+    """Ends that share nodes, or lie within 0.5 m, are connected."""
     assert read(tmp_path, street(3, gap_m=gap_m)).successors.tolist() == edges
 
 
-def test_a_gap_ends_the_lane(tmp_path: Path) -> None:
-    """Ends 0.6 m apart do not meet."""
+def test_ends_0_6_m_apart_are_not_connected(tmp_path: Path) -> None:
     assert len(read(tmp_path, street(3, gap_m=0.6)).successors) == 0
 
 
 @pytest.mark.parametrize("swapped", [0, 1, 2, 3])
-def test_swapped_sides_are_turned_around(tmp_path: Path, swapped: int) -> None:
-    """One of four lanelets in a row with left and right swapped: all run east again, and told."""
+def test_a_lanelet_with_swapped_bounds_is_reversed(tmp_path: Path, swapped: int) -> None:
+    """One of four lanelets in a row: afterwards all run east, and a repair is reported."""
     road = read(tmp_path, street(4, swapped=swapped))
     assert all(road.lanes[i][-1, 0] > road.lanes[i][0, 0] for i in range(4))
     assert road.successors.tolist() == [[0, 1], [1, 2], [2, 3]]
-    assert road.repairs == (f"1 lanelets with left and right swapped turned around: {swapped}",)
+    assert road.repairs == (f"1 lanelets with swapped left and right bounds reversed: {swapped}",)
 
 
-def test_two_that_disagree_are_left_alone(tmp_path: Path) -> None:
-    """Of two lanelets that meet head-on nobody knows which is wrong, so neither is turned."""
+def test_two_contradicting_lanelets_are_unchanged(tmp_path: Path) -> None:
+    """Of two lanelets that meet head-on either may be wrong."""
     road = read(tmp_path, street(2, swapped=1))
     assert road.lanes[0][-1, 0] > road.lanes[0][0, 0]
     assert road.lanes[1][-1, 0] < road.lanes[1][0, 0]
     assert road.repairs == ()
 
 
-def test_crossing_lanes_are_no_contradiction(tmp_path: Path) -> None:
-    """Opposite lanes side by side share a bound and end at its nodes, and nothing is turned."""
+def test_opposite_lanes_are_no_contradiction(tmp_path: Path) -> None:
+    """They share a bound and its end nodes, and none is reversed."""
     ways: Ways = {}
     lanelets: Lanelets = {}
     for number, (begin, end) in enumerate(pairwise((0.0, 10.0, 20.0, 30.0))):
@@ -159,7 +158,7 @@ def test_crossing_lanes_are_no_contradiction(tmp_path: Path) -> None:
     ],
 )
 def test_subtypes(tmp_path: Path, subtype: str | None, is_lane: bool, is_drivable: bool) -> None:
-    """Vehicles drive along roads, bus lanes and what is not specified, and over crosswalks."""
+    """Vehicles drive along roads, bus lanes and lanelets without subtype, and over crosswalks."""
     ways: Ways = {
         "far": ([(0, 50), (9, 50)], {}),
         "farther": ([(0, 54), (9, 54)], {}),
@@ -193,7 +192,7 @@ def test_subtypes(tmp_path: Path, subtype: str | None, is_lane: bool, is_drivabl
     ],
 )
 def test_line_types(tmp_path: Path, tags: dict[str, str], expected: LineType) -> None:
-    """The tags of a way tell its type; one without a type that two lanes share is dashed."""
+    """The tags of a way determine its type; a way without a type that two lanes share is dashed."""
     text = two_lane_road()
     old = "<tag k='type' v='line_thin' /><tag k='subtype' v='dashed' />"
     new = "".join(f"<tag k='{key}' v='{value}' />" for key, value in tags.items())
@@ -203,8 +202,8 @@ def test_line_types(tmp_path: Path, tags: dict[str, str], expected: LineType) ->
     assert kinds[-20.0] == expected
 
 
-def test_curbs_count_wherever_they_are(tmp_path: Path) -> None:
-    """A curb that bounds no lanelet is a line; another way that bounds none is not."""
+def test_curbs_that_bound_no_lanelet_are_lines(tmp_path: Path) -> None:
+    """Other ways that bound no lanelet are not."""
     ways: Ways = {
         "l": ([(0, 2), (9, 2)], {"type": "virtual"}),
         "r": ([(0, -2), (9, -2)], {}),
@@ -216,7 +215,7 @@ def test_curbs_count_wherever_they_are(tmp_path: Path) -> None:
 
 
 def test_areas(tmp_path: Path) -> None:
-    """A parking lot of 10 by 20 m whose ring comes in two ways is drivable; vegetation is not."""
+    """A parking lot of 10 by 20 m, whose ring has two ways, is drivable; vegetation is not."""
     ways: Ways = {
         "l": ([(0, 2), (9, 2)], {}),
         "r": ([(0, -2), (9, -2)], {}),
@@ -233,8 +232,8 @@ def test_areas(tmp_path: Path) -> None:
         assert found == pytest.approx(areas, rel=1e-4)
 
 
-def test_bounds_in_pieces(tmp_path: Path) -> None:
-    """A bound of two ways, one drawn backwards, is joined where they meet."""
+def test_bounds_of_several_ways_are_joined(tmp_path: Path) -> None:
+    """One of them is drawn backwards."""
     ways: Ways = {
         "l1": ([(5, 2), (0, 2)], {}),
         "l2": ([(5, 2), (9, 2)], {}),
@@ -246,8 +245,8 @@ def test_bounds_in_pieces(tmp_path: Path) -> None:
     np.testing.assert_allclose(road.lanes[0], [(0, 0), (5, 0), (9, 0)], atol=1e-4)
 
 
-def test_given_centre_line(tmp_path: Path) -> None:
-    """A centre line of the file's is taken as it is, in the direction of travel."""
+def test_a_centre_line_in_the_file_is_used(tmp_path: Path) -> None:
+    """In the direction of travel."""
     ways: Ways = {
         "l": ([(0, 2), (9, 2)], {}),
         "r": ([(0, -2), (9, -2)], {}),
@@ -271,15 +270,20 @@ def test_centre_line_of_uneven_bounds(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("old", "new", "lanes", "repair"),
     [
-        ("<way id='l1'>", "<way id='gone'>", 2, "1 lanelets left out, a bound is missing: 1"),
-        ("<nd ref='1' />", "<nd ref='1' /><nd ref='999' />", 3, "1 ways name nodes that are"),
-        ("<way id='l1'>", "<way id='l0'><nd ref='3' /></way><way id='l1'>", 3, "1 ids given twice"),
-        ("<way id='l1'>", "<way id='l1' action='delete'>", 2, "1 lanelets left out"),
-        ("<way id='l1'>", "<way id='x'><nd ref='1' /></way><way id='l1'>", 3, "1 ways left out"),
+        (
+            "<way id='l1'>",
+            "<way id='gone'>",
+            2,
+            "1 lanelets without a left or right bound left out: 1",
+        ),
+        ("<nd ref='1' />", "<nd ref='1' /><nd ref='999' />", 3, "1 ways refer to missing nodes"),
+        ("<way id='l1'>", "<way id='l0'><nd ref='3' /></way><way id='l1'>", 3, "1 ids occur twice"),
+        ("<way id='l1'>", "<way id='l1' action='delete'>", 2, "1 lanelets without"),
+        ("<way id='l1'>", "<way id='x'><nd ref='1' /></way><way id='l1'>", 3, "1 ways with fewer"),
     ],
 )
-def test_repairs(tmp_path: Path, old: str, new: str, lanes: int, repair: str) -> None:
-    """What refers to nothing, is there twice or was deleted is left out, and told."""
+def test_repairs_are_reported(tmp_path: Path, old: str, new: str, lanes: int, repair: str) -> None:
+    """Missing references, duplicate ids and deleted elements."""
     text = street(3)
     assert old in text
     road = read(tmp_path, text.replace(old, new))
@@ -293,22 +297,22 @@ def test_repairs(tmp_path: Path, old: str, new: str, lanes: int, repair: str) ->
 def test_real_cars_drive_along_their_lanes(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, location: str
 ) -> None:
-    """Of cars over 2 m/s within 2 m of a lane, 98 % have one there that runs their way (±30°)."""
+    """Of cars above 2 m/s within 2 m of a lane, 98 % have one in their direction (±30°)."""
     monkeypatch.setenv("ASP_ENV_CACHE", str(tmp_path))
-    found = [each for each in open_data(real_data("karlsruhe")) if each.location == location]
-    lanes = found[0].road_map.lanes
+    recordings = [each for each in open_data(real_data("karlsruhe")) if each.location == location]
+    lanes = recordings[0].road_map.lanes
     points, courses = [], []
     for lane in (lanes[i] for i in range(len(lanes))):
         for begin, end in pairwise(lane):
             shares = np.arange(0.0, 1.0, 0.5 / max(0.5, float(np.hypot(*(end - begin)))))
             points.append(begin + shares[:, None] * (end - begin))
             courses.append(np.full(len(shares), math.atan2(*(end - begin)[::-1])))
-    where, course = np.concatenate(points), np.concatenate(courses)
+    positions, course = np.concatenate(points), np.concatenate(courses)
     states = np.concatenate(
-        [each.track(int(i))[::5] for each in found for i in np.flatnonzero(each.predicted)]
+        [each.track(int(i))[::5] for each in recordings for i in np.flatnonzero(each.predicted)]
     )
     states = states[states[:, 3] > 2.0]
-    near = np.linalg.norm(states[:, None, :2] - where, axis=-1) < 2.0
+    near = np.linalg.norm(states[:, None, :2] - positions, axis=-1) < 2.0
     along = np.cos(states[:, None, 2] - course) > math.cos(math.radians(30))
     assert near.any(axis=1).mean() > 0.9
     assert (near & along).any(axis=1)[near.any(axis=1)].mean() > 0.98

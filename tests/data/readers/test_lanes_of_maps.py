@@ -1,4 +1,4 @@
-"""What maps tell of lanes besides their centre lines: areas, directions, limits; kept by caches."""
+"""Properties of lanes besides their centre lines: areas, directions and speed limits."""
 
 from pathlib import Path
 
@@ -15,7 +15,7 @@ ORIGIN = Origin(x_m=ORIGIN_M[0], y_m=ORIGIN_M[1], longitude_deg=6.1, latitude_de
 
 
 def road_with(folder: Path, **tags: str) -> RoadMap:
-    """A lanelet of 10 by 4 m along +x with some tags, and a crosswalk."""
+    """A map of one lanelet, 10 by 4 m along +x, with the given tags, and a crosswalk."""
     ways = {
         "l": ([(0.0, 2.0), (10.0, 2.0)], {}),
         "r": ([(0.0, -2.0), (10.0, -2.0)], {}),
@@ -32,7 +32,7 @@ def road_with(folder: Path, **tags: str) -> RoadMap:
 
 
 def test_areas(tmp_path: Path) -> None:
-    """One ring for each lane, the left bound first; crosswalks are drivable, but no lanes."""
+    """One ring for each lane, the left bound first; crosswalks are drivable, but not lanes."""
     road = road_with(tmp_path)
     assert (len(road.lanes), len(road.areas), len(road.drivable)) == (1, 1, 2)
     np.testing.assert_allclose(road.areas[0], [(0, 2), (10, 2), (10, -2), (0, -2)], atol=1e-4)
@@ -70,13 +70,13 @@ def test_two_way(tmp_path: Path, tags: dict[str, str], two_way: bool) -> None:
         ("-50", None),
     ],
 )
-def test_speeds(text: str, limit: float | None) -> None:
-    """Numbers with units as tags have them; what cannot be read is not known."""
+def test_speed_tags(text: str, limit: float | None) -> None:
+    """Numbers with units; anything else is unknown."""
     assert speed_mps(text) == pytest.approx(limit)
 
 
 def test_speed_limits(tmp_path: Path) -> None:
-    """Lanelet2's tag goes before OSM's."""
+    """Lanelet2's tag has priority over OSM's."""
     for tags, limit in (
         ({"maxspeed": "36"}, 10.0),
         ({"speed_limit": "72 km/h", "maxspeed": "36"}, 20.0),
@@ -86,8 +86,7 @@ def test_speed_limits(tmp_path: Path) -> None:
         assert road.limits_mps.tolist() == pytest.approx([limit])
 
 
-def test_a_cache_keeps_them(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Read again from the cache, the sample's map has the same areas, directions and limits."""
+def test_the_cache_returns_the_same_lanes(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("ASP_ENV_CACHE", str(tmp_path))
     first, second = (open_data("sample:intersection")[0].road_map for _ in range(2))
     assert first is not second
@@ -99,10 +98,8 @@ def test_a_cache_keeps_them(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> 
     np.testing.assert_array_equal(first.areas.points, second.areas.points)
 
 
-def test_counts_must_match() -> None:
-    """Areas for some of the lanes alone are refused; none at all is fine."""
-
-    def made(areas: int) -> RoadMap:
+def test_areas_of_some_lanes_only_are_refused() -> None:
+    def map_with(areas: int) -> RoadMap:
         square = np.array([(0, 0), (1, 0), (1, 1)])
         return RoadMap(
             name="by hand",
@@ -117,7 +114,7 @@ def test_counts_must_match() -> None:
             limited=np.zeros(areas, dtype=bool),
         )
 
-    assert len(made(0).areas) == 0
-    assert len(made(2).areas) == 2
+    assert len(map_with(0).areas) == 0
+    assert len(map_with(2).areas) == 2
     with pytest.raises(DataError, match=r"map by hand: \[1\] areas, .* all 2 lanes, or none"):
-        made(1)
+        map_with(1)

@@ -12,15 +12,15 @@ from hypothesis import given
 
 from asp_env.data.classes import FOOTPRINTS_M, AgentClass
 from asp_env.data.readers import tables
+from asp_env.data.readers.layout import TrackTable
 from asp_env.data.readers.levelx import (
     LevelxFiles,
     RecordingMeta,
-    TrackTable,
     find_map,
     find_recordings,
     metres_per_pixel,
+    read_levelx,
     read_recording_meta,
-    read_tracks,
 )
 from tests.data.levelx_files import track_rows, write_folder, write_map, write_recording
 
@@ -28,17 +28,16 @@ from tests.data.levelx_files import track_rows, write_folder, write_map, write_r
 def read(folder: Path) -> TrackTable:
     """The tracks of a folder's only recording."""
     (files,) = find_recordings(folder)
-    return read_tracks(files)
+    return read_levelx(files)
 
 
-def described(folder: Path) -> list[tuple[LevelxFiles, RecordingMeta]]:
-    """Every recording of a folder with its metadata."""
+def recordings_with_metadata(folder: Path) -> list[tuple[LevelxFiles, RecordingMeta]]:
     found = find_recordings(folder)
     return [(files, read_recording_meta(files.recording_meta)) for files in found]
 
 
-def one_track(folder: Path, kind: str, **columns: list[float]) -> np.ndarray:
-    """The states read for a track of class `kind` with some columns given."""
+def states_of_one_track(folder: Path, kind: str, **columns: list[float]) -> np.ndarray:
+    """The states of a track of class `kind` with the given columns."""
     count = len(next(iter(columns.values())))
     rows = track_rows(7, np.arange(count), 25.0, kind)
     for name, values in columns.items():
@@ -48,23 +47,23 @@ def one_track(folder: Path, kind: str, **columns: list[float]) -> np.ndarray:
 
 
 def same(table: TrackTable, other: TrackTable) -> bool:
-    """Whether two tables agree bit for bit, repairs aside."""
+    """Whether two tables are equal bit for bit, except for repairs."""
     names = ("track_ids", "classes", "sizes", "first_frames", "starts", "states")
     return all(np.array_equal(getattr(table, name), getattr(other, name)) for name in names)
 
 
-def test_metadata(tmp_path: Path) -> None:
-    """Frame rate, limit, place and origin are those of the file."""
+def test_metadata_of_a_recording(tmp_path: Path) -> None:
+    """Frame rate, speed limit, location and origin."""
     write_recording(tmp_path, number=3, location=2, rate_hz=10.0)
-    ((files, meta),) = described(tmp_path)
+    ((files, meta),) = recordings_with_metadata(tmp_path)
     assert files.name == "03"
     assert (meta.number, meta.location, meta.frame_rate_hz) == (3, 2, 10.0)
     assert meta.speed_limit_mps == pytest.approx(13.9)
     assert meta.origin.epsg == 32632
 
 
-def test_table(tmp_path: Path) -> None:
-    """Track i begins at frame i, ends at 249, and its rows follow one another."""
+def test_tracks_and_rows(tmp_path: Path) -> None:
+    """Track i begins at frame i, ends at 249, and its rows are consecutive."""
     write_recording(tmp_path, classes=("car", "Truck_Bus", "PEDESTRIAN"))
     table = read(tmp_path)
     assert table.track_ids.tolist() == [0, 1, 2]
@@ -76,9 +75,9 @@ def test_table(tmp_path: Path) -> None:
     assert table.repairs == ()
 
 
-def test_speed_is_signed(tmp_path: Path) -> None:
+def test_speed_is_negative_against_the_heading(tmp_path: Path) -> None:
     """A car that heads north and moves south at 2 m/s has speed -2; north at 3 m/s, 3."""
-    states = one_track(
+    states = states_of_one_track(
         tmp_path, "car", heading=[90.0, 90.0], xVelocity=[0.0, 0.0], yVelocity=[-2.0, 3.0]
     )
     np.testing.assert_allclose(states[:, 2], math.pi / 2, atol=1e-6)
@@ -86,17 +85,17 @@ def test_speed_is_signed(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(("velocity_x", "speed"), [(3.0, 5.0), (-3.0, -5.0)])
-def test_speed_is_that_of_the_centre_with_the_sign_of_motion(
-    tmp_path: Path, velocity_x: float, speed: float
-) -> None:
+def test_speed_is_the_norm_of_the_velocity(tmp_path: Path, velocity_x: float, speed: float) -> None:
     """A car that heads east and moves at (±3, 4) m/s has speed ±5."""
-    states = one_track(tmp_path, "car", heading=[0.0], xVelocity=[velocity_x], yVelocity=[4.0])
+    states = states_of_one_track(
+        tmp_path, "car", heading=[0.0], xVelocity=[velocity_x], yVelocity=[4.0]
+    )
     assert states[0, 3] == pytest.approx(speed)
 
 
-def test_vulnerable_heading(tmp_path: Path) -> None:
-    """File heading until the first motion, course in motion, held at 0.2 m/s; speed is |v|."""
-    states = one_track(
+def test_heading_of_vulnerable_road_users(tmp_path: Path) -> None:
+    """That of the file until the first motion, then the direction of motion, held at 0.2 m/s."""
+    states = states_of_one_track(
         tmp_path,
         "pedestrian",
         heading=[30.0] * 5,
@@ -109,8 +108,7 @@ def test_vulnerable_heading(tmp_path: Path) -> None:
     np.testing.assert_allclose(states[:, 3], [0.2, 2.0, 0.0, 0.1 * math.sqrt(2), 1.0], atol=1e-6)
 
 
-def test_vulnerable_headings_stay_in_their_track(tmp_path: Path) -> None:
-    """What one pedestrian's motion says is not held on in the next one's track."""
+def test_headings_do_not_continue_in_the_next_track(tmp_path: Path) -> None:
     first = track_rows(0, np.arange(3), 25.0, "pedestrian")
     second = track_rows(1, np.arange(3), 25.0, "pedestrian")
     second[["xVelocity", "yVelocity"]] = 0.0
@@ -122,18 +120,18 @@ def test_vulnerable_headings_stay_in_their_track(tmp_path: Path) -> None:
 def test_headings_are_wrapped(
     tmp_path_factory: pytest.TempPathFactory, heading: float, course: float, total: float
 ) -> None:
-    """Any heading in degrees lands in [-π, π], and the speed is the velocity's, with a sign."""
+    """Headings lie in [-π, π]; the speed is the norm of the velocity, with a sign."""
     velocity = {"xVelocity": [total * math.cos(course)], "yVelocity": [total * math.sin(course)]}
     folder = tmp_path_factory.mktemp("wrapped")
-    state = one_track(folder, "car", heading=[heading], **velocity)[0]
+    state = states_of_one_track(folder, "car", heading=[heading], **velocity)[0]
     assert abs(state[2]) <= np.float32(math.pi)
     assert abs(abs(state[3]) - total) < 1e-4
     along = total * math.cos(course - math.radians(heading))
     assert abs(along) < 1e-4 or math.copysign(1, state[3]) == math.copysign(1, along)
 
 
-def test_sizes(tmp_path: Path) -> None:
-    """The rows' sizes count before the metadata's, and zeros become the class's footprint."""
+def test_sizes_in_rows_have_priority(tmp_path: Path) -> None:
+    """Over those of the metadata; sizes of zero become the class's footprint."""
     data = write_recording(tmp_path, classes=("car", "pedestrian"))
     path = data / "00_tracksMeta.csv"
     meta = pd.read_csv(path)
@@ -144,8 +142,8 @@ def test_sizes(tmp_path: Path) -> None:
     np.testing.assert_allclose(sizes[1], FOOTPRINTS_M[AgentClass.PEDESTRIAN])
 
 
-def test_sizes_of_the_metadata(tmp_path: Path) -> None:
-    """Without sizes in the rows those of the metadata count."""
+def test_sizes_in_the_metadata(tmp_path: Path) -> None:
+    """Used if the rows have none."""
     rows = track_rows(0, np.arange(5), 25.0)
     data = write_recording(tmp_path, classes=["car"], tracks=rows)
     rows.drop(columns=["width", "length"]).to_csv(data / "00_tracks.csv", index=False)
@@ -153,10 +151,10 @@ def test_sizes_of_the_metadata(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("change", ["columns", "rows", "gzip", "chunks", "crlf", "spaces"])
-def test_how_it_is_written_does_not_matter(
+def test_equivalent_files_give_equal_tracks(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, change: str
 ) -> None:
-    """Order of columns and rows, compression, chunk size and line ends change nothing."""
+    """Order of columns and rows, compression, chunk size, line ends and spaces."""
     plain = read(write_folder(tmp_path / "plain"))
     other = tmp_path / "other"
     path = write_recording(other, suffix=".gz" if change == "gzip" else "") / "00_tracks.csv"
@@ -175,7 +173,7 @@ def test_how_it_is_written_does_not_matter(
 
 
 def test_gaps_split_tracks(tmp_path: Path) -> None:
-    """Frames 0-4 and 8-9 of track 0 become tracks 0 and 2, behind track 1; it is told."""
+    """Frames 0-4 and 8-9 of track 0 become tracks 0 and 2, after track 1; a repair is reported."""
     frames = np.array([0, 1, 2, 3, 4, 8, 9])
     rows = [track_rows(0, frames, 25.0), track_rows(1, np.arange(10), 25.0)]
     write_recording(tmp_path, classes=["car", "van"], tracks=pd.concat(rows))
@@ -188,19 +186,19 @@ def test_gaps_split_tracks(tmp_path: Path) -> None:
     assert table.repairs == ("1 gaps in tracks' frames, split there: 0 after frame 4",)
 
 
-def test_frames_that_differ_from_the_metadata_are_told(tmp_path: Path) -> None:
-    """A track that begins later than its metadata says is kept, and reported."""
+def test_frames_that_differ_from_the_metadata_are_reported(tmp_path: Path) -> None:
+    """A track that begins later than in its metadata is read."""
     path = write_recording(tmp_path) / "00_tracks.csv"
     rows = pd.read_csv(path)
     rows[(rows["trackId"] != 1) | (rows["frame"] > 20)].to_csv(path, index=False)
     table = read(tmp_path)
     assert table.first_frames.tolist() == [0, 21, 2]
     assert len(table.repairs) == 1
-    assert "than tracksMeta says: 1" in table.repairs[0]
+    assert "than in tracksMeta: 1" in table.repairs[0]
 
 
-def test_names(tmp_path: Path) -> None:
-    """Ids in natural order; where two folders have the same id, the folder tells them apart."""
+def test_names_of_recordings(tmp_path: Path) -> None:
+    """In natural order; preceded by the folder where two folders have the same id."""
     for number in (10, 2, 100):
         write_recording(tmp_path / "inD", number=number)
     assert [files.name for files in find_recordings(tmp_path)] == ["02", "10", "100"]
@@ -210,43 +208,43 @@ def test_names(tmp_path: Path) -> None:
 
 
 def test_map_by_location(tmp_path: Path) -> None:
-    """The map whose name ends in the location's id, of the data set the recording is in."""
+    """The map whose name ends in the location's id, of the recording's dataset."""
     for dataset in ("inD", "rounD"):
         for location in (1, 2, 12):
             write_map(tmp_path / dataset, location=location)
         write_recording(tmp_path / dataset, location=2)
-    for files, meta in described(tmp_path):
+    for files, meta in recordings_with_metadata(tmp_path):
         found = find_map(files, meta, {})
         assert found.name == "location2.osm"
         assert found.is_relative_to(tmp_path / files.name.split("/")[0])
 
 
 def test_map_beside_the_data_folder(tmp_path: Path) -> None:
-    """Who names the folder `data` itself still gets the maps beside it."""
+    """It is found if the folder `data` itself is opened."""
     path = write_map(tmp_path)
     write_recording(tmp_path)
-    ((files, meta),) = described(tmp_path / "data")
+    ((files, meta),) = recordings_with_metadata(tmp_path / "data")
     assert find_map(files, meta, {}) == path
 
 
 def test_map_by_folder(tmp_path: Path) -> None:
-    """A map with a name of its own in a folder that begins with the location's id."""
+    """A map with another name in a folder that begins with the location's id."""
     path = write_map(tmp_path, location=3)
     other = write_map(tmp_path, location=4)
     path, other = (each.rename(each.with_name("crossing.osm")) for each in (path, other))
     write_recording(tmp_path, location=4)
-    ((files, meta),) = described(tmp_path)
+    ((files, meta),) = recordings_with_metadata(tmp_path)
     assert find_map(files, meta, {}) == other
 
 
 def test_map_by_place(tmp_path: Path) -> None:
-    """A map that names no location serves a recording that is made there."""
+    """A map without a location in its name is used by recordings made near it."""
     path = tmp_path / "lanelets" / "heckstrasse.osm"
     path.parent.mkdir()
-    path.write_bytes(write_map(tmp_path / "aside").read_bytes())
-    (tmp_path / "aside" / "maps" / "lanelets" / "01_place" / "location1.osm").unlink()
+    path.write_bytes(write_map(tmp_path / "source").read_bytes())
+    (tmp_path / "source" / "maps" / "lanelets" / "01_place" / "location1.osm").unlink()
     write_recording(tmp_path, location=3)
-    ((files, meta),) = described(tmp_path)
+    ((files, meta),) = recordings_with_metadata(tmp_path)
     assert find_map(files, meta, {}) == path
 
 
@@ -258,7 +256,7 @@ def test_construction_map(tmp_path: Path, number: int, folder: str) -> None:
         path.parent.mkdir(parents=True)
         path.write_text("<osm />")
     write_recording(tmp_path, number=number)
-    ((files, meta),) = described(tmp_path)
+    ((files, meta),) = recordings_with_metadata(tmp_path)
     assert find_map(files, meta, {}).parent.name == folder
 
 
@@ -273,33 +271,32 @@ def test_construction_map(tmp_path: Path, number: int, folder: str) -> None:
     ],
 )
 def test_background_scale(tmp_path: Path, folder: str, expected_m: float) -> None:
-    """The data set's factor by its folder's name, else the smallest with which tracks fit."""
+    """The dataset's factor if a folder has its name, otherwise the smallest factor that fits."""
     write_recording(tmp_path / folder)
-    ((files, meta),) = described(tmp_path)
+    ((files, meta),) = recordings_with_metadata(tmp_path)
     xy = np.array([[0.0, -2.0], [18.0, -8.0], [10.0, -5.0]])
     scale = metres_per_pixel(files, meta, (1000, 500), xy)
     assert scale == pytest.approx(expected_m)
 
 
 def test_background_that_cannot_fit(tmp_path: Path) -> None:
-    """Positions that no factor brings into the picture leave it without a scale."""
+    """Without a factor that fits there is no scale."""
     write_recording(tmp_path)
-    ((files, meta),) = described(tmp_path)
+    ((files, meta),) = recordings_with_metadata(tmp_path)
     xy = np.array([[0.0, -2.0], [400.0, -8.0]])
     assert metres_per_pixel(files, meta, (1000, 500), xy) is None
 
 
-def test_background_of_a_folder_that_is_called_like_a_data_set(tmp_path: Path) -> None:
-    """A name whose factor cannot be is overruled: 110 m in 1,000 pixels need 12, not 10."""
+def test_background_of_a_folder_named_like_a_dataset(tmp_path: Path) -> None:
+    """A named factor that does not fit is not used: 110 m in 1,000 pixels need 12, not 10."""
     write_recording(tmp_path / "round-1")
-    ((files, meta),) = described(tmp_path)
+    ((files, meta),) = recordings_with_metadata(tmp_path)
     xy = np.array([[0.0, -2.0], [110.0, -8.0]])
     scale = metres_per_pixel(files, meta, (1000, 500), xy)
     assert scale == pytest.approx(0.12)
 
 
 def test_background_is_found(tmp_path: Path) -> None:
-    """A picture beside the tables belongs to the recording."""
     data = write_recording(tmp_path)
     head = b"\x89PNG\r\n\x1a\n" + struct.pack(">I4sII", 13, b"IHDR", 1000, 500)
     (data / "00_background.png").write_bytes(head)

@@ -1,4 +1,4 @@
-"""States from positions: what is exact stays, what is noisy is smoothed, headings follow."""
+"""States from positions: exact tracks are unchanged, noise is removed, headings follow."""
 
 import math
 
@@ -15,13 +15,12 @@ REAR_M = 0.3 * LENGTH_M
 DT_S = 0.1
 
 
-def off_deg(headings: np.ndarray, states: np.ndarray) -> np.ndarray:
-    """How far headings are from those of states."""
+def heading_errors_deg(headings: np.ndarray, states: np.ndarray) -> np.ndarray:
     return np.degrees(np.abs(wrap_angle(headings - states[:, 2])))
 
 
-def test_motion_of_constant_acceleration_is_left_as_it_is() -> None:
-    """After 2 t + t² m: at 1 s 3 m and 4 m/s, to millimetres, though nobody said how fast it is."""
+def test_constant_acceleration_is_unchanged() -> None:
+    """2 t + t² m: at 1 s 3 m and 4 m/s, to millimetres, without a measured speed."""
     time = np.arange(31) * DT_S
     positions = np.stack([2 * time + time**2, np.zeros(31)], axis=-1)
     smoothed, velocities = smooth(positions, DT_S)
@@ -31,15 +30,15 @@ def test_motion_of_constant_acceleration_is_left_as_it_is() -> None:
     assert (velocities[:, 1] == 0).all()
 
 
-def test_what_stands_stays() -> None:
-    """Equal positions are equal afterwards, at no speed."""
+def test_equal_positions_are_unchanged() -> None:
+    """Their speed is zero."""
     smoothed, velocities = smooth(np.full((40, 2), 7.0), DT_S)
     np.testing.assert_allclose(smoothed, 7.0, atol=1e-9)
     np.testing.assert_allclose(velocities, 0.0, atol=1e-9)
 
 
-def test_noise_is_smoothed() -> None:
-    """0.3 m of white noise at 12 m/s: a third of it is left, and speeds to 0.4 m/s (rms)."""
+def test_noise_is_reduced() -> None:
+    """Of 0.3 m of white noise at 12 m/s a third remains; speeds are right to 0.4 m/s (rms)."""
     rng = np.random.default_rng(3)
     states = drive((0, 0, 0.4, 12), [(6, 0, 0), (4, -2, 0.05)], 10)
     noise = 0.3 * rng.standard_normal((len(states), 2))
@@ -55,10 +54,10 @@ def test_noise_is_smoothed() -> None:
     seed=st.integers(0, 99),
     rows=st.integers(2, 60),
 )
-def test_nothing_depends_on_where_and_which_way(
+def test_smoothing_commutes_with_rigid_motion(
     shift: tuple[float, float], turn: float, seed: int, rows: int
 ) -> None:
-    """Moved and turned tracks give moved and turned results; reversed ones reversed positions."""
+    """Translated and rotated tracks give translated and rotated results."""
     rng = np.random.default_rng(seed)
     positions = np.cumsum(rng.normal((1, 0), 0.2, (rows, 2)), axis=0)
     cosine, sine = math.cos(turn), math.sin(turn)
@@ -69,8 +68,8 @@ def test_nothing_depends_on_where_and_which_way(
     np.testing.assert_allclose(turned_velocities, velocities @ matrix, atol=1e-4)
 
 
-def test_heading_in_a_bend_lies_inside_the_course() -> None:
-    """On a circle of 10 m the box's centre moves asin(1.35 / 10) = 7.76° outside its heading."""
+def test_the_slip_angle_in_a_bend() -> None:
+    """On a circle of 10 m the box's centre moves at asin(1.35 / 10) = 7.76° to its heading."""
     angles = np.arange(200) * 0.05
     positions = 10 * np.stack([np.cos(angles), np.sin(angles)], axis=-1)
     headings = follow_heading(positions, None, REAR_M, DT_S)
@@ -79,25 +78,25 @@ def test_heading_in_a_bend_lies_inside_the_course() -> None:
     np.testing.assert_allclose(slip[50:], math.degrees(math.asin(0.135)), atol=0.1)
 
 
-def test_standing_keeps_the_heading() -> None:
-    """Drive a bend, stand for 5 s with a jitter of 1 mm, go on: to 1° throughout."""
+def test_the_heading_is_constant_while_standing() -> None:
+    """A bend, a stand of 5 s with a jitter of 1 mm, another bend: right to 1°."""
     states = drive((0, 0, 1, 6), [(3, 0, 0.2), (2, -3, 0.2), (5, 0, 0), (3, 1.5, -0.1)], 10)
     jitter = 0.001 * np.random.default_rng(1).standard_normal((len(states), 2))
     headings = follow_heading(states[:, :2] + jitter, None, REAR_M, DT_S)
-    assert off_deg(headings, states)[5:].max() < 1.0
+    assert heading_errors_deg(headings, states)[5:].max() < 1.0
     standing = states[:, 3] < 0.01
     assert np.ptp(headings[standing]) == 0
 
 
-def test_standing_at_first() -> None:
-    """Who stands at first stands as it will set off, whatever its measured heading says."""
+def test_the_first_motion_gives_the_first_heading() -> None:
+    """The measured heading only determines the front."""
     states = drive((0, 0, -2, 0), [(3, 0, 0), (4, 1, 0)], 10)
     headings = follow_heading(states[:, :2], np.full(len(states), -1.0), REAR_M, DT_S)
-    assert off_deg(headings, states).max() < 0.01
+    assert heading_errors_deg(headings, states).max() < 0.01
 
 
-def test_who_never_moves() -> None:
-    """The mean of the measured headings, the short way round, or 0; folded ones have no front."""
+def test_a_vehicle_that_never_moves() -> None:
+    """The circular mean of the measured headings, or 0; folded headings have no front."""
     positions = np.zeros((4, 2))
     measured = np.array([3.1, -3.1, 3.1, -3.1])
     assert np.abs(follow_heading(positions, measured, REAR_M, DT_S)) == pytest.approx(math.pi)
@@ -107,8 +106,8 @@ def test_who_never_moves() -> None:
     assert np.abs(found) == pytest.approx(math.pi / 2)
 
 
-def test_backing_up() -> None:
-    """Forward, back, forward: the heading stays; a measured one tells a track that only backs."""
+def test_driving_backwards() -> None:
+    """Forward, back, forward: a constant heading. With a measured heading, all may be backwards."""
     forward = np.linspace(0, 10, 51)
     there_and_back = np.concatenate([forward, forward[:-1][::-1][:30], forward[20:]])
     positions = np.stack([there_and_back, np.zeros_like(there_and_back)], axis=-1)
@@ -120,7 +119,7 @@ def test_backing_up() -> None:
 
 
 def test_jumps() -> None:
-    """A displaced rest of a track, a single displaced row, one at either end; no hard braking."""
+    """A displaced end of a track, a displaced row, also at either end; hard braking is no jump."""
     time = np.arange(40) * DT_S
     straight = np.stack([8 * time, np.zeros(40)], axis=-1)
     assert not find_jumps(straight).any()
@@ -137,8 +136,8 @@ def test_jumps() -> None:
     assert not find_jumps(np.array([[0.0, 0.0], [9.0, 0.0]])).any()
 
 
-def test_held_positions() -> None:
-    """Three equal rows, then 10 m/s: not seen yet. After 1.2 s of them, or at 1 m/s²: it stood."""
+def test_repeated_first_positions() -> None:
+    """Three equal rows, then 10 m/s: repeated. Equal for 1.2 s, or followed by 1 m/s²: a stand."""
     moving = np.stack([np.arange(10.0), np.zeros(10)], axis=-1)
     held = np.repeat(moving[:1], 3, axis=0)
     assert count_held(np.concatenate([held, moving]), DT_S) == 3

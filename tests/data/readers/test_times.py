@@ -1,4 +1,4 @@
-"""Frames and their rate from times in milliseconds."""
+"""Frames and the frame rate from times in milliseconds."""
 
 import numpy as np
 import pytest
@@ -10,13 +10,13 @@ from asp_env.errors import DataError
 
 
 def clock_of(*tracks: list[float]) -> Clock:
-    """The clock of some tracks' times."""
+    """The clock of the times of some tracks."""
     numbers = np.repeat(np.arange(len(tracks)), [len(times) for times in tracks])
     times = np.concatenate([np.array(times, dtype=float) for times in tracks])
     return read_clock(
         numbers,
         times,
-        lambda at, what: f"row {at}: " + what.format(track=numbers[at], time=times[at]),
+        lambda row, what: f"row {row}: " + what.format(track=numbers[row], time=times[row]),
     )
 
 
@@ -26,8 +26,10 @@ def clock_of(*tracks: list[float]) -> Clock:
     begin=st.integers(-5_000, 10**7),
     frames=st.lists(st.integers(0, 3_000), min_size=1, max_size=40, unique=True),
 )
-def test_round_trip(rate: float, rounded: bool, begin: int, frames: list[int]) -> None:
-    """Frames written as times, whole milliseconds or not, with gaps, are read as these frames."""
+def test_frames_are_recovered_from_times(
+    rate: float, rounded: bool, begin: int, frames: list[int]
+) -> None:
+    """Whole milliseconds or not, with gaps, at any rate."""
     first = sorted(frames)
     steady = list(range(4_000, 5_500))
     times = [[begin + frame * 1000 / rate for frame in track] for track in (first, steady)]
@@ -43,21 +45,21 @@ def test_round_trip(rate: float, rounded: bool, begin: int, frames: list[int]) -
 
 
 @pytest.mark.parametrize(
-    ("tracks", "told"),
+    ("tracks", "expected"),
     [
-        ([[0], [100]], "row 0: no track has a second row, so that no frame rate can be told"),
-        ([[0, 0.1, 0.2, 0.3]], "row 0: timestamp_ms of its rows and those after are 0.1 apart"),
+        ([[0], [100]], "row 0: no track has a second row, so there is no frame rate"),
+        ([[0, 0.1, 0.2, 0.3]], "row 0: timestamp_ms of its rows and later rows are 0.1 apart"),
         ([[0, 1, 2, 3]], "makes 1000 Hz; expected 1 to 250 Hz"),
         ([[0, 5_000, 10_000]], "makes 0.2 Hz"),
-        ([[0, 100, 200, 260, 360]], "row 3: timestamp_ms is 260.0, 60 ms after the one before"),
+        ([[0, 100, 200, 260, 360]], "row 3: timestamp_ms is 260.0, 60 ms after the previous time"),
         ([[0, 100, 101, 200]], "row 2: a second row of track 0 at 101.0 ms, less than a frame"),
         ([[0, 100, 200], [50, 150]], "row 3: timestamp_ms is 50.0, 50 ms after"),
         ([[0, 100, 200, 301.5 + 20, 400]], "expected multiples of 100 ms"),
     ],
 )
-def test_impossible(tracks: list[list[float]], told: str) -> None:
-    """What no clock takes is refused, with the row where it begins."""
+def test_impossible_times_are_refused(tracks: list[list[float]], expected: str) -> None:
+    """The error begins with the first wrong row."""
     with pytest.raises(DataError) as caught:
         clock_of(*tracks)
-    assert told in str(caught.value)
+    assert expected in str(caught.value)
     assert "\n" not in str(caught.value)

@@ -1,4 +1,4 @@
-"""Episodes cut from tracks by hand, and the laws of all of them."""
+"""How tracks are cut into scenarios: by hand, and laws."""
 
 import dataclasses
 
@@ -29,35 +29,35 @@ def found(
 
 
 def windows(scenarios: ScenarioSet) -> list[tuple[int, int]]:
-    """(start tick, length) of each."""
+    """(start tick, length) of each scenario."""
     return [(each.start_tick, each.length) for each in scenarios]
 
 
 @pytest.mark.parametrize(
     ("duration_s", "expected"),
     [
-        (6.8, []),  # tick 34: 19 ticks behind the history
+        (6.8, []),  # up to tick 34: 19 ticks after the history
         (7.0, [(15, 20)]),
         (18.0, [(15, 75)]),
-        (20.0, [(15, 75)]),  # 2 s are left over
+        (20.0, [(15, 75)]),  # the remaining 2 s are too short
         (22.0, [(15, 75), (90, 20)]),
         (40.0, [(15, 75), (90, 75), (165, 35)]),
     ],
 )
 def test_windows(duration_s: float, expected: list[tuple[int, int]]) -> None:
-    """From tick 15 on up to 75 ticks at a time, at least 20."""
+    """Windows of 20 to 75 ticks from tick 15 on."""
     assert windows(found(CAR, duration_s=duration_s)) == expected
 
 
-def test_comes_late() -> None:
-    """From frame 31 on the first whole tick is 16, and 15 ticks of history end at 31."""
+def test_window_of_a_vehicle_that_appears_late() -> None:
+    """From frame 31 on, the first whole tick is 16, and 15 ticks of history end at 31."""
     late = Drive(kind=AgentClass.CAR, start=CAR.start, appears_s=3.1, leaves_s=12.3)
     assert windows(found(late, duration_s=20.0)) == [(31, 30)]  # frame 123 is tick 61.5
 
 
 @pytest.mark.parametrize(("speed", "count"), [(0.65, 0), (0.68, 1)])
-def test_worth_driving(speed: float, count: int) -> None:
-    """15 s at 0.65 m/s are 9.75 m, at 0.68 m/s 10.2 m: at least 10 m are asked for."""
+def test_shortest_distance(speed: float, count: int) -> None:
+    """15 s at 0.65 m/s are 9.75 m, at 0.68 m/s 10.2 m; at least 10 m are needed."""
     slow = Drive(kind=AgentClass.CAR, start=(0.0, 0.0, 0.0, speed))
     assert len(found(slow, duration_s=20.0)) == count
 
@@ -66,7 +66,7 @@ def test_worth_driving(speed: float, count: int) -> None:
     ("dt_s", "expected"), [(0.3, (10, 50)), (0.1, (30, 150)), (0.7, (4, 21)), (1.0, (3, 15))]
 )
 def test_other_time_steps(dt_s: float, expected: tuple[int, int]) -> None:
-    """At most 15 s and at least 4 s, whether they are whole ticks or not."""
+    """At most 15 s and at least 4 s, also if these are no whole ticks."""
     assert windows(found(CAR, duration_s=19.0, dt_s=dt_s)) == [expected]
 
 
@@ -80,15 +80,14 @@ def test_other_time_steps(dt_s: float, expected: tuple[int, int]) -> None:
     ],
 )
 def test_allowed(first: int, last: int, expected: list[tuple[int, int]]) -> None:
-    """The history begins with the first allowed tick, the drive ends with the last."""
+    """The history starts at the first allowed tick, and the scenario ends at the last."""
     allowed = np.zeros(101, dtype=bool)
     allowed[first : last + 1] = True
     assert windows(found(CAR, duration_s=20.0, allowed=allowed)) == expected
 
 
 @given(allowed=arrays(np.bool_, 8).map(lambda marks: np.repeat(marks, 40)))
-def test_laws(allowed: np.ndarray) -> None:
-    """Every tick of a scenario and its history is allowed; its drives do not overlap."""
+def test_scenarios_use_allowed_ticks_and_do_not_overlap(allowed: np.ndarray) -> None:
     scenarios = found(CAR, duration_s=63.8, allowed=allowed)
     ends = -1
     for start, length in windows(scenarios):
@@ -99,8 +98,8 @@ def test_laws(allowed: np.ndarray) -> None:
     assert bool(len(scenarios)) == bool(allowed.any())
 
 
-def test_who() -> None:
-    """Vehicles of predicted classes that are not parked; numbered seeds; readable names."""
+def test_egos_are_predicted_and_not_parked() -> None:
+    """Seeds are numbered, and names are readable."""
     scenarios = found(
         Drive(kind=AgentClass.BICYCLE, start=CAR.start),
         CAR,
@@ -119,14 +118,14 @@ def test_who() -> None:
     [(0.06, ("left",)), (-0.06, ("right",)), (0.01, ("straight",)), (-0.01, ("straight",))],
 )
 def test_turns(steering: float, tags: tuple[str, ...]) -> None:
-    """75 m turn a car of 4.5 m by 75·sin β/1.35: 1.67 rad and 0.28 rad, of which 0.52 decide."""
+    """A car of 4.5 m turns by 75·sin β/1.35 in 75 m: 1.67 or 0.28 rad; the threshold is 0.52."""
     turning = Drive(kind=AgentClass.CAR, start=(0.0, 0.0, 3.0, 5.0), phases=((60, 0, steering),))
     (scenario,) = found(turning, duration_s=18.0)
     assert scenario.tags == tags
 
 
 def test_standing_start() -> None:
-    """Who stands when the drive begins is tagged so, and can be picked by that."""
+    """A vehicle that stands at the first tick has the tag, by which it can be selected."""
     starts = Drive(
         kind=AgentClass.CAR, start=(0.0, 0.0, 0.0, 0.0), phases=((3.0, 0.0, 0.0), (2.0, 1.0, 0.0))
     )
@@ -137,14 +136,13 @@ def test_standing_start() -> None:
     assert len(scenarios.tagged("left")) == 0
 
 
-def test_names_are_files_names() -> None:
-    """A recording of a folder gives no name with a slash."""
-    drive = found(CAR, duration_s=7.0)[0]
-    assert dataclasses.replace(drive, recording_name="k1/000", ego_id=7).name == "k1_000-7-15"
+def test_names_are_valid_file_names() -> None:
+    """Without a slash, even if the recording's name has one."""
+    scenario = found(CAR, duration_s=7.0)[0]
+    assert dataclasses.replace(scenario, recording_name="k1/000", ego_id=7).name == "k1_000-7-15"
 
 
 def test_several_recordings() -> None:
-    """Each scenario knows which recording it lies in."""
     recordings = [make_recording(name=name, drives=(CAR,)) for name in ("00", "01")]
     scenarios = find_scenarios(recordings, source="made up", dt_s=0.2, history=15)
     assert [(each.recording, each.recording_name) for each in scenarios] == [(0, "00"), (1, "01")]

@@ -1,4 +1,4 @@
-"""Scenarios asked for in words, and the table that they are picked from."""
+"""The filter language, and selection from the table of scenarios."""
 
 import numpy as np
 import pytest
@@ -26,48 +26,44 @@ COMPARISON = st.builds(
     NUMBER,
 )
 CONDITION = st.one_of(TAG, TAG.map("!{}".format), COMPARISON)
-WORDS = st.lists(st.lists(CONDITION, min_size=1, max_size=3).map("|".join), max_size=3).map(
-    ",".join
-)
+TEXT = st.lists(st.lists(CONDITION, min_size=1, max_size=3).map("|".join), max_size=3).map(",".join)
 
 
-def fits(words: str) -> np.ndarray:
-    """Which of the scenarios fit."""
-    return ScenarioFilter.parse(words).holds(FOUND)
+def matches(text: str) -> np.ndarray:
+    """Mask of the scenarios that match a filter."""
+    return ScenarioFilter.parse(text).matches(FOUND)
 
 
-@given(words=WORDS)
-def test_words_and_back(words: str) -> None:
-    """What is written is what was read."""
-    read = ScenarioFilter.parse(words)
-    assert str(read) == words
-    assert ScenarioFilter.parse(str(read)) == read
+@given(text=TEXT)
+def test_filters_round_trip(text: str) -> None:
+    parsed = ScenarioFilter.parse(text)
+    assert str(parsed) == text
+    assert ScenarioFilter.parse(str(parsed)) == parsed
 
 
-@given(one=WORDS, other=WORDS)
-def test_comma_means_both(one: str, other: str) -> None:
-    """Rows that fit both; no words ask for nothing."""
-    both = ",".join(words for words in (one, other) if words)
-    np.testing.assert_array_equal(fits(both), fits(one) & fits(other))
+@given(one=TEXT, other=TEXT)
+def test_comma_is_a_conjunction(one: str, other: str) -> None:
+    """The empty filter matches everything."""
+    both = ",".join(text for text in (one, other) if text)
+    np.testing.assert_array_equal(matches(both), matches(one) & matches(other))
 
 
 @given(one=CONDITION, other=CONDITION)
-def test_bar_means_either(one: str, other: str) -> None:
-    """Rows that fit one or the other."""
-    np.testing.assert_array_equal(fits(f"{one}|{other}"), fits(one) | fits(other))
+def test_bar_is_a_disjunction(one: str, other: str) -> None:
+    np.testing.assert_array_equal(matches(f"{one}|{other}"), matches(one) | matches(other))
 
 
 @given(tag=TAG, name=st.sampled_from([*COLUMNS]), value=NUMBER)
-def test_opposites(tag: str, name: str, value: float) -> None:
-    """Every row has a tag or not, and a column is at least a value or less."""
-    np.testing.assert_array_equal(fits(tag), ~fits(f"!{tag}"))
-    np.testing.assert_array_equal(fits(f"{name}>={value:g}"), ~fits(f"{name}<{value:g}"))
-    np.testing.assert_array_equal(fits(f"{name}>{value:g}"), ~fits(f"{name}<={value:g}"))
-    np.testing.assert_array_equal(fits(f"{name}={value:g}"), ~fits(f"{name}!={value:g}"))
+def test_opposite_conditions_match_the_complement(tag: str, name: str, value: float) -> None:
+    for one, other in ((">=", "<"), (">", "<="), ("=", "!=")):
+        np.testing.assert_array_equal(
+            matches(f"{name}{one}{value:g}"), ~matches(f"{name}{other}{value:g}")
+        )
+    np.testing.assert_array_equal(matches(tag), ~matches(f"!{tag}"))
 
 
-def test_picks() -> None:
-    """By tag, by column with and without its unit, by recording and location; blanks are free."""
+def test_filtered_scenarios() -> None:
+    """By tag, by column with and without its unit, by recording and location, with spaces."""
     left = FOUND.filtered("left")
     assert 0 < len(left) < len(FOUND)
     assert all("left" in each.tags for each in left)
@@ -81,7 +77,7 @@ def test_picks() -> None:
 
 
 @pytest.mark.parametrize(
-    ("words", "message"),
+    ("text", "message"),
     [
         ("lft", r"unknown scenario tag 'lft' \(did you mean 'left'\?\): known are crossing-vru, "),
         ("!lft", "unknown scenario tag 'lft'"),
@@ -101,18 +97,18 @@ def test_picks() -> None:
         ("recording=", "expected recording=NAME"),
     ],
 )
-def test_what_is_not_understood(words: str, message: str | None) -> None:
-    """One line that says what was given and what was expected."""
+def test_errors_of_the_parser(text: str, message: str | None) -> None:
+    """One line; the empty text is no error."""
     if message is None:
-        assert ScenarioFilter.parse(words).clauses == ()
+        assert ScenarioFilter.parse(text).clauses == ()
         return
-    with pytest.raises(AspEnvError, match=message) as told:
-        ScenarioFilter.parse(words)
-    assert "\n" not in str(told.value)
+    with pytest.raises(AspEnvError, match=message) as caught:
+        ScenarioFilter.parse(text)
+    assert "\n" not in str(caught.value)
 
 
-def test_nothing_fits() -> None:
-    """One line with what each condition would leave by itself."""
+def test_no_scenario_matches() -> None:
+    """The message has the number of scenarios that each condition alone matches."""
     lefts = int(FOUND.has("left").sum())
     expected = f"none of the {len(FOUND)} of 'made up' fits .* left {lefts}, density>500 0"
     with pytest.raises(AspEnvError, match=expected):
@@ -121,7 +117,7 @@ def test_nothing_fits() -> None:
 
 
 def test_sorting() -> None:
-    """By a column, up and down; equals keep their order both ways; nothing is lost."""
+    """In both directions; the sort is stable and keeps all scenarios."""
     for name in (*COLUMNS, "recording", "location"):
         up, down = FOUND.sorted_by(name), FOUND.sorted_by(name, descending=True)
         assert (np.sort(FOUND.column(name)) == up.column(name)).all()
@@ -133,7 +129,7 @@ def test_sorting() -> None:
 
 
 def test_sampling() -> None:
-    """The same seed draws the same, in order and without doubles; at most all."""
+    """Reproducible by seed, in order, without duplicates, and at most all scenarios."""
     some = FOUND.sample(4, seed=3)
     assert [*some] == [*FOUND.sample(4, seed=3)]
     assert [*some] != [*FOUND.sample(4, seed=4)]
@@ -141,22 +137,21 @@ def test_sampling() -> None:
     assert [*FOUND.sample(1000, seed=0)] == [*FOUND]
 
 
-def test_spreading() -> None:
-    """From the first to the last, evenly; at most all."""
+def test_evenly_spaced_scenarios() -> None:
+    """From the first to the last, at most all."""
     assert FOUND.evenly_spaced(3).seed.tolist() == [0, round((len(FOUND) - 1) / 2), len(FOUND) - 1]
     assert [*FOUND.evenly_spaced(1000)] == [*FOUND]
 
 
 @pytest.mark.parametrize("count", [0, -1])
-def test_too_few(count: int) -> None:
-    """Nothing cannot be drawn."""
+def test_count_must_be_positive(count: int) -> None:
     for pick in (lambda: FOUND.evenly_spaced(count), lambda: FOUND.sample(count, seed=0)):
         with pytest.raises(AspEnvError, match=f"{count} scenarios: expected at least 1"):
             pick()
 
 
 def test_by_name() -> None:
-    """Every scenario is found under its name; others' names are refused with what is near."""
+    """An unknown name is rejected with similar names."""
     for each in FOUND:
         assert FOUND.by_name(each.name) == each
     with pytest.raises(AspEnvError, match=rf"unknown scenario '00-99-1': {len(FOUND)} are known"):
@@ -165,8 +160,7 @@ def test_by_name() -> None:
         FOUND.tagged("roundabout").by_name("00-1-15")
 
 
-def test_unknown_names() -> None:
-    """Of tags and columns, asked of the table."""
-    for ask in (FOUND.has, FOUND.tagged, FOUND.column, FOUND.sorted_by):
+def test_unknown_tags_and_columns() -> None:
+    for method in (FOUND.has, FOUND.tagged, FOUND.column, FOUND.sorted_by):
         with pytest.raises(AspEnvError, match=r"unknown scenario (tag|column) 'speeed'"):
-            ask("speeed")
+            method("speeed")

@@ -1,4 +1,4 @@
-"""What tags and measures may not depend on: frames of reference, order, names, and who is far."""
+"""Invariances of tags and measures: frame of reference, order, ids, distant agents, frame rate."""
 
 import dataclasses
 import math
@@ -13,7 +13,7 @@ from asp_env.data.road_map import Ragged
 from asp_env.data.scenarios.scenario import ScenarioSet, find_scenarios
 from asp_env.geometry import from_frame
 from tests.builders import DRIVES, Drive, make_recording
-from tests.data.scenarios.test_scenario_rings import ellipse, loop
+from tests.data.scenarios.test_roundabouts import ellipse, loop
 from tests.data.scenarios.test_scenario_tags import WAITS, through
 
 MADE_UP = make_recording(
@@ -28,11 +28,11 @@ MADE_UP = make_recording(
     road_map=loop(np.array([40.0, 40.0]) + ellipse()),
     duration_s=25.0,
 )
-"""Everything at once: turns, waiting, yielding, leaders, walkers, a ring where somebody circles."""
+"""Turns, waiting, yielding, leaders, pedestrians, and a roundabout in which a vehicle circles."""
 
 
 def table(recording: Recording) -> ScenarioSet:
-    """All scenarios by the ego's id, then start."""
+    """All scenarios, sorted by the ego's id, then start."""
     found = find_scenarios([recording], source="", dt_s=0.2, history=15)
     return found.select(np.lexsort((found.start_tick, found.ego_id)))
 
@@ -51,8 +51,7 @@ def reordered(recording: Recording, order: np.ndarray) -> Recording:
     )  # fmt: skip
 
 
-def test_there_is_something_to_compare() -> None:
-    """Most tags occur."""
+def test_most_tags_occur() -> None:
     assert {tag for tag, count in BEFORE.counts().items() if count} >= {
         "left", "right", "straight", "standing-start", "stopping", "following", "yielding",
         "crossing-vru", "roundabout",
@@ -61,8 +60,8 @@ def test_there_is_something_to_compare() -> None:
 
 @settings(max_examples=25, deadline=None)
 @given(angle=st.floats(-math.pi, math.pi), x=st.floats(-300, 300), y=st.floats(-300, 300))
-def test_where_the_origin_lies(angle: float, x: float, y: float) -> None:
-    """Turning and shifting the world changes no tag and no measure."""
+def test_frame_of_reference(angle: float, x: float, y: float) -> None:
+    """Rotation and translation change no tag and no measure."""
     pose = np.array([x, y, angle])
     states = MADE_UP.states.astype(np.float64)
     states[:, :2], states[:, 2] = from_frame(states[:, :2], pose), states[:, 2] + angle
@@ -82,8 +81,8 @@ def test_where_the_origin_lies(angle: float, x: float, y: float) -> None:
 
 @settings(max_examples=25, deadline=None)
 @given(seed=st.integers(0, 1000))
-def test_order_and_names_of_tracks(seed: int) -> None:
-    """Shuffled tracks give the same table, renamed ones the same under other names."""
+def test_order_and_ids_of_tracks(seed: int) -> None:
+    """Shuffled tracks give the same table; other ids change the ids only."""
     order = np.random.default_rng(seed).permutation(len(MADE_UP))
     after = table(reordered(MADE_UP, order))
     for name in ("ego_id", "start_tick", "length", "tags", "values"):
@@ -95,8 +94,8 @@ def test_order_and_names_of_tracks(seed: int) -> None:
 
 @settings(max_examples=25, deadline=None)
 @given(x=st.floats(500, 2000), heading=st.floats(-3, 3), kind=st.sampled_from(AgentClass))
-def test_who_is_far_away(x: float, heading: float, kind: AgentClass) -> None:
-    """Somebody 400 m off matters to nothing but the number of agents."""
+def test_distant_agents(x: float, heading: float, kind: AgentClass) -> None:
+    """An agent at least 400 m away changes the number of agents only."""
     far = make_recording(drives=(Drive(kind=kind, start=(x, -x, heading, 3.0)),), duration_s=25.0)
     both = dataclasses.replace(
         MADE_UP,
@@ -113,7 +112,7 @@ def test_who_is_far_away(x: float, heading: float, kind: AgentClass) -> None:
 
 
 def test_frame_rate() -> None:
-    """Of tracks that are known at every frame or at every tick alone, the table is the same."""
+    """Tracks with states at every frame or at every tick only give the same table."""
     every_tick = make_recording(drives=DRIVES, duration_s=25.0, frame_rate_hz=10.0)
     stride = 2
     rows = [every_tick.track(i)[::stride] for i in range(len(every_tick))]

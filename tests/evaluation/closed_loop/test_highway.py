@@ -61,7 +61,7 @@ def test_wrong_options_are_errors_of_one_line(tmp_path, capsys):
     """Unknown DATA, a driver that needs replayed logs, and a tick that fits no frame rate."""
     for options, message in (
         (["highway:nowhere"], "unknown highway site or folder 'nowhere'"),
-        ([highway_data("roundabout"), "--traffic", "log"], "in this world nobody replays a log"),
+        ([highway_data("roundabout"), "--traffic", "log"], "this world replays no tracks"),
         ([highway_data("roundabout"), "--dt", "0.3333333333"], "multiple of that"),
     ):
         out = tmp_path / "out"

@@ -265,7 +265,7 @@ def test_earlier_forecasts_are_stored_as_long_as_needed() -> None:
         tick=np.array([0, 0, 3, 3, 6, 9]),
         dt_s=DT_S,
         history=15,
-        horizon=15,
+        horizon_ticks=15,
     )
     history = ForecastHistory(index)
     assert history.apart_ticks == 3

@@ -281,7 +281,7 @@ def test_failed_cells_end_with_status_1(
     ("given", "what"),
     [
         (["--predictors", "dkn"], "did you mean 'dkm'"),
-        (["--predictors", "dkm:ours2"], "preset of dkm"),
+        (["--predictors", "dkm:ours2"], "recipe of dkm"),
         (["--views", "raster"], "unknown view 'raster'"),
         (["--ablations", "skip"], "unknown ablation 'skip'"),
         (["--horizons", "0.3"], "0.3"),

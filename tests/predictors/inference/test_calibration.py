@@ -1,4 +1,4 @@
-"""One temperature for all logits, found again where it is known."""
+"""The temperature of logits whose temperature is known."""
 
 import math
 
@@ -10,8 +10,8 @@ from hypothesis import strategies as st
 from predictors.inference.calibration import LIMITS, cross_entropy, fit_temperature
 
 
-def drawn(scale: float, count: int = 20_000) -> tuple[np.ndarray, np.ndarray]:
-    """Logits that are `scale` times too big, and modes drawn with the true probabilities."""
+def samples(scale: float, count: int = 20_000) -> tuple[np.ndarray, np.ndarray]:
+    """Logits that are `scale` times too large, and modes drawn with the true probabilities."""
     rng = np.random.default_rng(0)
     logits = rng.normal(0, 1.5, (count, 3))
     best = (logits + rng.gumbel(size=logits.shape)).argmax(axis=1)
@@ -19,17 +19,16 @@ def drawn(scale: float, count: int = 20_000) -> tuple[np.ndarray, np.ndarray]:
 
 
 @pytest.mark.parametrize("scale", [0.5, 1.0, 2.0])
-def test_logits_too_big_are_divided_by_as_much(scale: float) -> None:
-    """Logits twice too big are given 2.00 ± 0.05, half as big ones 0.5."""
-    assert fit_temperature(*drawn(scale)) == pytest.approx(scale, rel=0.025)
+def test_temperature_is_the_scale_of_the_logits(scale: float) -> None:
+    assert fit_temperature(*samples(scale)) == pytest.approx(scale, rel=0.025)
 
 
 @given(shift=st.floats(-5, 5), temperature=st.floats(*LIMITS))
-def test_no_other_temperature_is_better(shift: float, temperature: float) -> None:
-    """Its cross-entropy is the lowest, and does not change when all logits are shifted."""
-    logits, best = drawn(2.0, count=200)
-    found = fit_temperature(logits, best)
-    lowest = cross_entropy(logits + np.float32(shift), best, found)
+def test_no_other_temperature_has_a_lower_cross_entropy(shift: float, temperature: float) -> None:
+    """The fitted temperature is the best, also after a shift of all logits."""
+    logits, best = samples(2.0, count=200)
+    fitted = fit_temperature(logits, best)
+    lowest = cross_entropy(logits + np.float32(shift), best, fitted)
     assert lowest <= cross_entropy(logits, best, temperature) + 1e-6
 
 
@@ -40,8 +39,8 @@ def test_cross_entropy_by_hand() -> None:
     assert cross_entropy(logits, np.array([0, 1]), 2.0) == pytest.approx(expected)
 
 
-def test_what_cannot_be_calibrated_stays() -> None:
-    """No sample, or one mode: 1; always right or always wrong ends at the limits."""
+def test_degenerate_logits() -> None:
+    """Without samples or with one mode: 1. Always right or always wrong: the limits."""
     assert fit_temperature(np.zeros((0, 3)), np.zeros(0, dtype=np.int64)) == 1
     assert fit_temperature(np.zeros((4, 1)), np.zeros(4, dtype=np.int64)) == 1
     logits = np.array([[3.0, 0.0]] * 4)

@@ -1,4 +1,4 @@
-"""Damaged, foreign and unfitting checkpoints: one line each."""
+"""Checkpoints: damaged ones are refused in one line, others load as they were saved."""
 
 import dataclasses
 import hashlib
@@ -29,25 +29,25 @@ def run(tmp_path: Path) -> Path:
 
 
 def change(run: Path, **fields: Any) -> None:
-    """Other values for some fields of its configuration."""
+    """Changes fields of its configuration."""
     path = run / "config.json"
     path.write_text(json.dumps({**json.loads(path.read_text()), **fields}))
 
 
 def change_network(run: Path, **fields: Any) -> None:
-    """Other values for some fields of its network's configuration."""
+    """Changes fields of its network's configuration."""
     config = json.loads((run / "config.json").read_text())
     change(run, network={**config["network"], **fields})
 
 
 def change_training(run: Path, **fields: Any) -> None:
-    """Other values for what it says of its training."""
+    """Changes fields of its training configuration."""
     provenance = json.loads((run / "config.json").read_text())["provenance"]
     change(run, provenance={**provenance, "config": {**provenance["config"], **fields}})
 
 
 def drop(run: Path, field: str) -> None:
-    """A configuration without one of its fields."""
+    """Removes a field of its configuration."""
     path = run / "config.json"
     config = json.loads(path.read_text())
     del config[field]
@@ -55,12 +55,12 @@ def drop(run: Path, field: str) -> None:
 
 
 def truncate(run: Path, name: str, size: int) -> None:
-    """Only the first bytes of a file."""
+    """Truncates a file to its first bytes."""
     (run / name).write_bytes((run / name).read_bytes()[:size])
 
 
 def poison(run: Path) -> None:
-    """A weight that is no number."""
+    """Sets a weight to NaN."""
     weights = load_file(run / "weights.safetensors")
     weights["norm.bias"][0] = float("nan")
     save_file(weights, run / "weights.safetensors")
@@ -87,14 +87,14 @@ FAULTS: dict[str, tuple[Callable[[Path], Any], str]] = {
     "unknown view": (lambda run: change(run, view={"name": "moon"}), "unknown view 'moon'"),
     "view of vectors": (
         lambda run: change(run, view=make_view("vectors").config()),
-        "encoder small reads pictures, the view draws vectors",
+        "encoder small reads rasters, the view renders vectors",
     ),
-    "view of other pictures": (
+    "view of other rasters": (
         lambda run: change(run, view=make_view("mtp", pixels=(36, 36)).config()),
         "does not fit|but it was trained with",
     ),
     "no temperature": (lambda run: drop(run, "temperature"), "does not describe a ffw-asp"),
-    "temperature of nothing": (lambda run: change(run, temperature=None), "does not describe"),
+    "temperature of None": (lambda run: change(run, temperature=None), "does not describe"),
     "no normaliser": (lambda run: change(run, normaliser={}), "does not describe"),
     "no horizon": (lambda run: drop(run, "horizon"), "does not describe"),
     "unknown field": (lambda run: change_network(run, colour=1), "colour"),
@@ -102,12 +102,12 @@ FAULTS: dict[str, tuple[Callable[[Path], Any], str]] = {
     "field of another type": (lambda run: change_network(run, features="x"), "does not describe"),
     "other shapes": (lambda run: change_network(run, gru_width=9), "does not fit"),
     "weights for another horizon": (lambda run: change(run, horizon=30), "does not fit"),
-    "horizon of nothing": (lambda run: change(run, horizon=0), "horizon is 0, expected a positive"),
+    "horizon of 0": (lambda run: change(run, horizon=0), "horizon is 0, expected a positive"),
     "time step that is no number": (
         lambda run: change(run, dt_s=float("nan")),
         "dt_s is nan, expected a positive",
     ),
-    "endless horizon": (lambda run: change(run, horizon=float("inf")), "horizon is inf"),
+    "infinite horizon": (lambda run: change(run, horizon=float("inf")), "horizon is inf"),
     "temperature that is no number": (
         lambda run: change(run, temperature=float("nan")),
         "temperature is nan, expected a positive",
@@ -140,8 +140,7 @@ FAULTS: dict[str, tuple[Callable[[Path], Any], str]] = {
 
 
 @pytest.mark.parametrize("fault", FAULTS, ids=list(FAULTS))
-def test_every_fault_is_one_line(fault: str, run: Path) -> None:
-    """Loading says in one line what is wrong with the folder."""
+def test_faults_are_refused_in_one_line(fault: str, run: Path) -> None:
     damage, message = FAULTS[fault]
     damage(run)
     with pytest.raises(CheckpointError, match=message) as caught:
@@ -149,14 +148,14 @@ def test_every_fault_is_one_line(fault: str, run: Path) -> None:
     assert "\n" not in str(caught.value)
 
 
-def test_missing_argument_says_how_to_name_a_run() -> None:
-    """`ffw-asp` alone is not enough."""
+def test_missing_run_is_refused() -> None:
+    """The name `ffw-asp` needs a run."""
     with pytest.raises(CheckpointError, match="ffw-asp:RUN_DIR"):
         load_predictor("ffw-asp", horizon=15, dt_s=0.2)
 
 
-def test_six_seconds_with_a_wrong_horizon_are_refused(tmp_path: Path) -> None:
-    """Weights of ssp-asp fit any number of segments; what it was trained for is remembered."""
+def test_horizon_other_than_in_training_is_refused(tmp_path: Path) -> None:
+    """The weights of ssp-asp fit any number of segments, so the training's horizon is checked."""
     run = save_random(tmp_path / "run", "ssp-asp", horizon=30)
     change(run, horizon=31)
     with pytest.raises(CheckpointError, match=r"chains segments of 3 s, the horizon of 6\.2 s"):
@@ -167,42 +166,41 @@ def test_six_seconds_with_a_wrong_horizon_are_refused(tmp_path: Path) -> None:
         load_predictor(f"ssp-asp:{run}", horizon=15, dt_s=0.2)
 
 
-def test_chaining_is_named_behind_the_last_at(tmp_path: Path) -> None:
-    """By beam without one; a folder with an @ in its name is one; unknown ones are listed."""
+def test_chaining_follows_the_last_at(tmp_path: Path) -> None:
+    """The default is beam; folders may have an @ in their names; unknown chainings are refused."""
     run = save_random(tmp_path / "runs@home" / "a", "ssp-asp", horizon=30)
     for name, chaining in ((f"{run}", "beam"), (f"{run}@top1", "top1"), (f"{run}@full", "full")):
-        about = load_predictor(f"ssp-asp:{name}", horizon=15, dt_s=0.2).metadata
-        assert about["chaining"] == chaining
+        metadata = load_predictor(f"ssp-asp:{name}", horizon=15, dt_s=0.2).metadata
+        assert metadata["chaining"] == chaining
     assert load_predictor(f"ssp-asp:{run}@oracle", horizon=15, dt_s=0.2).privileged
     with pytest.raises(AspEnvError, match=r"unknown chaining 'top' \(did you mean 'top1'"):
         load_predictor(f"ssp-asp:{run}@top", horizon=15, dt_s=0.2)
     with pytest.raises(CheckpointError, match="runs@work/a holds no trained predictor"):
         load_predictor(f"ssp-asp:{tmp_path}/runs@work/a", horizon=15, dt_s=0.2)
-    whole = save_random(tmp_path / "b@top1", "ssp-asp", horizon=30)
-    assert load_predictor(f"ssp-asp:{whole}", horizon=15, dt_s=0.2).metadata["chaining"] == "beam"
+    with_at = save_random(tmp_path / "b@top1", "ssp-asp", horizon=30)
+    assert load_predictor(f"ssp-asp:{with_at}", horizon=15, dt_s=0.2).metadata["chaining"] == "beam"
 
 
 @pytest.mark.parametrize("predictor", ["ffw-asp", "ssp-asp"])
-def test_what_chains_nothing_takes_no_chaining(predictor: str, tmp_path: Path) -> None:
-    """3 s are forecast at once, by ssp-asp too: the line says how to name the run."""
+def test_chaining_of_a_single_segment_is_refused(predictor: str, tmp_path: Path) -> None:
+    """ssp-asp, too, forecasts 3 s at once; the error says how to name the run."""
     run = save_random(tmp_path / "run", predictor)
     with pytest.raises(AspEnvError, match=f"nothing to chain: .* as {predictor}:{run}$"):
         load_predictor(f"{predictor}:{run}@top1", horizon=15, dt_s=0.2)
 
 
 def test_other_time_step_is_refused(run: Path) -> None:
-    """A predictor of 0.2 s is not loaded for scenes of 0.1 s."""
     with pytest.raises(AspEnvError, match=r"time step of 0\.2 s, the scenes have 0\.1 s"):
         load_predictor(f"ffw-asp:{run}", horizon=30, dt_s=0.1)
 
 
-def test_predictor_keeps_the_horizon_it_was_trained_for(run: Path) -> None:
-    """Asked for 30 ticks, a predictor of 15 forecasts 15."""
+def test_trained_predictor_has_its_own_horizon(run: Path) -> None:
+    """Loaded for 30 ticks, a predictor of 15 forecasts 15."""
     assert load_predictor(f"ffw-asp:{run}", horizon=30, dt_s=0.2).horizon == 15
 
 
-def test_probabilities_are_those_of_the_temperature(run: Path) -> None:
-    """Logits are divided by what is stored: at 2 the log-odds between modes are half as large."""
+def test_logits_are_divided_by_the_temperature(run: Path) -> None:
+    """At a temperature of 2 the log-odds between modes are half as large."""
     recordings = [make_recording()]
     scene = gather_scene(recordings, index_snippets(recordings, dt_s=0.2, horizon_s=3.0))
     odds = []
@@ -214,8 +212,8 @@ def test_probabilities_are_those_of_the_temperature(run: Path) -> None:
     np.testing.assert_allclose(odds[1], odds[0] / 2, atol=1e-5)
 
 
-def test_network_is_stored_as_it_is(run: Path) -> None:
-    """What is loaded holds the weights, shape and configuration that were saved, bit for bit."""
+def test_network_is_stored_unchanged(run: Path) -> None:
+    """The files hold the weights, bit for bit, the shape and the configuration."""
     network = make_network("ffw-asp", tiny_network("ffw-asp"), tiny_shape())
     stored = load_file(run / "weights.safetensors")
     assert stored.keys() == network.state_dict().keys()
@@ -227,25 +225,25 @@ def test_network_is_stored_as_it_is(run: Path) -> None:
     assert tuple(config["normaliser"]["action_range"]) == network.shape.action_range
 
 
-def test_about_names_what_tables_show(run: Path) -> None:
-    """Source, view, preset, and 16 digits that change with the weights; no preset, no entry."""
-    about = load_predictor(f"ffw-asp:{run}", horizon=15, dt_s=0.2).metadata
+def test_metadata(run: Path) -> None:
+    """Source, view, recipe if it is known, and 16 digits of the weights' hash."""
+    metadata = load_predictor(f"ffw-asp:{run}", horizon=15, dt_s=0.2).metadata
     content = (run / "weights.safetensors").read_bytes()
-    assert dict(about) == {
+    assert dict(metadata) == {
         "trained_on": "nothing",
         "view": "chauffeurnet",
         "preset": "tiny",
         "weights": hashlib.sha256(content).hexdigest()[:16],
     }
     other = save_random(run.with_name("other"), seed=1)
-    assert load_predictor(f"ffw-asp:{other}", horizon=15, dt_s=0.2).metadata != about
+    assert load_predictor(f"ffw-asp:{other}", horizon=15, dt_s=0.2).metadata != metadata
     known = json.loads((run / "config.json").read_text())["provenance"]["trained_on"]
     change(run, provenance={"trained_on": known})
     assert "preset" not in load_predictor(f"ffw-asp:{run}", horizon=15, dt_s=0.2).metadata
 
 
-def test_state_of_a_run_survives_the_disk(tmp_path: Path) -> None:
-    """Nested tensors, tuples, integer keys, None and infinities come back as they were."""
+def test_state_of_a_run_is_stored_and_loaded(tmp_path: Path) -> None:
+    """Nested tensors, tuples, integer keys, None and infinities are restored."""
     state = {
         "epoch": 3,
         "best": float("inf"),
@@ -265,22 +263,21 @@ def test_state_of_a_run_survives_the_disk(tmp_path: Path) -> None:
     assert [loaded[key] for key in rest] == [state[key] for key in rest]
 
 
-def test_state_refuses_what_would_need_a_pickle(tmp_path: Path) -> None:
-    """An object in the state of a run is an error when it is written, not when it is read."""
+def test_state_with_an_object_is_refused(tmp_path: Path) -> None:
+    """An object that would need a pickle raises when the state is written."""
     with pytest.raises(TypeError, match="Path, which is not stored"):
         SafetensorsIO().save_checkpoint({"where": Path()}, tmp_path / "state")
 
 
-def test_damaged_state_is_one_line(tmp_path: Path) -> None:
-    """A state cut short says to start the run again."""
+def test_damaged_state_is_refused(tmp_path: Path) -> None:
     SafetensorsIO().save_checkpoint({"a": torch.zeros(100)}, tmp_path / "state")
     (tmp_path / "state").write_bytes((tmp_path / "state").read_bytes()[:90])
     with pytest.raises(CheckpointError, match="start the run again"):
         SafetensorsIO().load_checkpoint(tmp_path / "state")
 
 
-def test_loading_leaves_the_global_generator_alone(run: Path) -> None:
-    """What torch draws next does not depend on whether a predictor was loaded."""
+def test_loading_does_not_change_the_global_generator(run: Path) -> None:
+    """Random numbers of torch do not depend on loading."""
     before = torch.random.get_rng_state()
     load_predictor(f"ffw-asp:{run}", horizon=15, dt_s=0.2)
     assert torch.equal(torch.random.get_rng_state(), before)

@@ -1,4 +1,4 @@
-"""The card of a run says what it is, what it learned from and what it is not."""
+"""The model card of a run."""
 
 import json
 import re
@@ -8,8 +8,8 @@ import pytest
 import yaml
 
 from asp_env import registry
+from predictors.inference.checkpoint import PredictorSpec
 from predictors.inference.model_card import model_card
-from predictors.models.network import LearnedPlug
 from predictors.training.recipes import RECIPES
 from tests.predictors.tiny import save_random
 
@@ -35,11 +35,11 @@ PROVENANCE = {
 
 
 def card_of(run: Path, **provenance: object) -> str:
-    """The card of a run that says this of itself."""
+    """The card of a run with a changed provenance."""
     config = json.loads((run / "config.json").read_text())
     config["provenance"] = {**config["provenance"], **provenance}
-    plug: LearnedPlug = registry.find("predictors", config["predictor"])
-    return model_card(config, plug, weights="0123456789abcdef")
+    spec: PredictorSpec = registry.find("predictors", config["predictor"])
+    return model_card(config, spec.network, weights="0123456789abcdef")
 
 
 @pytest.fixture(scope="module")
@@ -51,19 +51,19 @@ def run(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.mark.parametrize("name", sorted(RECIPES))
 def test_every_run_has_a_card(name: str, tmp_path: Path) -> None:
-    """Beside the weights, with the paper of the predictor and the hash of its own weights."""
+    """The card is beside the weights, with the predictor's paper and the hash of the weights."""
     card = (save_random(tmp_path / "run", name) / "README.md").read_text()
     assert f"# {name}, 3 s" in card
     assert re.search(r"arXiv:\d{4}\.\d{5}", card)
-    loaded: LearnedPlug = registry.find("predictors", name)
+    spec: PredictorSpec = registry.find("predictors", name)
     config = json.loads((tmp_path / "run" / "config.json").read_text())
     weights = re.search(r"SHA-256 `([0-9a-f]{16})…`", card)
     assert weights is not None
-    assert model_card(config, loaded, weights=weights[1]) == card
+    assert model_card(config, spec.network, weights=weights[1]) == card
 
 
-def test_header_is_what_hubs_read(run: Path) -> None:
-    """YAML between two lines of dashes: library, licence by name, tags."""
+def test_header_for_model_hubs(run: Path) -> None:
+    """YAML between two lines of dashes: library, licence, tags."""
     _, header, _ = (run / "README.md").read_text().split("---\n", 2)
     assert yaml.safe_load(header) == {
         "library_name": "asp-env",
@@ -82,11 +82,12 @@ def test_header_is_what_hubs_read(run: Path) -> None:
 def test_numbers_of_a_run(run: Path) -> None:
     """Recordings and snippets by part, histories, horizon, epoch, value, temperature, versions."""
     card = card_of(run, **PROVENANCE)
-    for said in (
+    for text in (
         "# ssp-asp, 6 s",
-        "| needs | 3 s of history: 15 ticks of 0.2 s |",
+        "| recipe | cpu |",
+        "| history | 3 s: 15 ticks of 0.2 s |",
         "3 modes of 30 ticks of 0.2 s (6 s)",
-        "| of | car, van, truck, bus, truck_bus, motorcycle, other |",
+        "| agent classes | car, van, truck, bus, truck_bus, motorcycle, other |",
         "| data | `recordings` |",
         "| validation data | `others` |",
         "| split | blocks |",
@@ -100,18 +101,18 @@ def test_numbers_of_a_run(run: Path) -> None:
         "a temperature, 1.7, on the validation data",
         "CC BY-NC-SA",
     ):
-        assert said in card, said
+        assert text in card, text
 
 
-def test_what_is_not_known_is_left_out(run: Path) -> None:
-    """A run that says little has a card without empty rows, and None nowhere."""
+def test_unknown_facts_are_omitted(run: Path) -> None:
+    """A run with few facts has a card without empty rows and without None."""
     card = card_of(run, config={"threads": None})
     assert "None" not in card
     assert "| threads |" not in card
     assert "best epoch" not in card
 
 
-def test_text_is_the_same_again(run: Path) -> None:
-    """No time of day, no order of chance: two cards of one configuration are equal."""
+def test_equal_configurations_have_equal_cards(run: Path) -> None:
+    """There is no time of day and no random order."""
     assert card_of(run, **PROVENANCE) == card_of(run, **PROVENANCE)
     assert not re.search(r"\d\d:\d\d", card_of(run, **PROVENANCE))

@@ -1,4 +1,4 @@
-"""Heads: the recurrent one is a GRU, whichever way it is worked out."""
+"""Heads: the recurrent reader equals torch's GRU, and the order of a connected head's outputs."""
 
 import pytest
 import torch
@@ -8,7 +8,7 @@ from predictors.models.heads import ConnectedHead, RecurrentReader
 
 @pytest.mark.parametrize("layers", [1, 2, 3])
 def test_reader_is_a_gru_over_context_and_actions(layers: int) -> None:
-    """The last state of torch's GRU that reads both at every tick, to 1e-6; and its gradients."""
+    """The last state of torch's GRU on both inputs, to 1e-6, and its gradients."""
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(0)
         reader = RecurrentReader(5, 7, layers)
@@ -16,11 +16,11 @@ def test_reader_is_a_gru_over_context_and_actions(layers: int) -> None:
         actions = torch.randn(3, 15, 2)
     whole = torch.cat([context[:, None].expand(-1, 15, -1), actions], dim=-1)
     expected = reader.gru(whole)[0][:, -1]
-    found = reader(context, actions)
-    torch.testing.assert_close(found, expected, atol=1e-6, rtol=1e-5)
+    state = reader(context, actions)
+    torch.testing.assert_close(state, expected, atol=1e-6, rtol=1e-5)
     inputs = [context, *reader.parameters()]
     pairs = zip(
-        torch.autograd.grad(found.square().sum(), inputs),
+        torch.autograd.grad(state.square().sum(), inputs),
         torch.autograd.grad(expected.square().sum(), inputs),
         strict=True,
     )
@@ -28,7 +28,7 @@ def test_reader_is_a_gru_over_context_and_actions(layers: int) -> None:
         torch.testing.assert_close(one, other, atol=1e-5, rtol=1e-4)
 
 
-def test_connected_head_deals_its_outputs() -> None:
+def test_order_of_the_outputs_of_a_connected_head() -> None:
     """Of 2 modes and 3 ticks: 2 logits first, then pairs mode by mode and tick by tick."""
     head = ConnectedHead(1, 0, modes=2, ticks=3)
     assert len(head.layers) == 1

@@ -1,4 +1,4 @@
-"""MTP: states along positions by hand, and that its modes do not collapse."""
+"""MTP: states along positions by hand, and modes that do not collapse."""
 
 import math
 from typing import Any
@@ -14,9 +14,9 @@ from tests.predictors.tiny import draw_samples, make_network, tiny_network, tiny
 
 
 def test_states_along_by_hand() -> None:
-    """2 m ahead, 2 m to the left, 5 cm back (too short to tell a heading), 4 m back.
+    """2 m ahead, 2 m to the left, 5 cm back (too short for a heading of its own), 4 m back.
 
-    At 0.2 s a tick the speeds are 10, 10, 0.25 and 20 m/s.
+    At ticks of 0.2 s the speeds are 10, 10, 0.25 and 20 m/s.
     """
     positions = torch.tensor([[[[2.0, 0.0], [2.0, 2.0], [1.95, 2.0], [-2.05, 2.0]]]])
     states = states_along(positions, 0.2)
@@ -26,23 +26,23 @@ def test_states_along_by_hand() -> None:
     np.testing.assert_allclose(states[0, 0, :, 3], [10, 10, 0.25, 20], atol=1e-4)
 
 
-def test_who_has_not_moved_yet_keeps_its_heading() -> None:
-    """Steps of 1 cm to the left from the start: heading 0."""
+def test_a_target_that_has_not_moved_has_heading_0() -> None:
+    """Three steps of 1 cm to the left."""
     positions = torch.zeros(1, 1, 3, 2)
     positions[..., 1] = torch.tensor([0.01, 0.02, 0.03])
     assert not states_along(positions, 0.2)[..., 2].any()
 
 
-def test_gradients_pass_through_positions_alone() -> None:
-    """Headings and speeds are read off, not learned from; positions have gradient 1."""
+def test_gradients_pass_through_positions_only() -> None:
+    """Positions have gradient 1; headings and speeds have none."""
     positions = torch.ones(1, 1, 2, 2, requires_grad=True)
     states = states_along(positions, 0.2)
     (gradient,) = torch.autograd.grad(states.sum(), positions)
     assert torch.equal(gradient, torch.ones_like(positions))
 
 
-def test_positions_are_not_bound_by_any_limit() -> None:
-    """It has no actions, and goes where its outputs say: 1000 m in one tick."""
+def test_positions_have_no_limits() -> None:
+    """MTP has no actions: a bias of 100 moves a target by 1000 m in one tick."""
     network = make_network("mtp", tiny_network("mtp"), tiny_shape())
     linear = network.get_submodule("head.layers.2")
     with torch.no_grad():
@@ -53,7 +53,7 @@ def test_positions_are_not_bound_by_any_limit() -> None:
 
 
 def bimodal() -> tuple[Batch, Labels]:
-    """The same target four times: it goes straight on three times, and to the left once."""
+    """The same target four times: it continues straight three times, and turns left once."""
     batch, labels = draw_samples([8] * 4, view="vectors")
     ahead = torch.arange(1.0, 16.0)
     states = torch.zeros_like(labels.states)
@@ -62,38 +62,36 @@ def bimodal() -> tuple[Batch, Labels]:
     return batch, Labels(states=states, later=())
 
 
-class Uninformed(torch.nn.Module):
-    """Features that do not depend on what is seen."""
+class ConstantEncoder(torch.nn.Module):
+    """Eight features that do not depend on the observation."""
 
     def __init__(self) -> None:
-        """Eight."""
         super().__init__()
         self.z = torch.nn.Parameter(torch.linspace(-1, 1, 8))
 
-    def forward(self, seen: VectorTensors) -> torch.Tensor:
-        """The same for all."""
-        return self.z.expand(len(seen.agents), -1)
+    def forward(self, vectors: VectorTensors) -> torch.Tensor:
+        return self.z.expand(len(vectors.agents), -1)
 
 
 def train_on_bimodal(modes: int, seed: int, **changes: Any) -> tuple[Modes, dict[str, float]]:
-    """What MTP says after 400 steps on them, and its losses."""
+    """Modes and losses of MTP after 400 steps on `bimodal`."""
     batch, labels = bimodal()
     config = tiny_network("mtp", "vectors", hidden=32, modes=modes, **changes)
     network = make_network("mtp", config, tiny_shape("vectors"), seed=seed)
-    network.add_module("encoder", Uninformed())
+    network.add_module("encoder", ConstantEncoder())
     optimizer = torch.optim.Adam(network.parameters(), lr=1e-2)
-    falling = torch.optim.lr_scheduler.LinearLR(
+    schedule = torch.optim.lr_scheduler.LinearLR(
         optimizer, start_factor=1.0, end_factor=0.0, total_iters=400
     )
     for step in range(400):
         optimizer.zero_grad()
         network.training_loss(batch, labels, TrainingProgress(share=step / 400))["loss"].backward()
         optimizer.step()
-        falling.step()
+        schedule.step()
     with torch.no_grad():
-        found = network(batch)
-        terms = network.loss(found, labels, TrainingProgress())
-    return found, {name: float(value) for name, value in terms.items()}
+        predicted = network(batch)
+        terms = network.loss(predicted, labels, TrainingProgress())
+    return predicted, {name: float(value) for name, value in terms.items()}
 
 
 @pytest.mark.parametrize(
@@ -103,22 +101,23 @@ def train_on_bimodal(modes: int, seed: int, **changes: Any) -> tuple[Modes, dict
 )
 @pytest.mark.parametrize("seed", [0, 1])
 def test_modes_do_not_collapse(seed: int, modes: int, changes: dict[str, Any]) -> None:
-    """On 75/25 data the classification loss reaches their entropy, 0.5623 ± 0.01; both are found.
+    """On 75/25 data the classification loss reaches the entropy, and both labels have a mode.
 
-    Nothing tells the two apart: 0.75 ln 4/3 + 0.25 ln 4 = 0.5623. The regression goes to zero.
+    The inputs are equal, so the lowest loss is 0.75 ln 4/3 + 0.25 ln 4 = 0.5623; the regression
+    reaches zero.
     """
-    found, terms = train_on_bimodal(modes, seed, **changes)
+    predicted, terms = train_on_bimodal(modes, seed, **changes)
     assert terms["classification"] == pytest.approx(0.5623, abs=0.01)
     assert terms["regression"] < 0.001
     _, labels = bimodal()
-    away = found.states[0, :, :, :2] - labels.states[[0, 3]][:, None, :, :2]
-    nearest = torch.linalg.vector_norm(away, dim=-1).mean(dim=-1).argmin(dim=1)
-    probabilities = found.logits[0].softmax(dim=0)
+    offsets = predicted.states[0, :, :, :2] - labels.states[[0, 3]][:, None, :, :2]
+    nearest = torch.linalg.vector_norm(offsets, dim=-1).mean(dim=-1).argmin(dim=1)
+    probabilities = predicted.logits[0].softmax(dim=0)
     np.testing.assert_allclose(probabilities[nearest], [0.75, 0.25], atol=0.02)
 
 
-def test_modes_collapse_where_the_best_one_takes_all() -> None:
-    """Why chance or annealing is needed: by distance one mode may win both, and is sure of it."""
+def test_modes_collapse_by_distance() -> None:
+    """By distance one mode wins both labels, with certainty: why other rules are needed."""
     _, terms = train_on_bimodal(3, 1, assignment="distance")
     assert terms["classification"] < 0.01
     assert terms["regression"] > 1

@@ -1,4 +1,4 @@
-"""Every network with each of its options: shapes, limits, gradients, and what its inputs are."""
+"""Every network with each of its options: shapes, limits, gradients and inputs."""
 
 import dataclasses
 import math
@@ -14,7 +14,7 @@ from asp_env.dynamics import MAX_ACCELERATION_MPS2, MAX_STEERING_RAD
 from asp_env.errors import AspEnvError
 from asp_env.views import make_view
 from predictors.models.batch import Batch, Labels, make_batch
-from predictors.models.network import AbstractNetwork, Modes, TrainingProgress, drive
+from predictors.models.network import AbstractNetwork, Modes, TrainingProgress, rollout_from_now
 from tests.builders import Drive, make_recording
 from tests.predictors.tiny import draw_samples, make_network, tiny_network, tiny_shape
 
@@ -26,7 +26,7 @@ OPTIONS: dict[str, tuple[str, dict[str, Any]]] = {
     "dkm with literal classification": ("dkm", {"classification": "softmax"}),
     "dkm with annealing": ("dkm", {"annealed": True}),
     "dkm by distance": ("dkm", {"assignment": "distance"}),
-    "dkm by chance": ("dkm", {"assignment": "angle-random"}),
+    "dkm by angle or at random": ("dkm", {"assignment": "angle-random"}),
     "ffw-asp": ("ffw-asp", {}),
     "ffw-asp with skip": ("ffw-asp", {"skip": True}),
     "ffw-asp with a hidden layer": ("ffw-asp", {"hidden": 8}),
@@ -38,7 +38,7 @@ OPTIONS: dict[str, tuple[str, dict[str, Any]]] = {
     "ssp-asp with skip": ("ssp-asp", {"skip": True, "hidden": 8}),
     "ssp-asp with two layers": ("ssp-asp", {"gru_layers": 2}),
     "ssp-asp normalised": ("ssp-asp", {"normalise": True, "stop_gradient": True}),
-    "ssp-asp with a follower": ("ssp-asp", {"ema": 0.9}),
+    "ssp-asp with a second encoder": ("ssp-asp", {"ema": 0.9}),
     "ssp-asp without encoded branch": ("ssp-asp", {"encoded_branch": False}),
     "ssp-asp scheduled": ("ssp-asp", {"scheduled": True}),
     "ssp-asp annealed": ("ssp-asp", {"annealed": True}),
@@ -48,18 +48,18 @@ OPTIONS: dict[str, tuple[str, dict[str, Any]]] = {
 
 @pytest.fixture(scope="module")
 def sample() -> tuple[Batch, Labels]:
-    """Four snippets of turning, braking and straight vehicles."""
+    """Four snippets of vehicles that turn, brake and drive straight."""
     return draw_samples([8, 30, 41, 55], later_ticks=(15,))
 
 
 def tiny(predictor: str, **changes: Any) -> AbstractNetwork:
-    """A tiny network for pictures."""
+    """A tiny network for rasters."""
     return make_network(predictor, tiny_network(predictor, **changes), tiny_shape())
 
 
 @pytest.mark.parametrize("option", OPTIONS, ids=list(OPTIONS))
-def test_every_option_gives_modes_and_gradients(option: str, sample: tuple[Batch, Labels]) -> None:
-    """Shapes (4, M, 15, ·), actions within limits, and finite gradients for all that is trained."""
+def test_every_option_has_modes_and_gradients(option: str, sample: tuple[Batch, Labels]) -> None:
+    """Shapes (4, M, 15, ·), actions within limits, and finite gradients of all parameters."""
     batch, labels = sample
     predictor, changes = OPTIONS[option]
     network = tiny(predictor, **changes)
@@ -80,25 +80,27 @@ def test_every_option_gives_modes_and_gradients(option: str, sample: tuple[Batch
             assert torch.isfinite(parameter.grad).all(), name
 
 
-def test_options_change_what_they_are_named_for(sample: tuple[Batch, Labels]) -> None:
-    """The literal term lies in [-1, 0], the cross-entropy above 0; annealing ends at half-way."""
+def test_classification_and_annealing_options(sample: tuple[Batch, Labels]) -> None:
+    """The term `softmax` is in [-1, 0], the cross-entropy above 0; annealing ends at half-way."""
     literal = tiny("dkm", classification="softmax").training_loss(*sample, TrainingProgress())
     assert -1 <= float(literal["classification"].detach()) <= 0
-    plain = tiny("dkm").training_loss(*sample, TrainingProgress(share=0.1))
-    assert float(plain["classification"].detach()) > 0
+    default = tiny("dkm").training_loss(*sample, TrainingProgress(share=0.1))
+    assert float(default["classification"].detach()) > 0
     early, late = (
         tiny("dkm", annealed=True).training_loss(*sample, TrainingProgress(share=share))[
             "regression"
         ]
         for share in (0.1, 0.5)
     )
-    assert float(early.detach()) > float(plain["regression"].detach())
-    assert torch.equal(late, plain["regression"])
+    assert float(early.detach()) > float(default["regression"].detach())
+    assert torch.equal(late, default["regression"])
 
 
 @pytest.mark.parametrize("predictor", ["dkm", "ffw-asp"])
-def test_outputs_are_tanh_times_the_range(predictor: str, sample: tuple[Batch, Labels]) -> None:
-    """With a bias of atanh(0.5) and no weights every action is half of the range (4, 0.5)."""
+def test_outputs_are_tanh_times_the_action_range(
+    predictor: str, sample: tuple[Batch, Labels]
+) -> None:
+    """With a bias of atanh(0.5) and weights of 0 every action is half of the range (4, 0.5)."""
     network = tiny(predictor)
     linear = [each for each in network.modules() if isinstance(each, torch.nn.Linear)][-1]
     with torch.no_grad():
@@ -119,14 +121,14 @@ def test_states_follow_from_actions_by_hand(sample: tuple[Batch, Labels]) -> Non
     actions = torch.tensor([2.0, 0.0]).expand(4, 3, 15, 2)
     for integrator, expected in (("heun", [0.04, 0.16]), ("euler", [0.0, 0.08])):
         named: Any = integrator
-        states = drive(actions, batch, 0.2, named)
+        states = rollout_from_now(actions, batch, 0.2, named)
         np.testing.assert_allclose(states[0, 0, :2, 0], expected, atol=1e-6)
         np.testing.assert_allclose(states[0, 0, :2, 3], [0.4, 0.8], atol=1e-6)
         assert not states[..., 1].any()
 
 
 def test_motion_is_speed_acceleration_and_yaw_rate() -> None:
-    """A car that brakes at 1 m/s² and turns left: its speed now, -1, and v·sin β / l_r rad/s."""
+    """A car that brakes at 1 m/s² and turns left: speed now, -1 m/s², and v·sin β / l_r rad/s."""
     turning = Drive(kind=AgentClass.CAR, start=(0.0, 0.0, 3.0, 12.0), phases=((60.0, -1.0, 0.1),))
     recording = make_recording(drives=(turning,), duration_s=8.0)
     index = index_snippets([recording], dt_s=0.2, horizon_s=3.0)
@@ -140,24 +142,24 @@ def test_motion_is_speed_acceleration_and_yaw_rate() -> None:
     np.testing.assert_allclose(batch.actions[0], [[-1.0, 0.1]] * 15, atol=2e-3)
 
 
-READS = {
-    "mtp": {"motion", "seen"},
-    "dkm": {"motion", "seen"},
-    "ffw-asp": {"actions", "seen"},
-    "ssp-asp": {"actions", "seen"},
+INPUTS = {
+    "mtp": {"motion", "observation"},
+    "dkm": {"motion", "observation"},
+    "ffw-asp": {"actions", "observation"},
+    "ssp-asp": {"actions", "observation"},
 }
 
 
-@pytest.mark.parametrize("predictor", READS)
-def test_networks_read_what_the_paper_gives_them(
+@pytest.mark.parametrize("predictor", INPUTS)
+def test_networks_read_the_inputs_of_the_papers(
     predictor: str, sample: tuple[Batch, Labels]
 ) -> None:
-    """DKM and MTP the present motion, the others past actions; logits tell, which nobody drives."""
+    """DKM and MTP read the present motion, the others past actions, as their logits show."""
     batch = sample[0]
     network = tiny(predictor).eval()
-    assert not isinstance(batch.seen, tuple)
-    others = {
-        "seen": batch._replace(seen=batch.seen.flip(0)),
+    assert not isinstance(batch.observation, tuple)
+    changed = {
+        "observation": batch._replace(observation=batch.observation.flip(0)),
         "actions": batch._replace(actions=batch.actions.flip(0) + 0.5),
         "motion": batch._replace(motion=batch.motion.flip(0)),
     }
@@ -165,14 +167,14 @@ def test_networks_read_what_the_paper_gives_them(
         before: Modes = network(batch)
         read = {
             name
-            for name, other in others.items()
+            for name, other in changed.items()
             if not torch.equal(before.logits, network(other).logits)
         }
-    assert read == READS[predictor]
+    assert read == INPUTS[predictor]
 
 
-def test_skip_leads_the_speed_to_the_output(sample: tuple[Batch, Labels]) -> None:
-    """With it another speed gives other logits, without it the same."""
+def test_skip_connects_the_speed_to_the_output(sample: tuple[Batch, Labels]) -> None:
+    """Another speed changes the logits only with `skip`."""
     batch = sample[0]
     faster = batch._replace(motion=batch.motion + torch.tensor([3.0, 0.0, 0.0]))
     for predictor in ("ffw-asp", "ssp-asp"):
@@ -186,7 +188,7 @@ def test_skip_leads_the_speed_to_the_output(sample: tuple[Batch, Labels]) -> Non
 @pytest.mark.parametrize("predictor", ["mtp", "dkm", "ffw-asp"])
 @pytest.mark.parametrize("field", ["features", "modes", "hidden", "gru_width", "gru_layers"])
 def test_impossible_sizes_are_refused(predictor: str, field: str) -> None:
-    """No features, width, layers or modes is one line; so is a negative hidden layer."""
+    """Negative numbers of features, modes, layers or units are refused in one line."""
     config = tiny_network(predictor)
     if not hasattr(config, field):
         return

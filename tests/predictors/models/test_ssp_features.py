@@ -1,4 +1,4 @@
-"""SSP-ASP's features: who learns from which loss, and what keeps the target still."""
+"""SSP-ASP's features: which parts each term of the loss trains, and the targets of ψ."""
 
 from typing import Any
 
@@ -15,7 +15,7 @@ END = TrainingProgress(share=1.0)
 
 
 def ssp(view: str = "vectors", **changes: Any) -> SSPASPNetwork:
-    """A tiny network for 3 s."""
+    """A tiny SSP-ASP for 3 s."""
     network = make_network("ssp-asp", tiny_network("ssp-asp", view, **changes), tiny_shape(view))
     assert isinstance(network, SSPASPNetwork)
     return network
@@ -23,12 +23,12 @@ def ssp(view: str = "vectors", **changes: Any) -> SSPASPNetwork:
 
 @pytest.fixture(scope="module")
 def sample() -> tuple[Batch, Labels]:
-    """Four snippets with the scene at 3 s."""
+    """Four snippets with the inputs at 3 s."""
     return draw_samples([8, 30, 41, 55], view="vectors", later_ticks=(15,))
 
 
-def moved_by(network: SSPASPNetwork, term: Tensor) -> set[str]:
-    """Parts of the network that a loss has a gradient for."""
+def trained_by(network: SSPASPNetwork, term: Tensor) -> set[str]:
+    """Parts of the network that have a gradient of a term."""
     network.zero_grad(set_to_none=True)
     term.backward(retain_graph=True)
     return {
@@ -42,60 +42,60 @@ FEATURES = {"encoder", "norm", "forward_reader", "forward_head"}
 ACTIONS = {"reader", "head"}
 
 
-def test_pretraining_moves_no_action_predictor(sample: tuple[Batch, Labels]) -> None:
-    """Encoder, feature predictor and reconstructor learn alone; afterwards all parts do."""
+def test_pretraining_does_not_train_the_action_predictor(sample: tuple[Batch, Labels]) -> None:
+    """It trains φ, ψ and ξ; afterwards all parts are trained."""
     network = ssp()
     loss = network.training_loss(*sample, TrainingProgress(share=0.0, pretraining=True))["loss"]
-    assert moved_by(network, loss) == FEATURES | {"reconstructor"}
+    assert trained_by(network, loss) == FEATURES | {"reconstructor"}
     loss = network.training_loss(*sample, END)["loss"]
-    assert moved_by(network, loss) == FEATURES | {"reconstructor"} | ACTIONS
+    assert trained_by(network, loss) == FEATURES | {"reconstructor"} | ACTIONS
 
 
-def test_every_term_moves_what_it_is_of(sample: tuple[Batch, Labels]) -> None:
-    """Reconstruction and mismatch their own parts, the others all that leads to actions."""
+def test_parts_trained_by_each_term(sample: tuple[Batch, Labels]) -> None:
+    """The reconstruction trains φ and ξ, the mismatch φ and ψ, the others φ, ψ and γ."""
     network = ssp()
     terms = network.training_loss(*sample, END)
-    assert moved_by(network, terms["actions"]) == {"encoder", "reconstructor"}
-    assert moved_by(network, terms["features"]) == FEATURES
+    assert trained_by(network, terms["actions"]) == {"encoder", "reconstructor"}
+    assert trained_by(network, terms["features"]) == FEATURES
     for name in ("regression", "classification"):
-        assert moved_by(network, terms[name]) == FEATURES | ACTIONS
+        assert trained_by(network, terms[name]) == FEATURES | ACTIONS
 
 
 def gradients_of_features(
     network: SSPASPNetwork, sample: tuple[Batch, Labels], monkeypatch: pytest.MonkeyPatch
 ) -> list[bool]:
-    """Whether the mismatch of features pulls at those encoded now, and at those encoded later."""
+    """Whether the feature mismatch has a gradient for the features now, and for the later ones."""
     encoded: list[Tensor] = []
     encode = network.encode
 
-    def kept(batch: Batch) -> Tensor:
+    def record(batch: Batch) -> Tensor:
         encoded.append(encode(batch))
         return encoded[-1]
 
-    monkeypatch.setattr(network, "encode", kept)
+    monkeypatch.setattr(network, "encode", record)
     terms = network.training_loss(*sample, END)
-    found = torch.autograd.grad(terms["features"], encoded, allow_unused=True)
-    return [each is not None and bool(each.any()) for each in found]
+    gradients = torch.autograd.grad(terms["features"], encoded, allow_unused=True)
+    return [each is not None and bool(each.any()) for each in gradients]
 
 
 @pytest.mark.parametrize(
-    ("changes", "pulls"),
+    ("changes", "expected"),
     [({}, True), ({"stop_gradient": True}, False), ({"ema": 0.9}, False)],
     ids=["literal", "stop_gradient", "ema"],
 )
-def test_no_gradient_through_a_fixed_target(
+def test_gradient_of_the_target_of_the_feature_predictor(
     changes: dict[str, Any],
-    pulls: bool,
+    expected: bool,
     sample: tuple[Batch, Labels],
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    """The literal loss pulls at both ends; a stopped or following target stays where it is."""
-    found = gradients_of_features(ssp(**changes), sample, monkeypatch)
-    assert found == [True, pulls]
+    """The literal loss has a gradient for the target; `stop_gradient` and `ema` have none."""
+    gradients = gradients_of_features(ssp(**changes), sample, monkeypatch)
+    assert gradients == [True, expected]
 
 
-def test_second_encoder_follows_by_hand(sample: tuple[Batch, Labels]) -> None:
-    """With 0.9 a weight of 1 whose leader is at 2 becomes 1.1, then 1.19; no gradient moves it."""
+def test_second_encoder_averages_weights(sample: tuple[Batch, Labels]) -> None:
+    """At a decay of 0.9 a weight of 1 that follows 2 becomes 1.1, then 1.19; it has no gradient."""
     network = ssp(ema=0.9)
     follower = network.target_encoder
     assert follower is not None
@@ -111,8 +111,8 @@ def test_second_encoder_follows_by_hand(sample: tuple[Batch, Labels]) -> None:
     assert all(each.grad is None for each in follower.parameters())
 
 
-def test_second_encoder_takes_the_statistics_of_the_first() -> None:
-    """Running means of batch normalisation are copied, not averaged."""
+def test_second_encoder_copies_running_statistics() -> None:
+    """Buffers of batch normalisation are copied, not averaged."""
     network = ssp("chauffeurnet", ema=0.9)
     batch, labels = draw_samples([8, 30, 41, 55], later_ticks=(15,))
     network.training_loss(batch, labels, END)
@@ -123,8 +123,8 @@ def test_second_encoder_takes_the_statistics_of_the_first() -> None:
     assert any(bool(each.any()) for each in network.encoder.buffers())
 
 
-def test_target_is_what_the_second_encoder_says(sample: tuple[Batch, Labels]) -> None:
-    """Other weights there change the mismatch of features and nothing else."""
+def test_second_encoder_makes_the_targets(sample: tuple[Batch, Labels]) -> None:
+    """Other weights of the second encoder change only the mismatch of features."""
     network = ssp(ema=0.9)
     before = network.training_loss(*sample, END)
     assert network.target_encoder is not None
@@ -135,8 +135,7 @@ def test_target_is_what_the_second_encoder_says(sample: tuple[Batch, Labels]) ->
     assert same == {"actions", "regression", "classification"}
 
 
-def test_without_a_second_encoder_a_step_changes_nothing() -> None:
-    """Without `ema` there is none to follow."""
+def test_after_step_without_a_second_encoder_changes_nothing() -> None:
     network = ssp()
     before = {name: value.clone() for name, value in network.state_dict().items()}
     network.after_step()
@@ -144,8 +143,8 @@ def test_without_a_second_encoder_a_step_changes_nothing() -> None:
     assert all(torch.equal(value, before[name]) for name, value in network.state_dict().items())
 
 
-def test_branch_on_encoded_features_can_be_left_out(sample: tuple[Batch, Labels]) -> None:
-    """Without it what is seen at 3 s moves no forecast's loss; with it, it does."""
+def test_branch_on_encoded_features_is_optional(sample: tuple[Batch, Labels]) -> None:
+    """Only with it do the inputs at 3 s influence the losses of the forecasts."""
     batch, labels = sample
     other = labels._replace(later=(batch,))
     for branch in (False, True):
@@ -156,13 +155,13 @@ def test_branch_on_encoded_features_can_be_left_out(sample: tuple[Batch, Labels]
         assert not torch.equal(one["features"], two["features"])
 
 
-def test_both_branches_count_alike(sample: tuple[Batch, Labels]) -> None:
-    """Where both see the same features, the loss of both is that of one."""
+def test_both_branches_have_equal_weight(sample: tuple[Batch, Labels]) -> None:
+    """If both branches have the same features, the loss of both equals that of one."""
     batch, labels = sample
     losses = []
     for branch in (False, True):
         network = ssp(encoded_branch=branch)
-        with torch.no_grad():  # ψ says the bias, and φ of whatever is seen as well
+        with torch.no_grad():  # ψ and φ return their bias for all inputs
             for linear in (network.forward_head, _last_linear(network.encoder)):
                 linear.get_parameter("weight").zero_()
                 linear.get_parameter("bias").copy_(torch.linspace(-1, 1, 8))
@@ -177,7 +176,7 @@ def _last_linear(module: torch.nn.Module) -> torch.nn.Module:
 
 
 def test_normalised_features_have_mean_0_and_variance_1(sample: tuple[Batch, Labels]) -> None:
-    """Encoded and predicted ones alike."""
+    """Encoded and predicted features."""
     features = ssp(normalise=True).features(*sample)
     assert features is not None
     for z in features:
@@ -185,17 +184,17 @@ def test_normalised_features_have_mean_0_and_variance_1(sample: tuple[Batch, Lab
         torch.testing.assert_close(z.var(dim=1, correction=0), torch.ones(4), atol=1e-2, rtol=0)
 
 
-def test_diagnosed_features_are_those_of_the_end_of_the_segment(
+def test_features_are_those_at_the_end_of_the_segment(
     sample: tuple[Batch, Labels],
 ) -> None:
-    """Encoded is what φ says of the scene at 3 s; predicted knows nothing of it."""
+    """Encoded features are those of the inputs at 3 s; predicted ones do not depend on them."""
     batch, labels = sample
     network = ssp()
-    features, false = (
+    features, other = (
         network.features(batch, each) for each in (labels, labels._replace(later=(batch,)))
     )
     assert features is not None
-    assert false is not None
+    assert other is not None
     assert torch.equal(features.encoded, network.encode(labels.later[0]))
-    assert not torch.equal(features.encoded, false.encoded)
-    assert torch.equal(features.predicted, false.predicted)
+    assert not torch.equal(features.encoded, other.encoded)
+    assert torch.equal(features.predicted, other.predicted)

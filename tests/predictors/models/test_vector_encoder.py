@@ -1,4 +1,4 @@
-"""The vector encoder: what must not change its features, and what must."""
+"""The vector encoder: what its features depend on, and what they do not."""
 
 import math
 
@@ -24,7 +24,7 @@ def make_encoder(shape: VectorShape = SHAPE, seed: int = 0) -> VectorEncoder:
 
 
 def make_vectors(count: int = 5, seed: int = 0, shape: VectorShape = SHAPE) -> VectorTensors:
-    """Random numbers; some ticks, agents and lines of each target are not valid."""
+    """Random vectors; some ticks, agents and lines of each target are not valid."""
     rng = np.random.default_rng(seed)
     agents_valid = rng.random((count, shape.agents, shape.ticks)) < 0.8
     agents_valid[:, :, -1] = True
@@ -42,24 +42,23 @@ def make_vectors(count: int = 5, seed: int = 0, shape: VectorShape = SHAPE) -> V
 
 
 def features(vectors: VectorTensors) -> Tensor:
-    """Of one and the same encoder."""
+    """Features by the encoder with seed 0."""
     with torch.inference_mode():
         return make_encoder()(vectors)
 
 
 def gradients(encoder: VectorEncoder) -> list[Tensor]:
-    """Of all parameters that have one."""
-    found = [parameter.grad for parameter in encoder.parameters()]
-    return [gradient for gradient in found if gradient is not None]
+    """Gradients of all parameters that have one."""
+    every = [parameter.grad for parameter in encoder.parameters()]
+    return [gradient for gradient in every if gradient is not None]
 
 
-def close(one: Tensor, other: Tensor) -> None:
-    """To 1e-5."""
+def assert_close(one: Tensor, other: Tensor) -> None:
     torch.testing.assert_close(one, other, rtol=0, atol=1e-5)
 
 
 def padded(vectors: VectorTensors, *, agents: int, lines: int) -> VectorTensors:
-    """With so many more agents and lines that are not valid."""
+    """Appends agents and lines that are not valid."""
     return VectorTensors(
         torch.nn.functional.pad(vectors.agents, (0, 0, 0, 0, 0, agents)),
         torch.nn.functional.pad(vectors.agents_valid, (0, 0, 0, agents)),
@@ -69,14 +68,14 @@ def padded(vectors: VectorTensors, *, agents: int, lines: int) -> VectorTensors:
 
 
 def test_shape() -> None:
-    """Five targets have five rows of seven features, no two of them alike."""
-    found = features(make_vectors())
-    assert found.shape == (5, 7)
-    assert len(torch.unique(found, dim=0)) == 5
+    """Five targets have five rows of seven features, all of them different."""
+    values = features(make_vectors())
+    assert values.shape == (5, 7)
+    assert len(torch.unique(values, dim=0)) == 5
 
 
 def test_reads_what_the_view_draws() -> None:
-    """A scene's vectors become features, and other scenes others."""
+    """The vectors of two scenes have different, finite features."""
     view = VectorView()
     encoder = make_encoder(view.shape)
     with torch.inference_mode():
@@ -90,8 +89,8 @@ def test_reads_what_the_view_draws() -> None:
 
 
 @pytest.mark.parametrize("garbage", [math.nan, math.inf, 1e30, 3.0])
-def test_what_is_not_valid_changes_nothing(garbage: float) -> None:
-    """Bit for bit, whatever stands there."""
+def test_invalid_entries_have_no_influence(garbage: float) -> None:
+    """Features are equal bit for bit with any values in invalid entries."""
     vectors = make_vectors()
     dirty = vectors._replace(
         agents=vectors.agents.masked_fill(~vectors.agents_valid[..., None], garbage),
@@ -100,8 +99,8 @@ def test_what_is_not_valid_changes_nothing(garbage: float) -> None:
     assert torch.equal(features(dirty), features(vectors))
 
 
-def test_order_does_not_matter() -> None:
-    """Neighbours and lines in another order give the same features."""
+def test_order_has_no_influence() -> None:
+    """Neighbours and lines in another order have the same features."""
     vectors = make_vectors()
     agents = torch.tensor([0, 3, 5, 1, 4, 2])
     lines = torch.from_numpy(np.random.default_rng(0).permutation(SHAPE.lines))
@@ -111,11 +110,10 @@ def test_order_does_not_matter() -> None:
         vectors.lines[:, lines],
         vectors.lines_valid[:, lines],
     )
-    close(features(shuffled), features(vectors))
+    assert_close(features(shuffled), features(vectors))
 
 
-def test_the_target_is_not_one_of_its_neighbours() -> None:
-    """In another's place it gives other features."""
+def test_target_and_neighbour_are_not_exchangeable() -> None:
     vectors = make_vectors()
     swapped = torch.tensor([1, 0, 2, 3, 4, 5])
     other = vectors._replace(
@@ -124,23 +122,22 @@ def test_the_target_is_not_one_of_its_neighbours() -> None:
     assert ((features(other) - features(vectors)).abs().amax(dim=1) > 1e-3).all()
 
 
-def test_padding_changes_nothing() -> None:
-    """More agents and lines that are not valid give the same features."""
+def test_padding_has_no_influence() -> None:
     vectors = make_vectors()
-    close(features(padded(vectors, agents=5, lines=20)), features(vectors))
+    assert_close(features(padded(vectors, agents=5, lines=20)), features(vectors))
 
 
-def test_the_batch_changes_nothing() -> None:
-    """Each target alone has the features that it has among others."""
+def test_the_batch_has_no_influence() -> None:
+    """Each target alone has the same features as in a batch."""
     vectors = make_vectors()
     together = features(vectors)
     for row in range(5):
         alone = VectorTensors(*(tensor[row : row + 1] for tensor in vectors))
-        close(features(alone), together[row : row + 1])
+        assert_close(features(alone), together[row : row + 1])
 
 
 def test_every_valid_part_is_read() -> None:
-    """Any tick of any agent and any point of any line changes its own target's features alone."""
+    """Every tick of every agent and every point of every line changes only its own target."""
     vectors = make_vectors(2)
     whole = features(vectors)
     moved = vectors._replace(agents=vectors.agents.clone(), lines=vectors.lines.clone())
@@ -150,27 +147,26 @@ def test_every_valid_part_is_read() -> None:
     ):
         for place in valid.nonzero():
             row = values[tuple(place)]
-            kept = row.clone()
+            original = row.clone()
             row[0] += 3
             changed = features(moved)
             assert not torch.equal(changed[0], whole[0]), place
             assert torch.equal(changed[1], whole[1])
-            row.copy_(kept)
+            row.copy_(original)
 
 
-def test_alone_in_the_world() -> None:
-    """Nobody else, no line, and even no target: finite features and gradients."""
+def test_without_neighbours_and_lines() -> None:
+    """Features and gradients are finite, even if the target is not valid."""
     vectors = VectorTensors(*(torch.zeros_like(tensor) for tensor in make_vectors()))
     vectors.agents_valid[:3, 0] = True
     encoder = make_encoder()
-    found = encoder(vectors)
-    found.sum().backward()
-    assert torch.isfinite(found).all()
+    values = encoder(vectors)
+    values.sum().backward()
+    assert torch.isfinite(values).all()
     assert all(torch.isfinite(gradient).all() for gradient in gradients(encoder))
 
 
-def test_every_parameter_learns() -> None:
-    """A loss has a gradient for each of them that is not zero."""
+def test_every_parameter_has_a_gradient() -> None:
     encoder = make_encoder()
     encoder(make_vectors()).square().sum().backward()
     assert len(gradients(encoder)) == len(list(encoder.parameters()))
@@ -178,7 +174,7 @@ def test_every_parameter_learns() -> None:
 
 
 def test_bfloat16() -> None:
-    """Under autocast features are those of float32 to about 1 %, and gradients are finite."""
+    """Under autocast features differ from float32 by less than 2 %; gradients are finite."""
     encoder, vectors = make_encoder(), make_vectors()
     exact = encoder(vectors)
     with torch.autocast("cpu", dtype=torch.bfloat16):
@@ -189,6 +185,5 @@ def test_bfloat16() -> None:
 
 
 def test_heads_must_divide_the_width() -> None:
-    """Width 16 with 3 heads is refused in one line."""
     with pytest.raises(AspEnvError, match="width 16 with 3 heads"):
         VectorEncoder(SHAPE, 7, width=16, heads=3)

@@ -1,4 +1,4 @@
-"""Several processes, on one node or on two: one run, the weights of one process."""
+"""Several processes, on one node or two, end with the weights of one process."""
 
 import json
 import os
@@ -36,7 +36,7 @@ from tests.predictors.tiny import (
 )
 
 SECONDS = 300
-"""After which processes that wait for each other have failed."""
+"""Time after which processes that wait for each other are ended."""
 
 TOLERANCE = 1e-6
 
@@ -47,7 +47,7 @@ pytestmark = pytest.mark.skipif(
 
 @pytest.fixture(scope="module")
 def data(tmp_path_factory: pytest.TempPathFactory) -> str:
-    """Three recordings: one to learn from, one to select on, one to test."""
+    """Three recordings: one for training, one for validation, one for testing."""
     return write_data(tmp_path_factory.mktemp("data"))
 
 
@@ -63,8 +63,8 @@ def start(
     backend: str | None = None,
     **variables: str,
 ) -> subprocess.Popen[str]:
-    """A process that trains, with variables of its own."""
-    told = {
+    """Starts a process of `tests.predictors.rank` with further environment variables."""
+    arguments = {
         "predictor": predictor,
         "view": view,
         "data": data,
@@ -75,7 +75,7 @@ def start(
         "backend": backend,
     }
     return subprocess.Popen(
-        [sys.executable, "-m", "tests.predictors.rank", json.dumps(told)],
+        [sys.executable, "-m", "tests.predictors.rank", json.dumps(arguments)],
         env={**os.environ, **variables},
         stderr=subprocess.PIPE,
         text=True,
@@ -83,7 +83,7 @@ def start(
 
 
 def end(process: subprocess.Popen[str]) -> str:
-    """Waits for a process; what it wrote to standard error."""
+    """Waits for a process and returns its standard error."""
     try:
         return process.communicate(timeout=SECONDS)[1]
     finally:
@@ -91,21 +91,21 @@ def end(process: subprocess.Popen[str]) -> str:
 
 
 def weights_of(path: Path) -> dict[str, torch.Tensor]:
-    """Tensors of a file that is there."""
+    """The tensors of a file, which must exist."""
     assert path.exists(), path
     return load_file(path)
 
 
 def same_weights(first: dict[str, torch.Tensor], second: dict[str, torch.Tensor]) -> bool:
-    """Whether they are equal bit for bit."""
+    """Whether all tensors are equal bit for bit."""
     assert first.keys() == second.keys()
     return all(torch.equal(tensor, second[name]) for name, tensor in first.items())
 
 
-def test_two_processes_that_died_end_with_the_weights_of_one(data: str, tmp_path: Path) -> None:
+def test_two_interrupted_processes_end_with_the_weights_of_one(data: str, tmp_path: Path) -> None:
     """Without batch statistics and in float32, to 1e-6; in pre-training γ has no gradient.
 
-    Batches of 7 are shared as 4 and 3, and the last one of 1 as 1 and none.
+    Batches of 7 are sharded as 4 and 3, the last one of 1 as 1 and 0.
     """
     changes = {
         "precision": "32-true",
@@ -115,7 +115,7 @@ def test_two_processes_that_died_end_with_the_weights_of_one(data: str, tmp_path
         "pretraining_epochs": 1,
         "epochs": 2,
     }
-    told: dict[str, Any] = {
+    options: dict[str, Any] = {
         "predictor": "ssp-asp",
         "view": "vectors",
         "data": data,
@@ -124,15 +124,17 @@ def test_two_processes_that_died_end_with_the_weights_of_one(data: str, tmp_path
     }
     out = tmp_path / "two" / "run"
     out.parent.mkdir()
-    died = start(out, **told, die_after=1)
+    died = start(out, **options, die_after=1)
     end(died)
     assert died.returncode != 0
     assert not (out / "config.json").exists()
-    resumed = start(out, **told)
-    told_last = end(resumed)
-    assert resumed.returncode == 0, told_last[-2000:]
-    lines = told_last.splitlines()
-    assert sum(line.startswith("epoch") for line in lines) == 1  # the third, of the first process
+    resumed = start(out, **options)
+    stderr = end(resumed)
+    assert resumed.returncode == 0, stderr[-2000:]
+    lines = stderr.splitlines()
+    assert (
+        sum(line.startswith("epoch") for line in lines) == 1
+    )  # only the third epoch, by the first process
     ranks = [weights_of(out.with_name(f"rank-{rank}.safetensors")) for rank in range(2)]
     assert same_weights(*ranks)
     assert sorted(each.name for each in (out / "logs").iterdir()) == [
@@ -144,15 +146,17 @@ def test_two_processes_that_died_end_with_the_weights_of_one(data: str, tmp_path
     of_one, of_two = (weights_of(run / "weights.safetensors") for run in (one, out))
     for name, tensor in of_one.items():
         torch.testing.assert_close(of_two[name], tensor, atol=TOLERANCE, rtol=0, msg=name)
-    found = [json.loads((run / "config.json").read_text())["provenance"] for run in (one, out)]
-    assert [each["processes"] for each in found] == [1, 2]
-    assert found[1]["best_epoch"] == found[0]["best_epoch"]
-    assert found[1]["best_value"] == pytest.approx(found[0]["best_value"], abs=1e-4)
+    provenances = [
+        json.loads((run / "config.json").read_text())["provenance"] for run in (one, out)
+    ]
+    assert [each["processes"] for each in provenances] == [1, 2]
+    assert provenances[1]["best_epoch"] == provenances[0]["best_epoch"]
+    assert provenances[1]["best_value"] == pytest.approx(provenances[0]["best_value"], abs=1e-4)
     assert load_predictor(f"ssp-asp:{out}", horizon=15, dt_s=0.2).name == "ssp-asp"
 
 
 def test_two_nodes_end_with_equal_weights(data: str, tmp_path: Path) -> None:
-    """Batch statistics and bfloat16 included, bit for bit."""
+    """Equal bit for bit, with batch statistics and bfloat16."""
     with socket.socket() as free:
         free.bind(("127.0.0.1", 0))
         port = str(free.getsockname()[1])
@@ -171,8 +175,8 @@ def test_two_nodes_end_with_equal_weights(data: str, tmp_path: Path) -> None:
         )
         for rank in range(2)
     ]
-    told = [end(node) for node in nodes]
-    assert [node.returncode for node in nodes] == [0, 0], told[0][-1000:] + told[1][-1000:]
+    stderrs = [end(node) for node in nodes]
+    assert [node.returncode for node in nodes] == [0, 0], "".join(s[-1000:] for s in stderrs)
     ranks = [weights_of(tmp_path / f"rank-{rank}.safetensors") for rank in range(2)]
     assert same_weights(*ranks)
     assert [each.name for each in (out / "logs").iterdir()] == ["from-epoch-00"]
@@ -186,25 +190,25 @@ def test_two_nodes_end_with_equal_weights(data: str, tmp_path: Path) -> None:
     seed=st.integers(0, 9),
 )
 @settings(max_examples=50, deadline=None)
-def test_shares_together_are_the_order_of_the_epoch(
+def test_shards_together_are_the_order_of_the_epoch(
     count: int, batch_size: int, ranks: int, seed: int
 ) -> None:
-    """Every row once, each in the batch that it has in one process, and no share is empty."""
+    """Every row occurs once, in the batch of a single process, and no shard is empty."""
     recordings = [make_recording()]
     index = index_snippets(recordings, dt_s=0.2, horizon_s=3.0)
     batches = Batches(
         recordings, index, view=make_view("chauffeurnet", pixels=PIXELS), batch_size=batch_size
     ).reordered(np.random.default_rng(seed).integers(0, len(index), count))
-    shares = [batches.dealt(rank, ranks) for rank in range(ranks)]
+    shards = [batches.shard(rank, ranks) for rank in range(ranks)]
     for number in range(len(batches)):
-        rows = [each.share(number) for each in shares]
-        own = [each.own(number) for each in shares]
+        rows = [each.shard_rows(number) for each in shards]
+        own = [each.num_own(number) for each in shards]
         assert all(len(each) for each in rows)
-        assert sum(own) == batches.rows(number)
-        dealt = np.concatenate([each[:n] for each, n in zip(rows, own, strict=True)])
+        assert sum(own) == batches.num_snippets(number)
+        joined = np.concatenate([each[:n] for each, n in zip(rows, own, strict=True)])
         first = number * batch_size
         np.testing.assert_array_equal(
-            np.sort(dealt), np.arange(first, min(first + batch_size, count))
+            np.sort(joined), np.arange(first, min(first + batch_size, count))
         )
 
 
@@ -216,12 +220,12 @@ def test_shares_together_are_the_order_of_the_epoch(
         ({"nodes": 2}, "MASTER_ADDR, MASTER_PORT, NODE_RANK not set"),
         ({"devices": 9}, "batches of 8 cannot be shared by 9 processes"),
     ],
-    ids=["no device", "no node", "nodes that do not know of one another", "too small a batch"],
+    ids=["no device", "no node", "nodes without a rendezvous", "too small a batch"],
 )
-def test_hardware_that_cannot_be_is_one_line(
+def test_impossible_hardware_is_refused(
     hardware: dict[str, Any], words: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Before any process is started, and nothing is written."""
+    """The error is raised before any process starts or anything is written."""
     for name in ("MASTER_ADDR", "MASTER_PORT", "NODE_RANK"):
         monkeypatch.delenv(name, raising=False)
     with pytest.raises(AspEnvError, match=words):
@@ -231,39 +235,39 @@ def test_hardware_that_cannot_be_is_one_line(
     assert not (tmp_path / "run").exists()
 
 
-def test_launcher_of_other_processes_is_one_line(
+def test_launcher_of_another_number_of_processes_is_refused(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Otherwise each of the three would take itself for the only one."""
+    """Each of the three processes would otherwise train alone."""
     monkeypatch.setenv("LOCAL_RANK", "0")
     monkeypatch.setenv("WORLD_SIZE", "3")
     with pytest.raises(AspEnvError, match="started 3 processes for 1 devices of 1 nodes"):
         make_trainer(tiny_config(), Hardware(), out=tmp_path / "run", started="now", callbacks=[])
 
 
-def test_compiled_encoder_leaves_names_and_weights_alone(data: str, tmp_path: Path) -> None:
-    """Traced by the compiler and run as traced: a run that died ends with the weights of another.
+def test_compiled_encoder_has_the_same_names_and_weights(data: str, tmp_path: Path) -> None:
+    """An interrupted run is resumed with compilation and ends with the weights of one without.
 
-    The one that died was not compiled, and the one that went on from it was.
+    The encoder is traced by the compiler and run as traced.
     """
-    told: dict[str, Any] = {
+    options: dict[str, Any] = {
         "predictor": "ffw-asp",
         "view": "chauffeurnet",
         "data": data,
         "changes": {"epochs": 2, "precision": "32-true"},
     }
     out = tmp_path / "run"
-    died = start(out, **told, hardware={}, die_after=0)
+    died = start(out, **options, hardware={}, die_after=0)
     end(died)
     assert died.returncode != 0
-    resumed = start(out, **told, hardware={"compiled": True}, backend="eager")
-    told_last = end(resumed)
-    assert resumed.returncode == 0, told_last[-2000:]
-    plain = train(tiny_config("ffw-asp", **told["changes"]), data, tmp_path / "plain")
-    found, expected = (weights_of(run / "weights.safetensors") for run in (out, plain))
-    assert found.keys() == expected.keys()
+    resumed = start(out, **options, hardware={"compiled": True}, backend="eager")
+    stderr = end(resumed)
+    assert resumed.returncode == 0, stderr[-2000:]
+    plain = train(tiny_config("ffw-asp", **options["changes"]), data, tmp_path / "plain")
+    resumed_weights, expected = (weights_of(run / "weights.safetensors") for run in (out, plain))
+    assert resumed_weights.keys() == expected.keys()
     for name, tensor in expected.items():
-        torch.testing.assert_close(found[name], tensor, atol=1e-6, rtol=0, msg=name)
+        torch.testing.assert_close(resumed_weights[name], tensor, atol=1e-6, rtol=0, msg=name)
     assert json.loads((out / "config.json").read_text())["provenance"]["compiled"]
     assert load_predictor(f"ffw-asp:{out}", horizon=15, dt_s=0.2).name == "ffw-asp"
 
@@ -279,23 +283,23 @@ def test_compiled_encoder_leaves_names_and_weights_alone(data: str, tmp_path: Pa
         ("ssp-asp", "vectors"),
     ],
 )
-def test_all_behind_the_encoder_is_float32(predictor: str, view: str) -> None:
-    """Under bf16-mixed the encoder alone computes in bfloat16, in training as in forecasts."""
+def test_everything_after_the_encoder_is_float32(predictor: str, view: str) -> None:
+    """Under bf16-mixed only the encoder computes in bfloat16, in training and in forecasts."""
     network = make_network(predictor, tiny_network(predictor, view), tiny_shape(view))
     batch, labels = draw_samples(
         (8, 30, 41, 55), view=view, later_ticks=network.later_ticks, recording=make_recording()
     )
     inside: set[torch.dtype] = set()
-    behind: set[torch.dtype] = set()
+    outside: set[torch.dtype] = set()
     for name, module in network.named_modules():
         if not list(module.children()):
-            of = inside if name.startswith("encoder.") else behind
-            module.register_forward_hook(lambda _, __, out, of=of: _add_dtype(of, out))
+            dtypes = inside if name.startswith("encoder.") else outside
+            module.register_forward_hook(lambda _, __, out, dtypes=dtypes: _add_dtype(dtypes, out))
     with torch.autocast("cpu", torch.bfloat16):
         terms = network.training_loss(batch, labels, TrainingProgress())
         modes = network(batch)
     assert torch.bfloat16 in inside
-    assert behind == {torch.float32}
+    assert outside == {torch.float32}
     assert modes.states.dtype == modes.logits.dtype == terms["loss"].dtype == torch.float32
 
 
@@ -304,8 +308,8 @@ def _add_dtype(dtypes: set[torch.dtype], out: Any) -> None:
         dtypes.add(out.dtype)
 
 
-def test_compiling_without_a_compiler_is_one_line(monkeypatch: pytest.MonkeyPatch) -> None:
-    """It names the compiler that is not there."""
+def test_compiling_without_a_compiler_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The error names the missing compiler."""
     monkeypatch.setenv("CXX", "no-such-compiler")
     monkeypatch.setattr(torch.cuda, "is_available", lambda: False)
     with pytest.raises(AspEnvError, match="there is no no-such-compiler"):

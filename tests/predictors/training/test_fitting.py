@@ -1,4 +1,4 @@
-"""Training: what it writes, and what it refuses."""
+"""A training run: its files, its result, and its errors."""
 
 import dataclasses
 import json
@@ -28,18 +28,17 @@ from tests.predictors.tiny import tiny_config, tiny_network, write_data
 
 @pytest.fixture(scope="module")
 def data(tmp_path_factory: pytest.TempPathFactory) -> str:
-    """Three recordings: one to learn from, one to select on, one to test."""
+    """Three recordings: one for training, one for validation, one for testing."""
     return write_data(tmp_path_factory.mktemp("data"))
 
 
 @pytest.fixture(scope="module")
 def finished(data: str, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A run of four epochs that nothing interrupted."""
+    """A finished run of four epochs."""
     return train(tiny_config(), data, tmp_path_factory.mktemp("runs") / "finished")
 
 
 def test_other_seed_gives_other_weights(data: str, finished: Path, tmp_path: Path) -> None:
-    """The seed decides the weights: another one gives others."""
     other = train(tiny_config(seed=1), data, tmp_path / "run")
     name = "head.layers.0.weight"
     weights = [load_file(run / "weights.safetensors")[name] for run in (finished, other)]
@@ -47,7 +46,7 @@ def test_other_seed_gives_other_weights(data: str, finished: Path, tmp_path: Pat
 
 
 def test_run_folder_holds_no_pickles(finished: Path) -> None:
-    """Configuration, weights and logs, and nothing else."""
+    """It holds the configuration, weights, card and logs only."""
     files = {str(path.relative_to(finished)) for path in finished.rglob("*") if path.is_file()}
     assert "logs/from-epoch-00/metrics.csv" in files
     logs = {name for name in files if name.startswith("logs/")}
@@ -55,7 +54,7 @@ def test_run_folder_holds_no_pickles(finished: Path) -> None:
     assert all("events" in n or n.endswith(("metrics.csv", "hparams.yaml")) for n in logs)
 
 
-def test_checkpoint_says_what_it_learned_from(data: str, finished: Path) -> None:
+def test_checkpoint_names_its_training_data(data: str, finished: Path) -> None:
     """Part and content hash of every recording, seed, normaliser, and versions."""
     config = json.loads((finished / "config.json").read_text())
     known = config["provenance"]["trained_on"]
@@ -73,8 +72,8 @@ def test_checkpoint_says_what_it_learned_from(data: str, finished: Path) -> None
     assert dict(predictor.trained_on.parts) == known["parts"]
 
 
-def test_what_merges_modes_is_calibrated_before_and_after(data: str, tmp_path: Path) -> None:
-    """The run keeps both temperatures, each the best one of the modes that it divides."""
+def test_network_that_merges_has_two_temperatures(data: str, tmp_path: Path) -> None:
+    """Each temperature is the best one for the modes that it divides."""
     config = tiny_config("ssp-asp", "vectors", epochs=1, pretraining_epochs=0)
     config = dataclasses.replace(config, network=tiny_network("ssp-asp", "vectors", kept=3))
     run = train(config, data, tmp_path / "run")
@@ -82,14 +81,14 @@ def test_what_merges_modes_is_calibrated_before_and_after(data: str, tmp_path: P
     assert isinstance(predictor, TrainedPredictor)
     network = predictor.network
     assert isinstance(network, SSPASPNetwork)
-    found = network.merging_temperature
-    assert found is not None
-    shown = open_training_data(config, data).validation
-    batches = shown.batches(
+    merging = network.merging_temperature
+    assert merging is not None
+    validation = open_training_data(config, data).validation
+    batches = validation.batches(
         predictor.view, size=VALIDATION_BATCH, later_ticks=network.later_ticks, config=config
     )
-    told = json.loads((run / "config.json").read_text())["temperature"]
-    both: tuple[tuple[Chaining, float], ...] = (("full", float(found)), ("beam", told))
+    stored = json.loads((run / "config.json").read_text())["temperature"]
+    both: tuple[tuple[Chaining, float], ...] = (("full", float(merging)), ("beam", stored))
     for chaining, temperature in both:
         logits, best = [], []
         with torch.inference_mode():
@@ -103,13 +102,12 @@ def test_what_merges_modes_is_calibrated_before_and_after(data: str, tmp_path: P
 
 
 def test_finished_run_is_refused(data: str, finished: Path) -> None:
-    """Training into a finished run is one line that says so."""
     with pytest.raises(AspEnvError, match="holds a finished run"):
         train(tiny_config(), data, finished)
 
 
 def test_other_configuration_is_refused(data: str, tmp_path: Path) -> None:
-    """An unfinished run is gone on with only by its own configuration."""
+    """An unfinished run is continued only with its own configuration."""
     out = tmp_path / "run"
     (out / "unfinished").mkdir(parents=True)
     (out / "unfinished" / "run.json").write_text("{}")
@@ -117,8 +115,8 @@ def test_other_configuration_is_refused(data: str, tmp_path: Path) -> None:
         train(tiny_config(), data, out)
 
 
-def test_foreign_folder_is_refused(data: str, tmp_path: Path) -> None:
-    """A folder with other things in it is left alone."""
+def test_folder_with_other_files_is_refused(data: str, tmp_path: Path) -> None:
+    """The folder is not changed."""
     (tmp_path / "letter.txt").write_text("dear")
     with pytest.raises(AspEnvError, match="something that is no run"):
         train(tiny_config(), data, tmp_path)
@@ -128,7 +126,7 @@ def test_foreign_folder_is_refused(data: str, tmp_path: Path) -> None:
 def test_loss_that_is_not_finite_stops_the_run(
     data: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """A NaN loss is one line, and no checkpoint is written."""
+    """A loss of NaN raises, and no checkpoint is written."""
     terms = "predictors.models.losses.regression_loss"
     monkeypatch.setattr(terms, lambda *_: torch.tensor(float("nan"), requires_grad=True))
     with pytest.raises(AspEnvError, match="not finite in epoch 0"):
@@ -137,17 +135,17 @@ def test_loss_that_is_not_finite_stops_the_run(
 
 
 def test_too_few_recordings_leave_no_folder(tmp_path: Path) -> None:
-    """Where nothing is left to test on the error names blocks, and nothing is half written."""
+    """If no recording is left for testing, the error names blocks, and nothing is written."""
     data = write_data(tmp_path / "data", recordings=1)
     with pytest.raises(AspEnvError, match="--split blocks"):
         train(tiny_config(), data, tmp_path / "run")
     assert not (tmp_path / "run").exists()
 
 
-def test_nothing_to_select_on_is_one_line(
+def test_empty_validation_part_is_refused(
     data: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """A split that leaves no snippet for validation is refused before anything is written."""
+    """The error is raised before anything is written."""
 
     def all_to_train(recordings: Recordings, index: SnippetIndex, split: Split) -> object:
         _, trained_on = snippet_parts(recordings, index, split)
@@ -161,7 +159,7 @@ def test_nothing_to_select_on_is_one_line(
 
 
 def test_forecasts_do_not_depend_on_the_batch(data: str, finished: Path) -> None:
-    """A target alone is forecast as among all others, to 1e-5 m."""
+    """The forecast of a single target equals that in a batch, to 2e-5 m."""
     recordings = open_data(data)
     scene = gather_scene(recordings, index_snippets(recordings, dt_s=0.2, horizon_s=3.0))
     predictor = load_predictor(f"ffw-asp:{finished}", horizon=15, dt_s=0.2)
@@ -176,5 +174,5 @@ def test_forecasts_do_not_depend_on_the_batch(data: str, finished: Path) -> None
     ("step", "share"), [(0, 0.1), (4, 0.5), (9, 1.0), (10, 1.0), (55, 0.5), (100, 0.0)]
 )
 def test_one_cycle_by_hand(step: int, share: float) -> None:
-    """Of 100 steps: up over the first ten, half in the middle of the rest, zero at the end."""
+    """100 steps: rising over the first ten, half at the middle of the rest, zero at the end."""
     assert one_cycle(step, 100) == pytest.approx(share, abs=1e-9)

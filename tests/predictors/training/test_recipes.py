@@ -1,4 +1,4 @@
-"""Recipes: the paper's numbers, and configurations that cannot be."""
+"""Recipes: the numbers of the paper, budgets, and invalid configurations."""
 
 import dataclasses
 from typing import Any
@@ -14,10 +14,10 @@ from tests.predictors.tiny import tiny_config
 
 @pytest.mark.parametrize("predictor", RECIPES)
 @pytest.mark.parametrize("horizon_s", [3.0, 6.0])
-def test_paper_recipes_are_the_papers(predictor: str, horizon_s: float) -> None:
+def test_recipes_paper_have_the_numbers_of_the_paper(predictor: str, horizon_s: float) -> None:
     """ResNet18 of 512, 3 modes by angle or at random, Euler; Adam 1e-4, batches of 32, 10 epochs.
 
-    Three epochs of pre-training come before those of SSP-ASP, but not where 6 s start from 3 s.
+    SSP-ASP has three more epochs of pre-training, unless its run for 6 s starts from 3 s.
     """
     config = recipe(predictor, "paper", view="chauffeurnet", horizon_s=horizon_s)
     network = config.network
@@ -34,8 +34,8 @@ def test_paper_recipes_are_the_papers(predictor: str, horizon_s: float) -> None:
     assert config.pretraining_epochs == (3 if first else 0)
 
 
-def test_papers_recurrent_networks() -> None:
-    """GRUs of 2x512 without skip or hidden layer; SSP-ASP's four terms weigh alike, both branches.
+def test_recurrent_networks_of_the_paper() -> None:
+    """GRUs of 2x512 without skip or hidden layer; SSP-ASP has four equal weights and both branches.
 
     Its options beyond the paper are off.
     """
@@ -53,27 +53,24 @@ def test_papers_recurrent_networks() -> None:
     assert not any((ssp.normalise, ssp.stop_gradient, ssp.ema, ssp.scheduled))
 
 
-CASES = [(predictor, preset) for predictor, presets in RECIPES.items() for preset in presets]
+CASES = [(predictor, name) for predictor, names in RECIPES.items() for name in names]
 
 
-@pytest.mark.parametrize(("predictor", "preset"), CASES)
-def test_every_recipe_is_for_every_view(predictor: str, preset: str) -> None:
-    """Named after predictor and preset; pictures get an encoder of pictures, vectors theirs.
-
-    Small pictures are square pixels of a quarter: 90x60, or 90x90 of the square view.
-    """
+@pytest.mark.parametrize(("predictor", "name"), CASES)
+def test_every_recipe_is_for_every_view(predictor: str, name: str) -> None:
+    """The encoder fits the view; small rasters have 90x60 pixels, or 90x90 in the square view."""
     for view, pixels in (("chauffeurnet", (90, 60)), ("mtp", (90, 90)), ("vectors", None)):
-        config = recipe(predictor, preset, view=view, horizon_s=3.0)
-        assert (config.predictor, config.preset, config.view) == (predictor, preset, view)
-        if preset == "paper":
+        config = recipe(predictor, name, view=view, horizon_s=3.0)
+        assert (config.predictor, config.preset, config.view) == (predictor, name, view)
+        if name == "paper":
             pixels = None
         assert config.pixels == pixels
-        encoder = "resnet18" if preset == "paper" else "small"
+        encoder = "resnet18" if name == "paper" else "small"
         assert config.network.encoder == ("vector" if view == "vectors" else encoder)
 
 
-def test_small_pretraining_takes_of_the_epochs() -> None:
-    """Two of SSP-ASP's epochs: with those after them as many as DKM has."""
+def test_small_pretraining_is_part_of_the_epochs() -> None:
+    """Two of SSP-ASP's epochs, which are as many as those of DKM."""
     ssp, dkm = (
         recipe(predictor, "cpu", view="vectors", horizon_s=3.0) for predictor in ("ssp-asp", "dkm")
     )
@@ -82,19 +79,19 @@ def test_small_pretraining_takes_of_the_epochs() -> None:
 
 
 def test_small_runs_for_6_s_have_equal_budgets() -> None:
-    """16 epochs each: of SSP-ASP 8 for 3 s and 8 after them, of the others all at once."""
-    small = [(name, preset) for name, of in RECIPES.items() for preset in of if preset != "paper"]
+    """16 epochs each: SSP-ASP has 8 for 3 s and 8 for 6 s, the others have 16 at once."""
+    small = [case for case in CASES if case[1] != "paper"]
     assert len(small) == 6
-    for predictor, preset in small:
+    for predictor, name in small:
         short, long = (
-            recipe(predictor, preset, view="vectors", horizon_s=horizon_s).all_epochs
+            recipe(predictor, name, view="vectors", horizon_s=horizon_s).all_epochs
             for horizon_s in (3.0, 6.0)
         )
         assert (short + long if predictor == "ssp-asp" else long) == 16
 
 
 def test_unknown_names_list_the_known_ones() -> None:
-    """A misspelt predictor or preset is one line with a suggestion."""
+    """The error suggests the nearest name and lists all."""
     with pytest.raises(AspEnvError, match="did you mean 'ffw-asp'"):
         recipe("ffw", "cpu", view="chauffeurnet", horizon_s=3.0)
     with pytest.raises(AspEnvError, match="known are cpu, ours, paper"):
@@ -105,14 +102,13 @@ def test_unknown_names_list_the_known_ones() -> None:
     "field",
     ["epochs", "batch_size", "snippets_per_epoch", "max_snippets", "max_validation_snippets"],
 )
-def test_numbers_of_nothing_are_refused(field: str) -> None:
-    """No epochs, or none of what is counted, is refused at construction."""
-    nothing: Any = {field: 0}
+def test_numbers_of_zero_are_refused(field: str) -> None:
+    zero: Any = {field: 0}
     with pytest.raises(AspEnvError, match=f"{field} is 0, expected 1 or more"):
-        tiny_config(**nothing)
+        tiny_config(**zero)
 
 
-def test_impossible_shares_are_refused() -> None:
+def test_numbers_out_of_range_are_refused() -> None:
     """A share of standing targets above one, or negative epochs."""
     with pytest.raises(AspEnvError, match=r"standing_share is 1\.5"):
         tiny_config(standing_share=1.5)
@@ -122,9 +118,9 @@ def test_impossible_shares_are_refused() -> None:
     assert dataclasses.replace(tiny_config(), pretraining_epochs=2).all_epochs == 6
 
 
-@pytest.mark.parametrize("preset", RECIPES["ssp-asp"])
+@pytest.mark.parametrize("name", RECIPES["ssp-asp"])
 @pytest.mark.parametrize("horizon_s", [1.5, 4.0])
-def test_what_cannot_be_chained_is_refused_at_once(preset: str, horizon_s: float) -> None:
-    """1.5 and 4 s are no whole number of segments of 3 s: one line before anything is trained."""
+def test_horizon_that_is_no_number_of_segments_is_refused(name: str, horizon_s: float) -> None:
+    """1.5 and 4 s are no whole number of segments of 3 s."""
     with pytest.raises(AspEnvError, match=f"horizon of {horizon_s:g} s is no whole number"):
-        recipe("ssp-asp", preset, view="vectors", horizon_s=horizon_s)
+        recipe("ssp-asp", name, view="vectors", horizon_s=horizon_s)

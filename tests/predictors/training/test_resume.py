@@ -1,4 +1,4 @@
-"""A run that is killed goes on as if nothing had been, and one for 6 s from one for 3 s."""
+"""Interrupted runs end as uninterrupted ones; runs for 6 s start from runs for 3 s."""
 
 import dataclasses
 import json
@@ -14,32 +14,32 @@ from safetensors.torch import load_file
 from asp_env.errors import AspEnvError
 from predictors.training import lightning_parts
 from predictors.training.fitting import train, train_stages
-from predictors.training.lightning_parts import EpochLogger, Fit
+from predictors.training.lightning_parts import EpochLogger, TrainingModule
 from predictors.training.recipes import TrainingConfig
 from tests.predictors.tiny import tiny_config, tiny_network, write_data
 
 
 @pytest.fixture(scope="module")
 def data(tmp_path_factory: pytest.TempPathFactory) -> str:
-    """Three recordings: one to learn from, one to select on, one to test."""
+    """Three recordings: one for training, one for validation, one for testing."""
     return write_data(tmp_path_factory.mktemp("data"))
 
 
 class Killed(BaseException):
-    """What a kill looks like from inside: nothing catches it."""
+    """Stands for a kill; nothing catches it."""
 
 
 def kill_after_epoch_two(
     self: EpochLogger, trainer: pl.Trainer, pl_module: pl.LightningModule
 ) -> None:
-    """Right after the state of the second epoch is on the disk."""
+    """Interrupts right after the state of the second epoch is written."""
     del self, pl_module
     if trainer.current_epoch == 1:
         raise Killed
 
 
-def kill_in_epoch_three(self: Fit, batch: object, batch_idx: int) -> None:
-    """After one step of the third epoch, which is lost."""
+def kill_in_epoch_three(self: TrainingModule, batch: object, batch_idx: int) -> None:
+    """Interrupts after one step of the third epoch, which is lost."""
     del batch
     if self.current_epoch == 2 and batch_idx == 1:
         raise Killed
@@ -47,14 +47,14 @@ def kill_in_epoch_three(self: Fit, batch: object, batch_idx: int) -> None:
 
 KILLS = {
     "between epochs": (EpochLogger, "on_train_epoch_end", kill_after_epoch_two),
-    "within an epoch": (Fit, "on_train_batch_start", kill_in_epoch_three),
+    "within an epoch": (TrainingModule, "on_train_batch_start", kill_in_epoch_three),
 }
 
 
 RUNS: dict[str, dict[str, Any]] = {
     "one-cycle": {"schedule": "one-cycle"},
     "plateau": {"schedule": "plateau"},
-    "pre-training and a follower": {
+    "pre-training and a second encoder": {
         "predictor": "ssp-asp",
         "view": "vectors",
         "schedule": "one-cycle",
@@ -67,19 +67,22 @@ CASES = [("one-cycle", "between epochs"), *((run, "within an epoch") for run in 
 
 
 @pytest.mark.parametrize(("run", "kill"), CASES)
-def test_killed_run_ends_with_the_same_weights(
+def test_interrupted_run_ends_with_the_same_weights(
     run: str, kill: str, data: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Two epochs, a kill, and two more give the weights of four in a row, bit for bit.
+    """Two epochs, an interruption and two more have the weights of four epochs, bit for bit.
 
-    On the plateau no epoch counts as better: the second and every later one divides the rate by 5.
+    With `plateau` no epoch counts as an improvement: from the second on, each divides the rate by
+    5.
     """
     monkeypatch.setattr(lightning_parts, "PLATEAU_PATIENCE", 0)
     monkeypatch.setattr(lightning_parts, "PLATEAU_THRESHOLD", 0.99)
     rates: list[float] = []
     last: list[dict[str, torch.Tensor]] = []
-    monkeypatch.setattr(Fit, "on_train_epoch_start", lambda self: rates.append(rate_of(self)))
-    monkeypatch.setattr(Fit, "on_train_end", lambda self: last.append(weights_of(self)))
+    monkeypatch.setattr(
+        TrainingModule, "on_train_epoch_start", lambda self: rates.append(rate_of(self))
+    )
+    monkeypatch.setattr(TrainingModule, "on_train_end", lambda self: last.append(weights_of(self)))
     config = tiny_config(**{**RUNS[run], "learning_rate": 0.01})
     with monkeypatch.context() as patched:
         patched.setattr(*KILLS[kill])
@@ -99,26 +102,26 @@ def test_killed_run_ends_with_the_same_weights(
         assert resumed.keys() == whole.keys()
         for name, tensor in whole.items():
             assert torch.equal(resumed[name], tensor), name
-    known = [
+    configs = [
         json.loads((tmp_path / each / "config.json").read_text()) for each in ("killed", "whole")
     ]
-    assert known[0] == known[1]
+    assert configs[0] == configs[1]
 
 
-def weights_of(module: Fit) -> dict[str, torch.Tensor]:
-    """A copy of the weights at this moment: those of the best epoch take their place later."""
+def weights_of(module: TrainingModule) -> dict[str, torch.Tensor]:
+    """A copy of the current weights, which those of the best epoch replace later."""
     return {name: value.clone() for name, value in module.network.state_dict().items()}
 
 
-def rate_of(module: Fit) -> float:
-    """The learning rate at this moment."""
+def rate_of(module: TrainingModule) -> float:
+    """The current learning rate."""
     optimizer = module.optimizers()
     assert isinstance(optimizer, LightningOptimizer)
     return float(optimizer.param_groups[0]["lr"])
 
 
-def test_6_s_go_on_from_3_s(data: str, tmp_path: Path) -> None:
-    """A run for 6 s trains one for 3 s in its folder first, and starts from all of it."""
+def test_run_for_6_s_starts_from_3_s(data: str, tmp_path: Path) -> None:
+    """A run for 6 s first trains a run for 3 s in its folder, and loads all its weights."""
 
     def config_for(horizon_s: float) -> TrainingConfig:
         config = tiny_config("ssp-asp", "vectors", epochs=1, pretraining_epochs=0)
@@ -133,8 +136,8 @@ def test_6_s_go_on_from_3_s(data: str, tmp_path: Path) -> None:
     assert first["provenance"]["trained_on"] == second["provenance"]["trained_on"]
 
 
-def test_3_s_of_another_run_are_refused(data: str, tmp_path: Path) -> None:
-    """A run for 3 s that is there already must be of the same recipe and data."""
+def test_first_stage_of_another_run_is_refused(data: str, tmp_path: Path) -> None:
+    """An existing run for 3 s must have the same configuration and data."""
 
     def config_for(horizon_s: float, **changes: Any) -> TrainingConfig:
         config = tiny_config("dkm", "vectors", epochs=1)
@@ -145,18 +148,18 @@ def test_3_s_of_another_run_are_refused(data: str, tmp_path: Path) -> None:
     with pytest.raises(AspEnvError, match="3s holds a finished run of another config: delete it"):
         train_stages(lambda horizon_s: config_for(horizon_s, seed=1), 6.0, data, out)
     path = out / "3s" / "config.json"
-    kept = path.read_text()
-    changed = json.loads(kept)
+    original = path.read_text()
+    changed = json.loads(original)
     changed["provenance"]["data_hash"] = "another"
     path.write_text(json.dumps(changed))
     with pytest.raises(AspEnvError, match="3s holds a finished run of another data_hash"):
         train_stages(config_for, 6.0, data, out)
-    path.write_text(kept)
+    path.write_text(original)
     assert train_stages(config_for, 6.0, data, out) == out
 
 
-def test_what_the_start_learned_from_is_remembered(data: str, tmp_path: Path) -> None:
-    """A run that goes on from one that saw a recording more has seen that too."""
+def test_training_data_of_the_start_are_included(data: str, tmp_path: Path) -> None:
+    """A run that starts from a run on one more recording names that recording, too."""
     config = tiny_config("dkm", "vectors", epochs=1, snippets_per_epoch=8)
     start = train(config, data, tmp_path / "start")
     path = start / "config.json"

@@ -16,11 +16,11 @@ NAMES = ("DISTANCE_WANTED", "COMFORT_ACC_MAX", "COMFORT_ACC_MIN")
 
 
 def parameters() -> list[float]:
-    """Those of the class of all vehicles that drive themselves."""
+    """Parameters of the class of all uncontrolled vehicles."""
     return [float(getattr(IDMVehicle, name)) for name in NAMES]
 
 
-def theirs() -> str:
+def reference() -> str:
     """A hash of where vehicles are in an episode of highway-env's roundabout."""
     env = RoundaboutEnv()
     env.reset(seed=8)
@@ -31,7 +31,7 @@ def theirs() -> str:
     return hashlib.sha256(np.array(seen).tobytes()).hexdigest()
 
 
-def ours() -> str:
+def own() -> str:
     """The same of our roundabout."""
     road = populated_road(SITES["roundabout"], np.random.default_rng(8))
     for _ in range(75):
@@ -39,22 +39,22 @@ def ours() -> str:
     return hashlib.sha256(np.array([each.position for each in road.vehicles]).tobytes()).hexdigest()
 
 
-def told() -> list:
+def observed() -> list:
     """What may not change."""
-    return [parameters(), theirs(), ours()]
+    return [parameters(), reference(), own()]
 
 
 def main() -> None:
     """Before anything, after our intersection, after highway-env's."""
-    out = [told()]
+    out = [observed()]
     simulate_round(SITES["intersection"], np.random.default_rng(0), frames=60)
     env = make(sys.argv[1])
     env.reset(seed=0)
     for _ in range(5):
         env.step(np.zeros(2))
-    out.append(told())
+    out.append(observed())
     IntersectionEnv()
-    out.append(told())
+    out.append(observed())
     sys.stdout.write(json.dumps(out))
 
 

@@ -1,4 +1,4 @@
-"""What another process is asked to do: go on from a snapshot."""
+"""Continues from a snapshot in another process."""
 
 import hashlib
 import pickle
@@ -11,24 +11,24 @@ import numpy as np
 from asp_env.data.source import Recordings, open_data
 from asp_env.sim.simulation import Simulation
 from asp_env.sim.traffic.assignment import make_traffic
-from asp_env.sim.world import world_of
+from asp_env.sim.world import world_class
 from tests.sim.worlds import DT_S, HISTORY
 
 
 def open_world(recordings: Recordings, episodes: int) -> Simulation:
-    """Room for episodes of highway-env's traffic that have not begun."""
+    """A world of highway-env's traffic before its first reset."""
     return Simulation(
         recordings,
         make_traffic("own"),
         num_episodes=episodes,
         dt_s=DT_S,
         history=HISTORY,
-        kind=world_of("highway:"),
+        world_class=world_class("highway:"),
     )
 
 
 def drive(simulation: Simulation, tick: int) -> None:
-    """One tick in which egos drive, and leave themselves to the world in every third."""
+    """One tick; the egos are controlled in two ticks of three."""
     count = len(simulation.world)
     actions = np.random.default_rng(tick).uniform((-2.0, -0.1), (2.0, 0.1), (count, 2))
     simulation.step(actions.astype(np.float32), np.full(count, tick % 3 > 0))
@@ -44,7 +44,7 @@ def go_on(simulation: Simulation, snapshot: Any, first: int, last: int) -> str:
 
 
 def main(path: Path) -> None:
-    """Prints what becomes of the snapshots in a file."""
+    """Prints the hashes of episodes that continue from the snapshots of a file."""
     for data, snapshots, last in pickle.loads(path.read_bytes()):
         simulation = open_world(open_data(data), len(snapshots[0][1][1]))
         for tick, snapshot in snapshots:

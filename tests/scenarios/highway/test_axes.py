@@ -26,7 +26,7 @@ def test_headings_are_wrapped() -> None:
     assert mirror_states(np.array([0.0, 0.0, -np.pi, 1.0]))[2] == -np.pi
 
 
-def test_the_kind_of_numbers_stays() -> None:
+def test_the_dtype_is_kept() -> None:
     """Of float32 float32 is made, and what is given stays as it is."""
     states = np.ones((2, 3, 4), dtype=np.float32)
     assert mirror_states(states).dtype == np.float32
@@ -36,7 +36,7 @@ def test_the_kind_of_numbers_stays() -> None:
 
 
 @given(motions())
-def test_twice_is_not_at_all(motion: Motion) -> None:
+def test_mirroring_is_its_own_inverse(motion: Motion) -> None:
     """Each is its own inverse."""
     again = mirror_states(mirror_states(motion.states))
     np.testing.assert_array_equal(again[:, [0, 1, 3]], motion.states[:, [0, 1, 3]])
@@ -49,7 +49,7 @@ def test_twice_is_not_at_all(motion: Motion) -> None:
 
 @pytest.mark.parametrize("integrator", ["heun", "euler"])
 @given(motions())
-def test_the_motion_model_does_not_mind(integrator: Integrator, motion: Motion) -> None:
+def test_the_motion_model_commutes_with_mirroring(integrator: Integrator, motion: Motion) -> None:
     """A step of the mirrored vehicle is the mirrored step."""
     states, actions, lengths = motion.states, motion.actions, motion.lengths_m
     stepped = forward(states, actions, lengths, motion.dt_s, integrator=integrator)

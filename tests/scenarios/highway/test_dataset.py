@@ -18,7 +18,7 @@ from asp_env.cli import main
 from asp_env.data.scenarios.scenario import find_scenarios
 from asp_env.data.source import open_data
 from asp_env.errors import AspEnvError, DataError
-from asp_env.sim.world import world_of
+from asp_env.sim.world import world_class
 from scenarios.highway import dataset
 from scenarios.highway.rounds import hidden_path, load_history
 from tests.highway_folders import SITE_NAMES, highway_data, highway_folder, highway_recordings
@@ -30,7 +30,7 @@ every_site = pytest.mark.parametrize("site", SITE_NAMES)
 
 
 def command(out: Path, **options: Any) -> list[str]:
-    """What makes 20 s of the roundabout with seed 7, unless the options say otherwise."""
+    """Generates 20 s of the roundabout with seed 7, with changes by options."""
     chosen = {"site": "highway:roundabout", "recordings": 1, "minutes": 0.3, "seed": 7, **options}
     return ["synthesize", str(out), *(str(x) for k, v in chosen.items() for x in (f"--{k}", v))]
 
@@ -45,11 +45,11 @@ def short(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @every_site
 def test_it_reads_back_without_a_fault(site, capsys):
-    """Four rounds: what `inspect` counts is there, everybody on the road, nothing repaired."""
+    """Four rounds: `inspect` counts them, all agents are on the road, nothing is repaired."""
     assert main(["inspect", str(highway_folder(site))]) == 0
-    told = capsys.readouterr().out
-    assert "Repairs: none" in told
-    assert "Faults: none" in told
+    observed = capsys.readouterr().out
+    assert "Repairs: none" in observed
+    assert "Faults: none" in observed
     for recording in highway_recordings(site):
         assert recording.num_frames == 600
         assert recording.frame_rate_hz == 15.0
@@ -61,7 +61,7 @@ def test_it_reads_back_without_a_fault(site, capsys):
 def test_the_written_velocity_leads_to_the_next_position(site):
     """In each of highway-env's steps, since it points where a vehicle goes, not where it faces.
 
-    Those who are pushed are moved by more than it, which happens in less than one step of twenty.
+    Vehicles that are pushed move further, in less than one step of twenty.
     """
     tracks = pd.read_csv(highway_folder(site) / "data" / "00_tracks.csv")
     following = tracks.trackId.diff().shift(-1) == 0
@@ -93,9 +93,9 @@ def test_same_seed_same_bytes_in_another_process(short, tmp_path):
     subprocess.run([sys.executable, "-c", script, *command(again)], check=True, capture_output=True)
     assert contents(again) == contents(short)
     assert main(command(other, seed=8)) == 0
-    theirs = contents(short)
-    assert contents(other).keys() == theirs.keys()
-    same = {name for name, value in contents(other).items() if value == theirs[name]}
+    reference = contents(short)
+    assert contents(other).keys() == reference.keys()
+    same = {name for name, value in contents(other).items() if value == reference[name]}
     assert same == {"maps/lanelets/00_roundabout/location0.osm", "data/00_recordingMeta.csv"}
 
 
@@ -103,24 +103,24 @@ def test_same_seed_same_bytes_in_another_process(short, tmp_path):
     ("options", "what"),
     [
         ({"site": "highway:motorway"}, "known are highway:intersection, highway:roundabout"),
-        ({"locations": 3}, "is a single place"),
+        ({"locations": 3}, "has a single location"),
         ({"recordings": 0}, "cannot be made"),
         ({"seed": -1}, "cannot be made"),
         ({"minutes": "nan"}, "cannot be made"),
         ({"minutes": 61}, "cannot be made"),
     ],
 )
-def test_what_makes_no_sense_is_refused(tmp_path, options, what, capsys):
+def test_invalid_options_are_refused(tmp_path, options, what, capsys):
     """One line, status 2, and nothing is written."""
     assert main(command(tmp_path / "out", **options)) == 2
-    told = capsys.readouterr()
-    assert what in told.err
-    assert told.err.count("\n") == 1
+    observed = capsys.readouterr()
+    assert what in observed.err
+    assert observed.err.count("\n") == 1
     assert not list(tmp_path.iterdir())
 
 
 def test_a_folder_with_something_in_it_is_refused(short, capsys):
-    """What is there stays as it is."""
+    """The existing content is unchanged."""
     before = contents(short)
     assert main(command(short)) == 2
     assert "is not an empty folder" in capsys.readouterr().err
@@ -169,19 +169,19 @@ DAMAGE: dict[str, tuple[Callable[[Path], object], str]] = {
 
 
 @pytest.mark.parametrize("kind", DAMAGE)
-def test_damage_is_told_in_one_line(short, tmp_path, kind):
+def test_damage_is_reported_in_one_line(short, tmp_path, kind):
     """Which file, what is wrong, what was expected."""
     path = tmp_path / "00_hidden.npz"
     shutil.copy(short / "hidden" / path.name, path)
     harm, what = DAMAGE[kind]
     harm(path)
-    with pytest.raises(DataError, match=rf"00_hidden\.npz.*{what}.*asp-env synthesize") as told:
+    with pytest.raises(DataError, match=rf"00_hidden\.npz.*{what}.*asp-env synthesize") as observed:
         load_history(path)
-    assert "\n" not in str(told.value)
+    assert "\n" not in str(observed.value)
 
 
 @pytest.mark.parametrize("harm", [_truncate, lambda path: _npz(path, rows=_rows(path)[::-1])])
-def test_an_environment_tells_of_damage(short, tmp_path, harm):
+def test_an_environment_reports_damage(short, tmp_path, harm):
     """When an episode begins: a file that cannot be read, and one with the vehicles mixed up."""
     shutil.copytree(short, tmp_path / "copy")
     harm(tmp_path / "copy" / "hidden" / "00_hidden.npz")
@@ -204,7 +204,7 @@ def test_the_history_of_another_recording_is_refused(tmp_path):
         env.reset(options={"scenario": 0})
 
 
-def test_what_was_never_made_here_is_refused(short, tmp_path):
+def test_foreign_data_are_refused(short, tmp_path):
     """Unknown names, folders without `hidden`, recordings in memory: one line each."""
     for name in ("nowhere", "", str(tmp_path / "nothing"), str(short / "data" / "00_tracks.csv")):
         with pytest.raises(AspEnvError, match=r"^unknown highway site or folder [^\n]*roundabout$"):
@@ -214,7 +214,7 @@ def test_what_was_never_made_here_is_refused(short, tmp_path):
     with pytest.raises(AspEnvError, match=r"^highway:[^\n]*hidden is missing[^\n]*replayed[^\n]*$"):
         open_data(f"highway:{tmp_path / 'copy'}")
     with pytest.raises(AspEnvError, match=r"^recordings in memory: expected those of `highway:…`$"):
-        world_of("highway:")(list(open_data(short)), num_episodes=1, dt_s=DT_S, history=HISTORY)
+        world_class("highway:")(list(open_data(short)), num_episodes=1, dt_s=DT_S, history=HISTORY)
 
 
 def test_the_source_is_made_once(tmp_path, monkeypatch):
@@ -229,7 +229,7 @@ def test_the_source_is_made_once(tmp_path, monkeypatch):
     assert folder == tmp_path / "highway" / f"roundabout-{dataset.SOURCE_VERSION}"
 
 
-def test_with_noise_the_truth_is_driven(short, tmp_path):
+def test_with_noise_episodes_hold_the_true_states(short, tmp_path):
     """Measured tracks are centimetres off; episodes hold the truth, before their start and after.
 
     Left to themselves they go on as they truly did, and progress is measured on the noisy log.
@@ -247,7 +247,7 @@ def test_with_noise_the_truth_is_driven(short, tmp_path):
     for folder in (short, out):
         recordings = open_data(f"highway:{folder}")
         found = list(find_scenarios(recordings, source="", dt_s=DT_S, history=HISTORY))
-        simulation = simulate(recordings, found, "own", world_of("highway:"))
+        simulation = simulate(recordings, found, "own", world_class("highway:"))
         replay(simulation, max(each.length for each in found))
         runs.append(simulation.world)
     one, other = runs[0].episodes, runs[1].episodes
@@ -259,9 +259,9 @@ def test_with_noise_the_truth_is_driven(short, tmp_path):
 
 
 def test_a_recording_can_be_replayed_as_any_other():
-    """The folder itself, without the scheme, is a recording in which nobody reacts."""
+    """The folder without the scheme is a recording in which no agent reacts."""
     folder = str(highway_folder("intersection"))
-    assert world_of(folder).traffic == "log"
+    assert world_class(folder).traffic == "log"
     simulation = simulate(open_data(folder), scenario(18, start=150, length=10))
     replay(simulation, 10)
     episodes = simulation.world.episodes

@@ -1,4 +1,4 @@
-"""Who is driven, who reacts, who comes and who leaves."""
+"""Controlled and uncontrolled agents, arrivals and departures."""
 
 import numpy as np
 import pytest
@@ -9,7 +9,7 @@ from asp_env.dynamics.bicycle import AXLE_SHARE_OF_LENGTH
 from asp_env.errors import AspEnvError
 from asp_env.geometry import wrap_angle
 from asp_env.sim.simulation import Simulation
-from asp_env.sim.world import ReplayWorld, World, world_of
+from asp_env.sim.world import ReplayWorld, World, world_class
 from scenarios.highway.sites import SITES, empty_road, network
 from scenarios.highway.world import APART_M, HighwayWorld
 from tests.envs.same import same
@@ -31,7 +31,7 @@ FOLLOWED = scenario(11, start=55, length=40)
 
 def begin(site: str, scenarios: list[Scenario] | Scenario, traffic: str = "own") -> Simulation:
     """Episodes that have just begun."""
-    return simulate(highway_recordings(site), scenarios, traffic, world_of("highway:"))
+    return simulate(highway_recordings(site), scenarios, traffic, world_class("highway:"))
 
 
 def step(world: HighwayWorld | ReplayWorld, driven: np.ndarray, tick: int) -> None:
@@ -42,8 +42,8 @@ def step(world: HighwayWorld | ReplayWorld, driven: np.ndarray, tick: int) -> No
 
 
 @every_site
-def test_who_is_driven_moves_as_in_a_replay(site):
-    """Bit for bit from the same states, everybody at once, through crashes and off the road."""
+def test_controlled_agents_move_as_in_a_replay(site):
+    """Bit for bit from the same states, all agents at once, through collisions and off the road."""
     scenarios = list(highway_scenarios(site))[::16]
     count, recordings = len(scenarios), highway_recordings(site)
     worlds = [
@@ -60,17 +60,17 @@ def test_who_is_driven_moves_as_in_a_replay(site):
         step(replaying, driven, tick)
     states, valid = reacting.episodes.states, reacting.episodes.valid
     for b in range(count):
-        theirs = states[b, :, driven[b]], valid[b, :, driven[b]]
+        reference = states[b, :, driven[b]], valid[b, :, driven[b]]
         others = (
             replaying.episodes.states[b, :, driven[b]],
             replaying.episodes.valid[b, :, driven[b]],
         )
-        assert [each.tobytes() for each in theirs] == [each.tobytes() for each in others]
+        assert [each.tobytes() for each in reference] == [each.tobytes() for each in others]
     assert driven.sum() >= 10
 
 
 @every_site
-def test_who_is_released_goes_on_by_itself(site):
+def test_released_agents_continue_on_their_own(site):
     """Egos that drive in two ticks of three anywhere, then not any more: all stays finite."""
     scenarios = list(highway_scenarios(site))[2::12]
     simulation = begin(site, scenarios)
@@ -83,7 +83,7 @@ def test_who_is_released_goes_on_by_itself(site):
     assert there.all(), "egos stay"
 
 
-def test_who_is_released_finds_back_to_its_lane():
+def test_a_released_agent_returns_to_its_lane():
     """Driven to the left by 1.5 m on its arm, the ego is back within 0.2 m some 4 s later."""
     simulation = begin("intersection", FOLLOWED)
     lane = network("intersection").get_lane(("o1", "ir1", 0))
@@ -101,7 +101,7 @@ def _aside(simulation: Simulation, lane) -> float:
     return lane.local_coordinates(simulation.world.ego_states()[0, :2] * [1, -1])[1]
 
 
-def test_who_is_released_looks_for_a_way_from_where_it_is():
+def test_a_released_agent_plans_a_route_from_its_position():
     """Driven across the junction where it was to turn left, it stays on the eastern arm.
 
     So it does from a snapshot that was taken before it was released.
@@ -110,7 +110,7 @@ def test_who_is_released_looks_for_a_way_from_where_it_is():
     drive(simulation, [(1.0, 0.0)] * 35)
     world = simulation.world
     assert isinstance(world, HighwayWorld)
-    taken, told = world.snapshot(), []
+    taken, observed = world.snapshot(), []
     for _ in range(2):
         run = world._runs[0]
         assert run is not None
@@ -122,13 +122,13 @@ def test_who_is_released_looks_for_a_way_from_where_it_is():
         assert ego.route[0][:2] == ("il3", "o3")
         assert ego.target_lane_index == ("il3", "o3", 0)
         replay(simulation, 5)
-        told.append(world.episodes.states.tobytes())
+        observed.append(world.episodes.states.tobytes())
         assert world.ego_states()[0, 1] == pytest.approx(-2.0, abs=0.5)
         world.restore(taken)
-    assert told[0] == told[1]
+    assert observed[0] == observed[1]
 
 
-def test_others_react_to_an_ego_that_is_driven():
+def test_other_vehicles_react_to_a_controlled_ego():
     """It halts on its lane: its follower halts behind it. Left alone neither does."""
     alone, driven = (begin("intersection", FOLLOWED) for _ in range(2))
     replay(alone, 25)
@@ -144,7 +144,7 @@ def test_others_react_to_an_ego_that_is_driven():
     assert not driven.world.events().collision.any()
 
 
-def test_a_predictor_drives_whom_it_is_given():
+def test_a_predictor_controls_its_agents():
     """13 keeps its speed and heading whatever stands before it, until it stands in the ego."""
     simulation = begin("intersection", FOLLOWED, "default=own,13=predictor:constant-velocity")
     first = now(simulation, 13)
@@ -157,7 +157,7 @@ def test_a_predictor_drives_whom_it_is_given():
     assert simulation.world.events().collision.any()
 
 
-def test_nobody_comes_near_somebody_and_who_is_barred_never_comes():
+def test_vehicles_do_not_appear_near_others_and_blocked_ones_never_appear():
     """On the southern arm 20 comes at tick 120 and halts there: 23, 26 and 29 never come.
 
     Left alone they come behind it at ticks 140, 160 and 180.
@@ -182,7 +182,7 @@ def test_nobody_comes_near_somebody_and_who_is_barred_never_comes():
 
 
 def _nearest_comer(world: World) -> float:
-    """The least distance of somebody who has just come to anybody else, metres."""
+    """Least distance between an agent that has just appeared and any other agent, m."""
     valid, states, nearest = world.episodes.valid[0], world.episodes.states[0], np.inf
     for tick in range(HISTORY + 1, len(valid)):
         for slot in np.flatnonzero(valid[tick] & ~valid[tick - 1]).tolist():
@@ -190,14 +190,14 @@ def _nearest_comer(world: World) -> float:
             others[slot] = False
             away = states[tick, others, :2] - states[tick, slot, :2]
             nearest = min(nearest, float(np.hypot(*away.T).min()))
-    assert np.isfinite(nearest), "somebody comes"
+    assert np.isfinite(nearest), "an agent appears"
     return nearest
 
 
 @pytest.mark.parametrize(
     ("site", "traffic"), [("intersection", "idm"), ("roundabout", "own"), ("roundabout", "idm")]
 )
-def test_who_left_never_returns(site, traffic):
+def test_departed_agents_never_return(site, traffic):
     """Presence has one beginning and one end; the ego is there all the while."""
     scenarios = list(highway_scenarios(site))[2 :: 12 if site == "intersection" else 3]
     simulation = begin(site, scenarios, traffic)
@@ -209,17 +209,17 @@ def test_who_left_never_returns(site, traffic):
         assert there[:, 0].all()
 
 
-def test_who_is_told_to_leave_is_gone():
-    """One who is there vanishes from the road, one who is yet to come never does."""
+def test_leaving_agents_are_removed():
+    """A present agent is removed from the road, and one that has not appeared yet never does."""
     world = begin("intersection", scenario(13, start=115, length=30, recording=1)).world
     assert isinstance(world, HighwayWorld)
     ids = world.episodes.ids
-    nobody = np.zeros(ids.shape, dtype=bool)
+    uncontrolled = np.zeros(ids.shape, dtype=bool)
     nothing = np.zeros((*ids.shape, 2), dtype=np.float32)
     leaving = np.isin(ids, (14, 20))
-    world.step(nothing, nobody, leaving)
+    world.step(nothing, uncontrolled, leaving)
     for _ in range(20):
-        world.step(nothing, nobody)
+        world.step(nothing, uncontrolled)
     there = world.episodes.valid[0]
     slots = [int(np.flatnonzero(ids[0] == number)[0]) for number in (14, 20)]
     assert there[HISTORY, slots[0]]
@@ -230,30 +230,30 @@ def test_who_is_told_to_leave_is_gone():
 
 
 class Short(Vehicle):
-    """highway-env's plain vehicle with its axles where ours are."""
+    """highway-env's plain vehicle with the axles of the bicycle model of this package."""
 
     LENGTH = 2 * AXLE_SHARE_OF_LENGTH * Vehicle.LENGTH
 
 
 @pytest.mark.parametrize("steering_rad", [0.0, 0.2, -0.5])
-def test_the_rules_expect_who_is_driven_in_its_curve(steering_rad):
+def test_right_of_way_predicts_controlled_vehicles_along_their_curve(steering_rad):
     """At each quarter of a second, where highway-env expects its plain vehicle, without a copy."""
     site = SITES["intersection"]
     road, times = empty_road(site), np.arange(0.25, 3.0, 0.25)
     given = (road, [-50.0, 2.0], 0.1, 7.0)
-    theirs, ours = Short(*given), site.vehicle(*given)
-    theirs.act({"acceleration": 1.0, "steering": steering_rad})
-    ours.steer(1.0, steering_rad, [])
-    places, headings = theirs.predict_trajectory_constant_speed(times)
-    found, turned = ours.predict_trajectory_constant_speed(times)
+    reference, own = Short(*given), site.vehicle(*given)
+    reference.act({"acceleration": 1.0, "steering": steering_rad})
+    own.steer(1.0, steering_rad, [])
+    places, headings = reference.predict_trajectory_constant_speed(times)
+    found, turned = own.predict_trajectory_constant_speed(times)
     assert np.array(found) == pytest.approx(np.array(places), abs=1e-9)
     assert wrap_angle(np.array(turned) - headings) == pytest.approx(0.0, abs=1e-9)
-    assert ours.predict_trajectory_constant_speed(times)[0] is found
+    assert own.predict_trajectory_constant_speed(times)[0] is found
     road.steps += 1
-    assert ours.predict_trajectory_constant_speed(times)[0] is not found
+    assert own.predict_trajectory_constant_speed(times)[0] is not found
 
 
-def test_who_is_not_in_the_table_is_left_to_the_world():
+def test_agents_without_a_driver_are_left_to_the_world():
     """A table without a default refuses nothing here: it is `own`, not `log`."""
     env = make(highway_data("intersection"), traffic="13=policy")
     env.reset(options={"scenario": 11})
@@ -261,5 +261,5 @@ def test_who_is_not_in_the_table_is_left_to_the_world():
     twin.reset(options={"scenario": 11})
     for _ in range(5):
         same(env.step(np.zeros(2)), twin.step(np.zeros(2)))
-    with pytest.raises(AspEnvError, match="in this world nobody replays a log"):
+    with pytest.raises(AspEnvError, match="this world replays no tracks"):
         make(highway_data("intersection"), traffic="log").reset(seed=0)

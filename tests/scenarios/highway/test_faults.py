@@ -23,7 +23,7 @@ COAST = np.zeros(2, dtype=np.float32)
 every_site = pytest.mark.parametrize("site", SITE_NAMES)
 
 
-def test_an_intersection_changes_no_roundabout():
+def test_an_intersection_does_not_change_a_roundabout():
     """(a) highway-env's writes parameters into the class of all vehicles, ours into one of its own.
 
     5 m between bumpers at the roundabout become 2 m, and its episodes others: only highway-env's.
@@ -46,10 +46,10 @@ def test_an_intersection_changes_no_roundabout():
 
 
 @every_site
-def test_the_same_seed_tells_the_same(site):
+def test_the_same_seed_gives_the_same_info(site):
     """(b) In highway-env `info["action"]` at reset is drawn from a space without a seed."""
-    theirs = RoundaboutEnv()
-    assert len({theirs.reset(seed=1)[1]["action"] for _ in range(40)}) > 1
+    reference = RoundaboutEnv()
+    assert len({reference.reset(seed=1)[1]["action"] for _ in range(40)}) > 1
     env = make(highway_data(site))
     expected = env.reset(seed=1)
     for _ in range(3):
@@ -67,8 +67,8 @@ def test_spaces_stay_the_same_objects(site):
         assert (env.observation_space is observation_space) == stays
 
 
-def _theirs_alone(speed_mps: float, **config: Any) -> tuple[Any, Vehicle]:
-    """Nobody but one vehicle that goes straight on, on highway-env's empty roundabout."""
+def _reference_alone(speed_mps: float, **config: Any) -> tuple[Any, Vehicle]:
+    """A single vehicle that drives straight on, on highway-env's empty roundabout."""
     env = RoundaboutEnv(config=config)
     vehicle = Vehicle(env.road, [0.0, -200.0], heading=0.0, speed=speed_mps)
     env.road.vehicles = env.controlled_vehicles = [vehicle]
@@ -81,9 +81,9 @@ def test_time_and_motion_agree():
     Ours moves one of constant speed by 0.2 s times it in a step of 0.2 s, and by 0.6 s in one of
     0.6 s.
     """
-    theirs, vehicle = _theirs_alone(10.0, simulation_frequency=25, policy_frequency=10)
-    theirs.step(None)
-    assert theirs.time == pytest.approx(0.1)
+    reference, vehicle = _reference_alone(10.0, simulation_frequency=25, policy_frequency=10)
+    reference.step(None)
+    assert reference.time == pytest.approx(0.1)
     assert vehicle.position[0] == pytest.approx(0.8)
     for dt_s in (0.2, 0.6):
         env = make(highway_data("intersection"), dt_s=dt_s)
@@ -119,30 +119,30 @@ def _copies(monkeypatch: pytest.MonkeyPatch) -> list[str]:
 @every_site
 def test_nothing_is_copied_in_a_step(site, monkeypatch):
     """(e) highway-env copies the road with all vehicles to foresee where a steered one goes."""
-    theirs: Any = IntersectionEnv(config={"action": {"type": "ContinuousAction"}})
-    ours = make(highway_data(site))
-    ours.reset(seed=0)
+    reference: Any = IntersectionEnv(config={"action": {"type": "ContinuousAction"}})
+    own = make(highway_data(site))
+    own.reset(seed=0)
     copied = _copies(monkeypatch)
-    theirs.step(COAST)
+    reference.step(COAST)
     assert "Vehicle" in copied
     copied.clear()
     for _ in range(10):
-        ours.step(COAST)
+        own.step(COAST)
     assert copied == []
 
 
 def test_the_roundabout_takes_continuous_actions():
-    """(f) highway-env's reward asks whether an array is one of two numbers."""
+    """(f) highway-env's reward compares an array with two numbers."""
     with pytest.raises(ValueError, match="truth value of an array"):
         RoundaboutEnv(config={"action": {"type": "ContinuousAction"}})
-    ours = make(highway_data("roundabout"))
-    ours.reset(seed=0)
-    _, reward, *_ = ours.step(COAST)
+    own = make(highway_data("roundabout"))
+    own.reset(seed=0)
+    _, reward, *_ = own.step(COAST)
     assert np.isfinite(reward)
 
 
 @every_site
-def test_nobody_is_a_dynamical_bicycle(site):
+def test_no_vehicle_is_a_dynamical_bicycle(site):
     """(g) highway-env's newer intersection drives its ego by another model than all others."""
     assert isinstance(ContinuousIntersectionEnv().vehicle, BicycleVehicle)
     road = populated_road(SITES[site], np.random.default_rng(0))
@@ -153,12 +153,12 @@ def test_nobody_is_a_dynamical_bicycle(site):
 
 def test_vehicles_leave_the_roundabout():
     """(h) highway-env's drive on behind the end of the road, 170 m from the centre, for ever."""
-    theirs = RoundaboutEnv()
-    theirs.reset(seed=1)
+    reference = RoundaboutEnv()
+    reference.reset(seed=1)
     for _ in range(25):
-        theirs.step(1)
-    assert len(theirs.road.vehicles) == 5
-    assert max(np.abs(each.position).max() for each in theirs.road.vehicles) > 180.0
+        reference.step(1)
+    assert len(reference.road.vehicles) == 5
+    assert max(np.abs(each.position).max() for each in reference.road.vehicles) > 180.0
     for recording in highway_recordings("roundabout"):
         assert np.abs(recording.states[:, :2]).max() < 170.0
         assert (recording.last_frames < recording.num_frames - 1).any()
@@ -167,7 +167,7 @@ def test_vehicles_leave_the_roundabout():
 @every_site
 def test_braking_ends_at_standstill(site):
     """(h) highway-env's plain vehicle goes backwards after it, at 6 m/s after 2 s of -4 m/s²."""
-    _, vehicle = _theirs_alone(2.0)
+    _, vehicle = _reference_alone(2.0)
     vehicle.act({"acceleration": -4.0, "steering": 0.0})
     for _ in range(30):
         vehicle.step(1 / 15)

@@ -7,10 +7,10 @@ import pytest
 from highway_env.vehicle.kinematics import Vehicle
 
 from asp_env.data.scenarios.scenario import Scenario
-from asp_env.dynamics import MAX_ACCELERATION_MPS2, MAX_STEERING_RAD, forward, inverse
+from asp_env.dynamics import forward, inverse, normalize_actions
 from asp_env.dynamics.bicycle import AXLE_SHARE_OF_LENGTH
 from asp_env.geometry import to_frame, wrap_angle
-from asp_env.sim.world import world_of
+from asp_env.sim.world import world_class
 from asp_env.views import make_picture_view
 from scenarios.highway.road_map import mirror_actions, mirror_states
 from scenarios.highway.rounds import hidden_path, load_history
@@ -21,7 +21,6 @@ from tests.scenarios.highway.environments import ego, make
 from tests.sim.worlds import drive, replay, simulate
 
 STEP_S, FRAMES = 1 / 15, 3
-LIMITS = np.array([MAX_ACCELERATION_MPS2, MAX_STEERING_RAD])
 TRAIL = 2
 """Channel of the picture."""
 
@@ -31,21 +30,23 @@ def test_our_bicycle_with_axles_at_the_bumpers_is_highway_envs(seed):
     """200 steps of Euler's method under random actions agree within a micrometre."""
     rng = np.random.default_rng(seed)
     nowhere: Any = None
-    theirs = Vehicle(nowhere, rng.uniform(-50, 50, 2), rng.uniform(-3, 3), rng.uniform(-10, 20))
-    state = mirror_states(np.array([*theirs.position, theirs.heading, theirs.speed]))
+    reference = Vehicle(nowhere, rng.uniform(-50, 50, 2), rng.uniform(-3, 3), rng.uniform(-10, 20))
+    state = mirror_states(np.array([*reference.position, reference.heading, reference.speed]))
     length = np.array(Vehicle.LENGTH * 0.5 / AXLE_SHARE_OF_LENGTH)
     furthest = 0.0
     for action in rng.uniform((-5.0, -np.pi / 4), (5.0, np.pi / 4), (200, 2)):
-        theirs.act({"acceleration": action[0], "steering": action[1]})
-        theirs.step(STEP_S)
+        reference.act({"acceleration": action[0], "steering": action[1]})
+        reference.step(STEP_S)
         state = forward(
             state, mirror_actions(action), length, STEP_S, integrator="euler", reverse=True
         )
-        expected = mirror_states(np.array([*theirs.position, theirs.heading, theirs.speed]))
+        expected = mirror_states(
+            np.array([*reference.position, reference.heading, reference.speed])
+        )
         away = state - expected
         away[2] = wrap_angle(away[2])
         assert np.abs(away).max() < 1e-6
-        assert abs(theirs.speed) < Vehicle.MAX_SPEED
+        assert abs(reference.speed) < Vehicle.MAX_SPEED
         furthest = max(furthest, np.abs(action).max())
     assert furthest > 4.0
 
@@ -54,7 +55,7 @@ SIDES = pytest.mark.parametrize(("tag", "side"), [("left", 1), ("right", -1)])
 
 
 def _turning(tag: str) -> Scenario:
-    """Somebody who turns without a halt, from before the turn to after it."""
+    """A vehicle that turns without a stop, from before the turn to after it."""
     found = highway_scenarios("intersection").filtered(f"{tag},!stopping,!yielding")
     quarter = np.abs(np.abs(found.column("turn_deg")) - 90.0) < 3.0
     return next(iter(found.select(quarter).sorted_by("length_s", descending=True)))
@@ -80,13 +81,13 @@ def test_left_is_what_highway_env_calls_left(tag, side):
 def test_a_turn_is_seen_to_go_its_way(tag, side):
     """Under its logged actions the heading turns by a quarter, steering and way to its side.
 
-    Behind a left turn the way lies to the left of who has made it; ahead of it, too.
+    After a left turn the path lies to the left of the vehicle; before it, too.
     """
     scenario = _turning(tag)
     recording = highway_recordings("intersection")[scenario.recording]
     log = recording.track(scenario.ego_id)[::FRAMES].astype(np.float64)
     start = scenario.start_tick - recording.first_frames[scenario.ego_id] // FRAMES
-    acts = inverse(log[:-1], log[1:], np.array(Vehicle.LENGTH), 0.2) / LIMITS
+    acts = normalize_actions(inverse(log[:-1], log[1:], np.array(Vehicle.LENGTH), 0.2))
     env = make(
         highway_data("intersection"), observations=("raster", "actions", "route"), traffic="own"
     )
@@ -115,8 +116,8 @@ def _side(layer: np.ndarray) -> float:
 
 
 @SIDES
-def test_who_is_observed_turns_the_same_way(tag, side):
-    """As a target of somebody else: its inferred steering, its heading, and its own picture."""
+def test_an_observed_vehicle_turns_the_same_way(tag, side):
+    """As a target of another agent: its inferred steering, its heading, and its own raster."""
     turner = _turning(tag)
     scenario = next(
         each
@@ -126,7 +127,9 @@ def test_who_is_observed_turns_the_same_way(tag, side):
         and abs(each.start_tick - turner.start_tick) < 10
         and each.length > 50
     )
-    simulation = simulate(highway_recordings("intersection"), scenario, "own", world_of("highway:"))
+    simulation = simulate(
+        highway_recordings("intersection"), scenario, "own", world_class("highway:")
+    )
     view, steering, heading, trail = make_picture_view("chauffeurnet"), [], [], []
     for _ in range(scenario.length):
         scene = simulation.world.scene()
@@ -145,10 +148,12 @@ def test_who_is_observed_turns_the_same_way(tag, side):
 
 
 @pytest.mark.parametrize("side", [1, -1])
-def test_our_steering_turns_the_body_that_others_see(side):
+def test_steering_turns_the_body_that_other_vehicles_see(side):
     """Left is positive: the heading grows here, falls in highway-env, and the box turns left."""
     scenario = highway_scenarios("intersection")[4]
-    simulation = simulate(highway_recordings("intersection"), scenario, "own", world_of("highway:"))
+    simulation = simulate(
+        highway_recordings("intersection"), scenario, "own", world_class("highway:")
+    )
     first = simulation.world.ego_states()[0].copy()
     drive(simulation, [(0.0, side * 0.25)] * 4)
     scene = simulation.world.scene()
@@ -160,11 +165,11 @@ def test_our_steering_turns_the_body_that_others_see(side):
     assert isinstance(simulation.world, HighwayWorld)
     run = simulation.world._runs[0]
     assert run is not None
-    theirs = next(each for each in run.road.vehicles if each.track == scene.ids[0, 0])
-    assert theirs.heading == pytest.approx(-state[2], abs=1e-6)
-    assert theirs.position == pytest.approx(state[:2] * [1, -1], abs=1e-6)
-    assert theirs.action["steering"] == pytest.approx(-side * 0.25)
-    # seen by a target in whose picture the ego's nose is within reach
+    reference = next(each for each in run.road.vehicles if each.track == scene.ids[0, 0])
+    assert reference.heading == pytest.approx(-state[2], abs=1e-6)
+    assert reference.position == pytest.approx(state[:2] * [1, -1], abs=1e-6)
+    assert reference.action["steering"] == pytest.approx(-side * 0.25)
+    # seen by a target in whose raster the front of the ego is in range
     others = scene.targets[:, 1]
     nearest = others[np.argmin(np.hypot(*(scene.states[0, others, -1, :2] - state[:2]).T))]
     picture = make_picture_view("chauffeurnet", pixels=(720, 480)).draw(

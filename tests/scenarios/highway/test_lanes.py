@@ -9,9 +9,8 @@ from highway_env.road.lane import LineType, StraightLane
 from highway_env.road.road import RoadNetwork
 
 from asp_env.errors import AspEnvError
-from asp_env.geometry import wrap_angle
+from asp_env.geometry import arc_lengths, wrap_angle
 from scenarios.highway.road_map import Strip, all_lanes, links, mirror_points, mouths, strips
-from scenarios.polylines import arc_lengths
 from tests.scenarios.highway.maps import Place
 
 
@@ -135,7 +134,7 @@ def test_only_gaps_have_mouths(intersection: Place, roundabout: Place) -> None:
 
 
 def test_a_gap_between_forks_is_refused() -> None:
-    """Two ways lead to m and two away, 3 m further on: nobody says whose the gap is."""
+    """Two ways lead to m and two away, 3 m further on: the gap belongs to none of them."""
     network = straight(
         ("a", "m", [0.0, 0.0], [10.0, 0.0]),
         ("b", "m", [0.0, 5.0], [10.0, 0.0]),

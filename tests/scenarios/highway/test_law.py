@@ -1,4 +1,4 @@
-"""The law of the world: nothing changes because it is ours."""
+"""The law of the world: results equal those of highway-env."""
 
 import numpy as np
 import pytest
@@ -8,7 +8,7 @@ from highway_env.vehicle.behavior import IDMVehicle
 
 from asp_env.data.scenarios.scenario import Scenario, find_scenarios
 from asp_env.geometry import wrap_angle
-from asp_env.sim.world import world_of
+from asp_env.sim.world import world_class
 from scenarios.highway.rounds import step_road
 from scenarios.highway.sites import (
     SITES,
@@ -26,14 +26,14 @@ every_site = pytest.mark.parametrize("site", SITE_NAMES)
 
 def warm_starts_from_3s(site: str, scenarios: list[Scenario], dt_s: float, history: int) -> int:
     """Leaves episodes to themselves and compares them with the log; how many states of it."""
-    recordings, kind = highway_recordings(site), world_of("highway:")
+    recordings, kind = highway_recordings(site), world_class("highway:")
     count = len(scenarios)
     world = kind(recordings, num_episodes=count, dt_s=dt_s, history=history)
     world.reset(scenarios, [np.random.default_rng(0)] * count)
     actions = np.zeros((*world.episodes.ids.shape, 2), dtype=np.float32)
-    nobody = np.zeros(world.episodes.ids.shape, dtype=bool)
+    uncontrolled = np.zeros(world.episodes.ids.shape, dtype=bool)
     for _ in range(max(each.length for each in scenarios)):
-        world.step(actions, nobody)
+        world.step(actions, uncontrolled)
     data, compared = world.episodes, 0
     for b, scenario in enumerate(scenarios):
         ticks = history + 1 + scenario.length
@@ -48,7 +48,7 @@ def warm_starts_from_3s(site: str, scenarios: list[Scenario], dt_s: float, histo
 
 @every_site
 def test_left_to_itself_everything_goes_on_as_recorded(site):
-    """Nobody is driven, the egos neither: presence is the log's, states are within its rounding."""
+    """Without control, presence equals the log's, and states agree within its rounding."""
     scenarios = list(highway_scenarios(site))[1 :: 8 if site == "intersection" else 2]
     assert warm_starts_from_3s(site, scenarios, DT_S, HISTORY) > 2000
 
@@ -66,25 +66,25 @@ class _AsTraffic:
     vehicle_class = IDMVehicle
 
 
-def _theirs(site: str, seed: int, seconds: int) -> list[list[tuple]]:
-    """Every step of an episode of highway-env's own environment, whose ego drives itself."""
+def _reference(site: str, seed: int, seconds: int) -> list[list[tuple]]:
+    """Each step of an episode of highway-env's own environment without control."""
     kinds = {"intersection": IntersectionEnv, "roundabout": RoundaboutEnv}
     env = kinds[site](config={"destination": None} if site == "intersection" else {})
     env.np_random, env.action_type = np.random.default_rng(seed), _AsTraffic()
     env._reset()
-    env.controlled_vehicles, told = [], []
+    env.controlled_vehicles, observed = [], []
     for _ in range(seconds):
         for _ in range(STEPS_PER_S):
             env.road.act()
             env.road.step(1 / STEPS_PER_S)
-            told.append(_told(env.road))
+            observed.append(_observed(env.road))
         if site == "intersection":
             env._clear_vehicles()
             env._spawn_vehicle(spawn_probability=env.config["spawn_probability"])
-        else:  # where it takes away nobody
+        else:  # where no vehicle is removed
             env.road.vehicles = [each for each in env.road.vehicles if not _at_the_end(each)]
-        told.append(_told(env.road))
-    return told
+        observed.append(_observed(env.road))
+    return observed
 
 
 def _at_the_end(vehicle: IDMVehicle) -> bool:
@@ -92,21 +92,21 @@ def _at_the_end(vehicle: IDMVehicle) -> bool:
     return vehicle.lane_index[1].endswith("xr") and along >= vehicle.lane.length - 20.0
 
 
-def _ours(site: str, seed: int, seconds: int) -> list[list[tuple]]:
-    rng, told = np.random.default_rng(seed), []
+def _own(site: str, seed: int, seconds: int) -> list[list[tuple]]:
+    rng, observed = np.random.default_rng(seed), []
     road = populated_road(SITES[site], rng)
     for _ in range(seconds):
         for _ in range(STEPS_PER_S):
             step_road(road)
-            told.append(_told(road))
+            observed.append(_observed(road))
         remove_exited(SITES[site], road)
         spawn_vehicle(SITES[site], road, rng)
-        told.append(_told(road))
-    return told
+        observed.append(_observed(road))
+    return observed
 
 
-def _told(road) -> list[tuple]:
-    """All that vehicles are and want, exactly."""
+def _observed(road) -> list[tuple]:
+    """The states and intentions of all vehicles, exactly."""
     return [
         (
             *each.position.tolist(), float(each.heading), float(each.speed),
@@ -125,14 +125,14 @@ def test_a_round_is_what_highway_env_makes_of_the_same_generator(site, seed):
 
     Amid it vehicles give way at the intersection, and crash at the roundabout.
     """
-    theirs, ours = _theirs(site, seed, seconds=12), _ours(site, seed, seconds=12)
-    assert theirs == ours
-    assert any(vehicle[-1 if site == "intersection" else -2] for step in ours for vehicle in step)
+    reference, own = _reference(site, seed, seconds=12), _own(site, seed, seconds=12)
+    assert reference == own
+    assert any(vehicle[-1 if site == "intersection" else -2] for step in own for vehicle in step)
 
 
 @every_site
 def test_the_nearest_lane_is_the_one_that_all_lanes_are_asked_for(site):
-    """At 2000 poses all over the place and along the lanes, on, beside, before and behind them."""
+    """At 2000 poses anywhere and along the lanes: on, beside, before and behind them."""
     fast, slow, rng = network(site), RoadNetwork(), np.random.default_rng(0)
     slow.graph, lanes = fast.graph, fast.lanes_list()
     for number in range(2000):

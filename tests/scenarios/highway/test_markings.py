@@ -56,7 +56,7 @@ def test_no_lane_leads_over_a_boundary(place: Place) -> None:
     ways = segments([road_map.lanes[i] for i in range(len(road_map.lanes))])
     assert len(boundaries) > 10
     assert not crossings(ways, boundaries).any()
-    # The dashed middle is crossed, by the turns or by who changes lanes; that the test can see it:
+    # The dashed middle is crossed, by turns or by lane changes; the test can detect it:
     dashed = np.flatnonzero(road_map.line_types == Kind.DASHED)
     middle = segments([road_map.lines[int(i)] for i in dashed])
     assert crossings(np.array([[[3.0, -60.0], [-3.0, -60.5]]]), middle).any()

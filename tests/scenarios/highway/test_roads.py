@@ -7,7 +7,7 @@ import pytest
 from highway_env.vehicle.behavior import IDMVehicle
 
 from scenarios.highway.sites import SITES, STEP_S, Site, empty_road, network
-from scenarios.highway.vehicles import REMEMBERED, Network
+from scenarios.highway.vehicles import CACHED_POSITIONS, Network
 
 
 class IntersectionCar(IDMVehicle):
@@ -42,7 +42,7 @@ def fill(site: Site, road: Any, kind: type[IDMVehicle], seed: int) -> None:
         road.vehicles.append(vehicle)
 
 
-def told(road: Any) -> list[tuple[Any, ...]]:
+def observed(road: Any) -> list[tuple[Any, ...]]:
     """All that the vehicles of a road differ in."""
     return [
         (*v.position.tolist(), v.heading, v.speed, v.crashed, v.target_lane_index, v.target_speed)
@@ -55,22 +55,22 @@ def told(road: Any) -> list[tuple[Any, ...]]:
 def test_a_crowd_goes_on_as_on_highway_envs_own_road(name: str, seed: int) -> None:
     """Through 3 s of giving way, changing lanes and hitting each other, bit for bit."""
     site = SITES[name]
-    ours, theirs = empty_road(site), their_road(site)
-    fill(site, ours, site.vehicle, seed)
-    fill(site, theirs, IntersectionCar if name == "intersection" else IDMVehicle, seed)
-    assert told(ours) == told(theirs)
-    before = told(ours)
+    own, reference = empty_road(site), their_road(site)
+    fill(site, own, site.vehicle, seed)
+    fill(site, reference, IntersectionCar if name == "intersection" else IDMVehicle, seed)
+    assert observed(own) == observed(reference)
+    before = observed(own)
     yielded = False
     for _ in range(45):
-        for road in (ours, theirs):
+        for road in (own, reference):
             road.act()
             road.step(STEP_S)
-        assert told(ours) == told(theirs)
-        yielded |= any(vehicle.target_speed == 0 for vehicle in ours.vehicles)
-    changed = [a[5] != b[5] for a, b in zip(before, told(ours), strict=True)]
-    assert any(changed), "somebody makes for another lane"
-    assert any(vehicle.crashed for vehicle in ours.vehicles), "somebody hits somebody"
-    assert yielded == (name == "intersection"), "somebody gives way where there are rules"
+        assert observed(own) == observed(reference)
+        yielded |= any(vehicle.target_speed == 0 for vehicle in own.vehicles)
+    changed = [a[5] != b[5] for a, b in zip(before, observed(own), strict=True)]
+    assert any(changed), "a vehicle changes its target lane"
+    assert any(vehicle.crashed for vehicle in own.vehicles), "two vehicles collide"
+    assert yielded == (name == "intersection"), "a vehicle yields where there is right of way"
 
 
 @pytest.mark.parametrize("name", SITES)
@@ -97,6 +97,6 @@ def test_what_a_lane_remembers_is_of_the_place_and_not_of_the_array() -> None:
     lane: Any = known.get_lane(known.indices[0])
     fresh: Any = their_road(SITES["roundabout"]).network.get_lane(known.indices[0])
     place = np.array([10.0, 20.0])
-    for _ in range(REMEMBERED + 2):
+    for _ in range(CACHED_POSITIONS + 2):
         assert lane.local_coordinates(place) == fresh.local_coordinates(place)
         place += 0.1

@@ -1,4 +1,4 @@
-"""Nothing that vehicles have in mind is lost, on disk or in a snapshot."""
+"""The internal state of vehicles survives on disk and in a snapshot."""
 
 import pickle
 import subprocess
@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from scenarios.highway.rounds import (
-    KEPT_EVERY,
+    HIDDEN_EVERY_FRAMES,
     HiddenHistory,
     hidden_path,
     load_history,
@@ -17,7 +17,7 @@ from scenarios.highway.rounds import (
     restore,
 )
 from scenarios.highway.sites import empty_road, network
-from tests.conformance.places import PLACES
+from tests.conformance.world_cases import WORLD_CASES
 from tests.highway_folders import SITE_NAMES, highway_data, highway_recordings
 from tests.scenarios.highway.elsewhere import drive, go_on, open_world
 
@@ -36,7 +36,7 @@ def test_vehicles_that_are_brought_back_are_the_same(site):
     for history in histories(site):
         assert len(history.steps) == 200
         for time in range(len(history.steps)):
-            rows, steps = history.at(time * KEPT_EVERY)
+            rows, steps = history.at(time * HIDDEN_EVERY_FRAMES)
             road = empty_road(history.site, steps=steps)
             road.vehicles = restore(rows, road, history.site.vehicle)
             assert read_vehicles(road).tobytes() == rows.tobytes()
@@ -44,7 +44,7 @@ def test_vehicles_that_are_brought_back_are_the_same(site):
 
 
 def changing_lanes(site: str, rows: np.ndarray) -> int:
-    """How many vehicles are on one lane of a road and make for another one of it."""
+    """Number of vehicles whose target lane is another lane of their road."""
     found, lanes = 0, network(site).indices
     for row in rows:
         place = np.array([row["x"], row["y"]])
@@ -67,17 +67,17 @@ def test_every_field_was_put_to_the_test():
     assert (every["impact"][every["pushed"]] != 0).any(axis=0).all()
     assert {0, 1, 2, 3} <= set(every["route_length"].tolist())
     assert every["route_length"].max() == 11
-    assert (every["delta"] == 4.0).any(), "one that was the ego once"
+    assert (every["delta"] == 4.0).any(), "a vehicle that was the ego"
     assert len(np.unique(every["delta"])) > 50
     assert len(np.unique(every["timer"])) > 50
-    assert not every["steered"].any(), "nobody else drives in recordings"
+    assert not every["steered"].any(), "no vehicle is controlled in recordings"
 
 
 def test_the_future_comes_back_bit_for_bit_in_another_process(tmp_path: Path):
     """From pickled snapshots of both sites, amid lane changes, yielding, crashes and drives."""
-    asked, expected, kept = [], [], {}
+    requests, expected, kept = [], [], {}
     for site in SITE_NAMES:
-        scenarios = PLACES[f"highway {site}"].scenarios()
+        scenarios = WORLD_CASES[f"highway {site}"].scenarios()
         simulation = open_world(highway_recordings(site), len(scenarios))
         simulation.reset(scenarios, [np.random.default_rng(0) for _ in scenarios])
         snapshots = []
@@ -86,7 +86,7 @@ def test_the_future_comes_back_bit_for_bit_in_another_process(tmp_path: Path):
                 snapshots.append((tick, simulation.world.snapshot()))
             drive(simulation, tick)
         untouched = simulation.world.episodes.states.tobytes()
-        asked.append((highway_data(site), snapshots, LAST))
+        requests.append((highway_data(site), snapshots, LAST))
         hashes = {go_on(simulation, snapshot, tick, LAST) for tick, snapshot in snapshots}
         assert simulation.world.episodes.states.tobytes() == untouched
         assert len(hashes) == 1
@@ -97,7 +97,7 @@ def test_the_future_comes_back_bit_for_bit_in_another_process(tmp_path: Path):
     for rows in kept.values():
         assert rows["crashed"].any()
         assert rows["steered"].any()
-    (tmp_path / "asked").write_bytes(pickle.dumps(asked))
+    (tmp_path / "asked").write_bytes(pickle.dumps(requests))
     done = subprocess.run(
         [sys.executable, "-m", "tests.scenarios.highway.elsewhere", str(tmp_path / "asked")],
         capture_output=True,

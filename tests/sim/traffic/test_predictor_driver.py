@@ -1,4 +1,4 @@
-"""Agents that follow forecasts."""
+"""The driver `predictor`."""
 
 from types import MappingProxyType
 
@@ -15,10 +15,10 @@ from tests.sim.worlds import DT_S, car, now, on_road, replay, scenario, simulate
 STEPS = 10
 
 
-class Oracles:
-    """Speaks of two modes: accelerate by 1 m/s² with probability 1/4, brake by 2 with 3/4."""
+class TwoModes:
+    """Forecasts two modes: accelerating by 1 m/s² with probability 1/4, braking by 2 with 3/4."""
 
-    name = "two-minds"
+    name = "two-modes"
     privileged = False
     dt_s = DT_S
     history = 15
@@ -27,24 +27,23 @@ class Oracles:
     metadata = MappingProxyType[str, str]({})
 
     def __init__(self, *, actions: bool = True, first_mps2: float = 1.0) -> None:
-        """Forecasts actions, or states alone."""
         self.actions, self.first_mps2 = actions, first_mps2
-        self.asked: list[list[tuple[int, int]]] = []
+        self.calls: list[list[tuple[int, int]]] = []
 
     def predict(self, scene, future=None):
-        """Remembers of whom it was asked."""
+        """Stores the targets."""
         assert future is None
-        self.asked.append([tuple(each) for each in scene.targets.tolist()])
+        self.calls.append([tuple(each) for each in scene.targets.tolist()])
         now, count = scene.target_states, len(scene.targets)
-        wanted = np.array([self.first_mps2, -2.0], dtype=np.float32)
+        accelerations = np.array([self.first_mps2, -2.0], dtype=np.float32)
         actions = np.zeros((count, 2, STEPS, 2), dtype=np.float32)
-        actions[..., 0] = wanted[:, None]
+        actions[..., 0] = accelerations[:, None]
         t = DT_S * np.arange(1, STEPS + 1, dtype=np.float32)
-        speed = now[:, None, None, 3] + wanted[:, None] * t
-        way = now[:, None, None, 3] * t + 0.5 * wanted[:, None] * t**2
+        speed = now[:, None, None, 3] + accelerations[:, None] * t
+        distance = now[:, None, None, 3] * t + 0.5 * accelerations[:, None] * t**2
         heading = np.broadcast_to(now[:, None, None, 2], speed.shape)
-        x = now[:, None, None, 0] + way * np.cos(heading)
-        y = now[:, None, None, 1] + way * np.sin(heading)
+        x = now[:, None, None, 0] + distance * np.cos(heading)
+        y = now[:, None, None, 1] + distance * np.sin(heading)
         return make_forecast(
             scene,
             states=np.stack([x, y, heading, speed], axis=-1),
@@ -62,91 +61,90 @@ def _speed(simulation, track_id: int, episode: int = 0) -> float:
 
 @pytest.mark.parametrize("actions", [True, False])
 def test_the_most_probable_mode_is_followed(actions):
-    """8 m/s braked by 2 m/s² for a second are 6, whether actions are forecast or states alone."""
-    driver = PredictorDriver(Oracles(actions=actions))
+    """8 m/s and -2 m/s² for 1 s yield 6 m/s, with and without forecast actions."""
+    driver = PredictorDriver(TwoModes(actions=actions))
     simulation = simulate(on_road(car(-50, 8)), scenario(), driver)
     replay(simulation, 5)
     assert now(simulation, 2) == pytest.approx([-50 + 24 + 7, -1.75, 0, 6], abs=1e-3)
 
 
 def test_actions_stay_within_the_limits():
-    """A forecast of 60 m/s² is followed at 5."""
-    driver = PredictorDriver(_only_first(60.0))
+    """A forecast of 60 m/s² is followed at 5 m/s²."""
+    driver = PredictorDriver(_first_mode_probable(60.0))
     simulation = simulate(on_road(car(-50, 8)), scenario(), driver)
     replay(simulation, 5)
     assert _speed(simulation, 2) == pytest.approx(13.0, abs=1e-3)
 
 
-def _only_first(acceleration_mps2: float) -> Oracles:
-    class Sure(Oracles):
+def _first_mode_probable(acceleration_mps2: float) -> TwoModes:
+    class FirstMode(TwoModes):
         def predict(self, scene, future=None):
             forecast = super().predict(scene, future)
             forecast.log_probs[:] = np.log([0.9, 0.1])
             return forecast
 
-    return Sure(first_mps2=acceleration_mps2)
+    return FirstMode(first_mps2=acceleration_mps2)
 
 
-def test_one_call_speaks_of_all_agents_of_all_episodes_every_k_ticks():
-    """Every 4 ticks of its own episode, and only of the driver's agents."""
-    predictor = Oracles()
+def test_one_call_covers_all_due_agents_of_all_episodes():
+    """Agents of the driver are due every 4 ticks of their own episode."""
+    predictor = TwoModes()
     table = {"default": "log", "car": PredictorDriver(predictor, every=4)}
     recording = on_road(car(-50, 8), car(-80, 8), car(-20, 8, kind=AgentClass.TRUCK))
     simulation = simulate(recording, [scenario(), scenario(length=10)], table)
     cars = [(0, 1), (0, 2), (1, 1), (1, 2)]
     replay(simulation, 9)
-    assert predictor.asked == [cars, cars, cars]
-    predictor.asked.clear()
+    assert predictor.calls == [cars, cars, cars]
+    predictor.calls.clear()
     where = np.array([False, True])
     simulation.reset([scenario()] * 2, [np.random.default_rng(0)] * 2, where)
     replay(simulation, 4)
     # episode 1 is at its ticks 0 and then 4, episode 0 at 9 and then 12
-    assert predictor.asked == [[(1, 1), (1, 2)], [(0, 1), (0, 2)]]
+    assert predictor.calls == [[(1, 1), (1, 2)], [(0, 1), (0, 2)]]
     replay(simulation, 1)
-    assert predictor.asked[2:] == [[(1, 1), (1, 2)]]
+    assert predictor.calls[2:] == [[(1, 1), (1, 2)]]
 
 
-def test_episodes_that_are_over_are_not_asked_about():
-    """Of the two only the longer one goes on."""
-    predictor = Oracles()
+def test_episodes_that_are_over_are_not_forecast():
+    predictor = TwoModes()
     driver = PredictorDriver(predictor, every=1)
     simulation = simulate(on_road(car(-50, 8)), [scenario(length=3), scenario()], driver)
     replay(simulation, 5)
-    assert predictor.asked == [[(0, 1), (1, 1)]] * 3 + [[(1, 1)]] * 2
+    assert predictor.calls == [[(0, 1), (1, 1)]] * 3 + [[(1, 1)]] * 2
 
 
-def test_without_enough_history_an_agent_goes_straight_on():
-    """One that came a second ago is not forecast by a predictor that wants 3 s."""
+def test_an_agent_with_too_short_a_history_continues_at_constant_velocity():
+    """It appeared 1 s ago; the predictor needs 3 s."""
     simulation = simulate(
-        on_road(car(-50, 8, appears_s=2.0)), scenario(), PredictorDriver(Oracles())
+        on_road(car(-50, 8, appears_s=2.0)), scenario(), PredictorDriver(TwoModes())
     )
     replay(simulation, 5)
     assert now(simulation, 2) == pytest.approx([-50 + 16, -1.75, 0, 8], abs=1e-3)
 
 
-def test_an_agent_that_comes_is_forecast_at_once():
-    """It appears at tick 3, between the forecasts of ticks 0 and 5, and then keeps their beat."""
-    predictor = Oracles()
+def test_an_agent_that_appears_is_forecast_at_once():
+    """It appears at tick 3, and is then forecast at ticks 5 and 10 with the others."""
+    predictor = TwoModes()
     driver = PredictorDriver(predictor)
     simulation = simulate(on_road(car(-50, 8, appears_s=3.6)), scenario(), driver)
     replay(simulation, 11)
-    assert predictor.asked == [[(0, 1)]] * 3
+    assert predictor.calls == [[(0, 1)]] * 3
     assert now(simulation, 2) == pytest.approx([-50 + 8 * 1.6, -1.75, 0, 8], abs=1e-3)
 
 
 def test_modes_are_drawn_with_their_probabilities():
-    """Of 400 agents about 3/4 brake; the draws come from the episodes' own generators."""
-    driver = PredictorDriver(Oracles(), sampled=True)
+    """Of 400 agents about 3/4 brake; each episode draws from its own generator."""
+    driver = PredictorDriver(TwoModes(), sampled=True)
     recording = on_road(*(car(x, 8) for x in (-90, -70, -50, -30)))
-    seeds = [scenario(length=5)] * 100
-    simulation = simulate(recording, seeds, driver)
-    simulation.reset(seeds, [np.random.default_rng(i) for i in range(100)])
+    scenarios = [scenario(length=5)] * 100
+    simulation = simulate(recording, scenarios, driver)
+    simulation.reset(scenarios, [np.random.default_rng(i) for i in range(100)])
     replay(simulation, 5)
     speeds = simulation.world.episodes.states[:, simulation.world.now[0], 1:, 3]
     assert set(np.round(speeds.ravel(), 2).tolist()) == {6.0, 9.0}
     assert 0.68 < (speeds < 8).mean() < 0.82
-    # the same seed draws the same, alone or among others
-    alone = simulate(recording, scenario(length=5), PredictorDriver(Oracles(), sampled=True))
+    # the same seed draws the same modes, alone and in a batch
+    alone = simulate(recording, scenario(length=5), PredictorDriver(TwoModes(), sampled=True))
     alone.reset([scenario(length=5)], [np.random.default_rng(37)])
     replay(alone, 5)
     assert alone.world.episodes.states[0, -1, 1:].tobytes() == (
@@ -154,8 +152,8 @@ def test_modes_are_drawn_with_their_probabilities():
     )
 
 
-def test_the_oracle_leads_along_the_log():
-    """It is handed the recorded future; tracks made by the bicycle come back within 1 cm in 4 s."""
+def test_the_oracle_follows_the_tracks():
+    """Tracks of the bicycle model are reproduced within 1 cm in 4 s."""
     drives = tuple(each for each in DRIVES if each.start[3] > 4.5 and each.kind != AgentClass.TRUCK)
     recording = make_recording(frame_rate_hz=5.0, drives=drives)
     simulation = simulate(recording, scenario(1, start=25, length=20), "predictor:oracle")
@@ -167,8 +165,8 @@ def test_the_oracle_leads_along_the_log():
     assert np.linalg.norm(away[both], axis=-1).max() < 0.01
 
 
-def test_an_agent_leaves_beyond_all_recorded_positions():
-    """Its log ends at 92 m and so does the recorded area; 10 m further on it is gone."""
+def test_an_agent_leaves_outside_the_recorded_area():
+    """Its track and the recorded area end at 92 m; 10 m farther it has left."""
     leaver = Drive(kind=AgentClass.CAR, start=(60.0, -1.75, 0.0, 8.0), leaves_s=4.0)
     simulation = simulate(on_road(leaver), scenario(length=60), "predictor:constant-velocity")
     edge = simulation.world.recordings[0].extent_m[2]
@@ -180,14 +178,12 @@ def test_an_agent_leaves_beyond_all_recorded_positions():
 
 
 @pytest.mark.parametrize("every", [0, STEPS + 1])
-def test_forecasts_must_reach_to_the_next_ones(every):
-    """Between 1 tick and the horizon."""
-    with pytest.raises(AspEnvError, match="expected 1 to 10 ticks, the horizon of two-minds"):
-        PredictorDriver(Oracles(), every=every)
+def test_an_interval_beyond_the_horizon_is_refused(every):
+    with pytest.raises(AspEnvError, match="expected 1 to 10 ticks, the horizon of two-modes"):
+        PredictorDriver(TwoModes(), every=every)
 
 
 def test_another_time_step_is_refused():
-    """Before anything is driven."""
     predictor = load_predictor("constant-velocity", horizon=5, dt_s=0.4)
     with pytest.raises(AspEnvError, match=r"time step of 0\.4 s, the world has 0\.2 s"):
         simulate(on_road(car(-50, 8)), scenario(), PredictorDriver(predictor))

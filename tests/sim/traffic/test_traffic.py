@@ -1,4 +1,4 @@
-"""Tables from agents to drivers."""
+"""Assignment of agents to drivers."""
 
 import numpy as np
 import pytest
@@ -7,39 +7,38 @@ from asp_env.data.classes import AgentClass
 from asp_env.errors import AspEnvError
 from asp_env.sim.traffic import Control, Driver
 from asp_env.sim.traffic.assignment import Traffic, make_traffic
-from asp_env.sim.traffic.driver import no_control, vehicles
+from asp_env.sim.traffic.driver import controllable_agents, no_control
 from asp_env.sim.traffic.log import LogActionsDriver, LogDriver
 from tests.builders import Drive, make_recording
 from tests.sim.worlds import car, now, on_road, replay, scenario, simulate
 
 
 class Spy:
-    """Drives nobody and remembers what it was told."""
+    """Controls no agents and stores its calls."""
 
     def __init__(self) -> None:
-        """Knows nothing yet."""
-        self.mine: np.ndarray | None = None
-        self.asked = 0
+        self.agent_mask: np.ndarray | None = None
+        self.calls = 0
 
     def reset(self, world, reset_mask, agent_mask=None) -> None:
-        """Remembers its agents."""
+        """Stores its agents."""
         assert reset_mask.shape == (len(world),)
-        self.mine = agent_mask
+        self.agent_mask = agent_mask
 
     def control(self, world) -> Control:
-        """Counts."""
-        self.asked += 1
+        """Counts its calls."""
+        self.calls += 1
         return no_control(world.episodes.ids.shape)
 
 
 def _ids(spy: Spy, simulation) -> list[int]:
-    if spy.mine is None:
+    if spy.agent_mask is None:
         return []
-    return sorted(simulation.world.episodes.ids[spy.mine].tolist())
+    return sorted(simulation.world.episodes.ids[spy.agent_mask].tolist())
 
 
 def test_an_agent_has_the_driver_of_its_id_else_of_its_class_else_the_default():
-    """Vehicles 1 (ego) to 7 and 9 of the made-up crossing; 8 walks and 10 is parked."""
+    """Vehicles are 1 (ego) to 7 and 9; 8 is a pedestrian and 10 is parked."""
     by_id, by_class, rest = Spy(), Spy(), Spy()
     table = {5: by_id, 3: by_id, "car": by_class, "default": rest}
     simulation = simulate(make_recording(), scenario(1), table)
@@ -48,8 +47,7 @@ def test_an_agent_has_the_driver_of_its_id_else_of_its_class_else_the_default():
     assert _ids(rest, simulation) == [4, 7, 9]
 
 
-def test_without_a_default_the_others_replay():
-    """Their states are the log's bits."""
+def test_without_a_default_all_other_agents_replay():
     simulation = simulate(make_recording(), scenario(1), {3: "idm"})
     replay(simulation, 20)
     episodes, tick = simulation.world.episodes, simulation.world.now[0]
@@ -60,21 +58,19 @@ def test_without_a_default_the_others_replay():
         assert same == (track != 3)
 
 
-def test_a_driver_that_nobody_has_costs_nothing():
-    """It is neither reset nor asked."""
-    nobodys, everybodys = Spy(), Spy()
-    simulation = simulate(on_road(car(-50, 8)), scenario(), {99: nobodys, "default": everybodys})
+def test_a_driver_without_agents_is_not_called():
+    unused, used = Spy(), Spy()
+    simulation = simulate(on_road(car(-50, 8)), scenario(), {99: unused, "default": used})
     replay(simulation, 3)
-    assert nobodys.mine is None
-    assert nobodys.asked == 0
-    assert everybodys.asked == 3
+    assert unused.agent_mask is None
+    assert unused.calls == 0
+    assert used.calls == 3
 
 
 def test_equal_names_share_one_driver():
-    """So that a predictor is asked once, whoever has it."""
+    """So that a predictor is called once for all its agents."""
     traffic = make_traffic({"car": "idm", "truck": "idm", "default": "idm"})
     assert isinstance(traffic, Traffic)
-    # the default of a table is `log` before it is given
     assert len(traffic.drivers) == 1
 
 
@@ -85,8 +81,7 @@ def test_equal_names_share_one_driver():
         " default = idm , truck=log-actions,3 =policy",
     ],
 )
-def test_text_means_what_a_table_means(text):
-    """Ten ticks later every state is the same."""
+def test_text_is_equivalent_to_a_table(text):
     table = {"default": "idm", "truck": "log-actions", 3: "policy"}
     one, other = (simulate(make_recording(), scenario(1), each) for each in (text, table))
     for simulation in (one, other):
@@ -95,8 +90,8 @@ def test_text_means_what_a_table_means(text):
     assert same
 
 
-def test_options_of_a_driver_survive_in_a_table():
-    """Colons, equal signs and commas do not get into each other's way."""
+def test_drivers_with_options_in_a_table():
+    """Colons, equal signs and commas of options and of the table are distinguished."""
     text = "default=predictor:every=2:mode=sampled:constant-velocity,truck=idm"
     traffic = make_traffic(text)
     assert isinstance(traffic, Traffic)
@@ -111,7 +106,7 @@ def test_options_of_a_driver_survive_in_a_table():
         ("", "unknown driver '': known are "),
         ("idm:3", "driver idm takes no argument, '3' was given: use idm"),
         ("lorri=idm", "traffic for 'lorri': expected an agent's id, bicycle, bus, car, "),
-        ("pedestrian=idm", "traffic for 'pedestrian': only vehicles are driven; expected "),
+        ("pedestrian=idm", "traffic for 'pedestrian': only vehicles have drivers; expected "),
         ("car=idm,car=log", "traffic 'car=idm,car=log' names 'car' twice"),
         ({"default": "idn"}, "unknown driver 'idn'"),
         ({"truck": "log:x"}, "driver log takes no argument"),
@@ -125,30 +120,27 @@ def test_options_of_a_driver_survive_in_a_table():
     ],
     ids=str,
 )
-def test_what_is_not_understood_is_refused_in_one_line(spec, error):
-    """What was given and what was expected."""
+def test_invalid_traffic_is_refused_in_one_line(spec, error):
     with pytest.raises(AspEnvError) as caught:
         make_traffic(spec)
     assert error in str(caught.value)
     assert "\n" not in str(caught.value)
 
 
-def test_a_plain_name_is_that_driver():
-    """No table is put around it, and a driver is handed back as it is."""
+def test_a_name_or_a_driver_needs_no_table():
     assert isinstance(make_traffic("log"), LogDriver)
     driver = LogActionsDriver()
     assert make_traffic(driver) is driver
     assert isinstance(driver, Driver)
 
 
-def test_the_caller_comes_before_the_table():
-    """An agent that the caller drives obeys it, whatever driver it has."""
+def test_the_caller_overrides_the_driver():
     simulation = simulate(on_road(car(-50, 8), car(-80, 8)), scenario(), "idm")
     actions = np.zeros((1, 3, 2), dtype=np.float32)
     actions[0, 1, 0] = -4.0
-    driven = np.array([[False, True, False]])
+    controlled = np.array([[False, True, False]])
     for _ in range(5):
-        simulation.step_agents(actions, driven)
+        simulation.step_agents(actions, controlled)
     braked, other = now(simulation, 2), now(simulation, 3)
     assert braked is not None
     assert other is not None
@@ -156,8 +148,8 @@ def test_the_caller_comes_before_the_table():
     assert other[3] > 7.0
 
 
-def test_agents_of_the_caller_go_straight_on_where_it_is_silent():
-    """8 m/s for 2 s are 16 m; beyond all recorded positions by more than 10 m it leaves."""
+def test_policy_agents_continue_straight_without_the_caller():
+    """8 m/s for 2 s are 16 m; the agent leaves 10 m outside the recorded area."""
     leaver = Drive(kind=AgentClass.CAR, start=(60.0, -1.75, 0.0, 8.0), leaves_s=4.0)
     simulation = simulate(on_road(leaver), scenario(length=60), "policy")
     replay(simulation, 10)
@@ -169,7 +161,7 @@ def test_agents_of_the_caller_go_straight_on_where_it_is_silent():
     assert now(simulation, 2) is None
 
 
-def test_vehicles_are_what_can_be_driven():
-    """Cars, a van, a truck, a motorcycle and a bicycle; not the ego, walkers and the parked."""
+def test_controllable_agents():
+    """Cars, a van, a truck, a motorcycle, a bicycle; not the ego, a pedestrian, a parked car."""
     world = simulate(make_recording(), scenario(1, start=25)).world
-    assert sorted(world.episodes.ids[vehicles(world)].tolist()) == [2, 3, 4, 5, 6, 7, 9]
+    assert sorted(world.episodes.ids[controllable_agents(world)].tolist()) == [2, 3, 4, 5, 6, 7, 9]

@@ -1,4 +1,4 @@
-/* Maps, boxes and paths on a canvas in metres, y up. Shared by the pictures and the replay. */
+/* Draws maps, boxes and paths on a canvas in metres, y up. Used by pictures.js and replay.js. */
 const DATA = JSON.parse(document.getElementById("data").textContent);
 const dark = matchMedia("(prefers-color-scheme: dark)");
 const CLASSES = ["car", "heavy", "heavy", "heavy", "heavy", "other", "two-wheeler",
@@ -7,7 +7,7 @@ const CURB = 0, DASHED = 2;
 
 const colour = (name) => getComputedStyle(document.documentElement).getPropertyValue("--" + name);
 
-/* Points are centimetres, the first one and then the steps. */
+/* Points in metres from steps in centimetres, of which the first is a position. */
 function points(steps) {
   const out = new Float32Array(steps.length);
   let x = 0, y = 0;
@@ -43,7 +43,7 @@ function preparedMap(number) {
   return map.paths;
 }
 
-/* Fits a canvas to its box and the screen; returns its size in CSS pixels. */
+/* Adapts a canvas to its box and the screen; returns its size in CSS pixels. */
 function fit(canvas) {
   const ratio = devicePixelRatio || 1;
   const width = canvas.clientWidth, height = canvas.clientHeight;
@@ -55,7 +55,7 @@ function fit(canvas) {
   return { width, height, ratio };
 }
 
-/* A drawing context whose unit is a metre: `scale` CSS pixels each, (x, y) in the middle. */
+/* A drawing context in metres with `scale` CSS pixels per metre and (x, y) in the middle. */
 function begin(canvas, x, y, scale) {
   const { width, height, ratio } = fit(canvas);
   const ctx = canvas.getContext("2d");
@@ -144,7 +144,7 @@ function drawDot(ctx, x, y, fill, radiusPx, alpha, scale) {
   ctx.restore();
 }
 
-/* Modes, the least probable first; width and strength tell the probability. */
+/* Modes, the least probable first; width and opacity show the probability. */
 function drawModes(ctx, modes, start, stroke, scale) {
   for (const [p, steps] of [...modes].sort((a, b) => a[0] - b[0])) {
     const xy = points(steps);
@@ -157,7 +157,7 @@ function drawModes(ctx, modes, start, stroke, scale) {
   }
 }
 
-/* A bar of a round length, in the lower left corner, in CSS pixels. */
+/* A scale bar in the lower left corner, in CSS pixels. */
 function drawScale(ctx, canvas, scale) {
   const { height, ratio } = fit(canvas);
   const metres = [1, 2, 5, 10, 20, 50, 100, 200].find((m) => m * scale > 50) || 500;

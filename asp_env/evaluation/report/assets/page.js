@@ -1,11 +1,11 @@
-/* Tabs, plots in the page's colours, and the start. */
+/* Tabs, plots in the colours of the page, and initialisation. */
 function listenToTabs() {
   for (const tabs of document.querySelectorAll(".tabs")) {
     const buttons = [...tabs.querySelectorAll("[role=tab]")];
     const panels = [...tabs.querySelectorAll("[role=tabpanel]")];
-    buttons.forEach((button, chosen) => button.addEventListener("click", () => {
-      buttons.forEach((other, n) => other.setAttribute("aria-selected", String(n === chosen)));
-      panels.forEach((panel, n) => { panel.hidden = n !== chosen; });
+    buttons.forEach((button, selected) => button.addEventListener("click", () => {
+      buttons.forEach((other, n) => other.setAttribute("aria-selected", String(n === selected)));
+      panels.forEach((panel, n) => { panel.hidden = n !== selected; });
     }));
   }
 }
@@ -24,7 +24,7 @@ function themed(layout) {
   return out;
 }
 
-/* Whiskers of bars stand out from the bars, those of points share their colour. */
+/* Whiskers of bars contrast with the bars; those of points have the colour of the points. */
 function themedTrace(trace) {
   if (trace.type !== "bar") return trace;
   return { ...trace, error_y: { ...trace.error_y, color: colour("text").trim() } };

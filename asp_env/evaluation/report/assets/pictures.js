@@ -1,4 +1,4 @@
-/* Forecasts over the map: a row per situation, a column per predictor. */
+/* Draws example forecasts over the map: a row per situation, a column per predictor. */
 function drawPicture(canvas, row, predictor) {
   const [x, y, extent] = row.window;
   const { width } = fit(canvas);
@@ -16,11 +16,11 @@ function drawPicture(canvas, row, predictor) {
     drawBox(ctx, pose(agent), [agent[1] / 100, agent[2] / 100], fill, colour("box-edge"), scale);
     ctx.globalAlpha = 1;
   });
-  row.targets.forEach((number, place) => {
+  row.targets.forEach((number, index) => {
     const start = pose(row.agents[number]).slice(0, 2);
     const stroke = DATA.colours[predictor] || colour("muted");
-    drawModes(ctx, row.forecasts[predictor].modes[place], start, stroke, scale);
-    const truth = points(row.truth[place]);
+    drawModes(ctx, row.forecasts[predictor].modes[index], start, stroke, scale);
+    const truth = points(row.truth[index]);
     drawPath(ctx, truth, colour("truth"), 2, 1, scale, [2, 4.5]);
     drawDot(ctx, truth[truth.length - 2], truth[truth.length - 1], colour("truth"), 3.5, 1, scale);
   });
@@ -77,7 +77,7 @@ function showPictures() {
   legend(document.getElementById("picture-legend"), [
     ["ego", "forecast agents"], ["car", "cars"], ["heavy", "vans, trucks, buses"],
     ["two-wheeler", "motorcycles"], ["vulnerable", "cyclists and pedestrians"],
-    ["truth", "what happened", "stroke"],
+    ["truth", "recorded future", "stroke"],
   ]);
   const redraw = () => drawings.forEach((draw) => draw());
   new ResizeObserver(redraw).observe(grid);

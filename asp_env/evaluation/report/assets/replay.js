@@ -1,17 +1,17 @@
-/* Drives, played on a canvas: poses between ticks are interpolated, forecasts are as said. */
+/* Plays rollouts on a canvas. Poses are interpolated between ticks; forecasts and plans are not. */
 const TRAIL_S = 3, FLASH_S = 1.2;
 
 class Replay {
   constructor() {
     const get = (name) => document.getElementById("replay-" + name);
-    for (const name of ["canvas", "strip", "clock", "event", "driver", "drive", "play", "scrub",
+    for (const name of ["canvas", "strip", "clock", "event", "method", "scenario", "play", "scrub",
       "speed", "follow", "forecasts", "ghost"]) this[name] = get(name);
     this.tick = 0;
     this.playing = false;
     this.zoom = 1;
     this.offset = [0, 0];
     this.legend();
-    this.fillDrivers();
+    this.fillMethods();
     this.listen();
     this.choose();
   }
@@ -25,34 +25,34 @@ class Replay {
     ]);
   }
 
-  fillDrivers() {
-    const drivers = [...new Set(DATA.drives.map((drive) => drive.driver))];
-    document.getElementById("replay-driver-label").hidden = drivers.length < 2;
-    this.driver.replaceChildren(...drivers.map((name) => new Option(name)));
-    this.driver.value = drivers.find((name) => name !== "expert") ?? drivers[0];
-    this.fillDrives();
+  fillMethods() {
+    const methods = [...new Set(DATA.drives.map((rollout) => rollout.driver))];
+    document.getElementById("replay-method-label").hidden = methods.length < 2;
+    this.method.replaceChildren(...methods.map((name) => new Option(name)));
+    this.method.value = methods.find((name) => name !== "expert") ?? methods[0];
+    this.fillScenarios();
   }
 
-  fillDrives() {
-    const before = this.drive.selectedOptions[0]?.dataset.name;
-    this.drive.replaceChildren(...DATA.drives.flatMap((drive, number) => {
-      if (drive.driver !== this.driver.value) return [];
-      const option = new Option([drive.name, drive.tags].filter(Boolean).join(" · "), number);
-      option.dataset.name = drive.name;
+  fillScenarios() {
+    const before = this.scenario.selectedOptions[0]?.dataset.name;
+    this.scenario.replaceChildren(...DATA.drives.flatMap((rollout, number) => {
+      if (rollout.driver !== this.method.value) return [];
+      const option = new Option([rollout.name, rollout.tags].filter(Boolean).join(" · "), number);
+      option.dataset.name = rollout.name;
       return [option];
     }));
-    const same = [...this.drive.options].find((option) => option.dataset.name === before);
+    const same = [...this.scenario.options].find((option) => option.dataset.name === before);
     if (same) same.selected = true;
   }
 
   listen() {
-    this.driver.addEventListener("change", () => {
+    this.method.addEventListener("change", () => {
       const tick = this.tick;
-      this.fillDrives();
+      this.fillScenarios();
       this.choose();
-      this.seek(Math.min(tick, this.log.ticks - 1));
+      this.seek(Math.min(tick, this.rollout.ticks - 1));
     });
-    this.drive.addEventListener("change", () => this.choose());
+    this.scenario.addEventListener("change", () => this.choose());
     this.play.addEventListener("click", () => this.toggle());
     this.scrub.addEventListener("input", () => this.seek(Number(this.scrub.value)));
     for (const box of [this.follow, this.forecasts, this.ghost]) {
@@ -60,7 +60,7 @@ class Replay {
     }
     this.strip.addEventListener("pointerdown", (event) => {
       const share = event.offsetX / this.strip.clientWidth;
-      this.seek(Math.round(share * (this.log.ticks - 1)));
+      this.seek(Math.round(share * (this.rollout.ticks - 1)));
     });
     this.canvas.addEventListener("keydown", (event) => {
       const step = { ArrowLeft: -1, ArrowRight: 1 }[event.key];
@@ -84,15 +84,15 @@ class Replay {
   }
 
   choose() {
-    this.log = DATA.drives[Number(this.drive.value)];
-    this.scrub.max = this.log.ticks - 1;
+    this.rollout = DATA.drives[Number(this.scenario.value)];
+    this.scrub.max = this.rollout.ticks - 1;
     this.zoom = 1;
     this.offset = [0, 0];
     this.seek(0);
   }
 
   seek(tick) {
-    this.tick = Math.min(Math.max(tick, 0), this.log.ticks - 1);
+    this.tick = Math.min(Math.max(tick, 0), this.rollout.ticks - 1);
     this.draw();
   }
 
@@ -101,20 +101,20 @@ class Replay {
     this.play.textContent = this.playing ? "❚❚" : "▶";
     this.play.setAttribute("aria-label", this.playing ? "Pause" : "Play");
     if (!this.playing) return;
-    if (this.tick >= this.log.ticks - 1) this.tick = 0;
+    if (this.tick >= this.rollout.ticks - 1) this.tick = 0;
     let before = performance.now();
     const frame = (now) => {
       if (!this.playing) return;
-      this.seek(this.tick + (now - before) / 1000 * Number(this.speed.value) / this.log.dt);
+      this.seek(this.tick + (now - before) / 1000 * Number(this.speed.value) / this.rollout.dt);
       before = now;
-      if (this.tick >= this.log.ticks - 1) this.toggle(); else requestAnimationFrame(frame);
+      if (this.tick >= this.rollout.ticks - 1) this.toggle(); else requestAnimationFrame(frame);
     };
     requestAnimationFrame(frame);
   }
 
   /* The pose of an agent between ticks, or null. */
   pose(poses, first) {
-    const at = this.tick - first, low = Math.floor(at), share = at - low;
+    const index = this.tick - first, low = Math.floor(index), share = index - low;
     const a = poses[low], b = poses[low + 1];
     if (!a) return null;
     if (!b || share === 0) return [a[0] / 100, a[1] / 100, a[2] / 1000];
@@ -124,57 +124,59 @@ class Replay {
   }
 
   trail(ctx, poses, first, stroke, pose) {
-    const last = Math.floor(this.tick), ticks = Math.round(TRAIL_S / this.log.dt);
+    const last = Math.floor(this.tick), ticks = Math.round(TRAIL_S / this.rollout.dt);
     let [x, y] = pose;
     ctx.lineCap = "butt";
     for (let tick = last; tick >= Math.max(first, last - ticks); tick--) {
-      const at = poses[tick - first];
-      if (!at) break;
+      const point = poses[tick - first];
+      if (!point) break;
       const fade = 0.5 * (1 - (this.tick - tick) / (ticks + 1));
-      drawPath(ctx, [x, y, at[0] / 100, at[1] / 100], stroke, 2.2, Math.max(fade, 0), this.scale);
-      [x, y] = [at[0] / 100, at[1] / 100];
+      const next = [point[0] / 100, point[1] / 100];
+      drawPath(ctx, [x, y, ...next], stroke, 2.2, Math.max(fade, 0), this.scale);
+      [x, y] = next;
     }
     ctx.lineCap = "round";
   }
 
   centre(ego) {
     if (this.follow.checked && ego) return [ego[0], ego[1]];
-    const [left, low, right, high] = DATA.maps[this.log.map].extent;
+    const [left, low, right, high] = DATA.maps[this.rollout.map].extent;
     return [(left + right) / 2, (low + high) / 2];
   }
 
   draw() {
     const { width, height } = fit(this.canvas);
     if (!width) return;
-    const log = this.log, tick = Math.floor(this.tick);
-    const poses = log.agents.map((agent) => this.pose(agent.poses, agent.first));
-    const [left, low, right, high] = DATA.maps[log.map].extent;
-    const whole = Math.min(width / (right - left), height / (high - low)) * 0.95;
-    this.scale = this.zoom * (this.follow.checked ? Math.max(whole, width / 130) : whole);
+    const rollout = this.rollout, tick = Math.floor(this.tick);
+    const poses = rollout.agents.map((agent) => this.pose(agent.poses, agent.first));
+    const [left, low, right, high] = DATA.maps[rollout.map].extent;
+    const fitted = Math.min(width / (right - left), height / (high - low)) * 0.95;
+    this.scale = this.zoom * (this.follow.checked ? Math.max(fitted, width / 130) : fitted);
     const [x, y] = this.centre(poses[0]);
     const ctx = begin(this.canvas, x + this.offset[0], y + this.offset[1], this.scale);
-    drawMap(ctx, log.map, this.scale);
-    drawPath(ctx, points(log.route), colour("plan"), 5, 0.14, this.scale);
+    drawMap(ctx, rollout.map, this.scale);
+    drawPath(ctx, points(rollout.route), colour("plan"), 5, 0.14, this.scale);
     if (this.forecasts.checked) this.drawForecasts(ctx, tick, poses);
-    log.agents.forEach((agent, slot) => {
+    rollout.agents.forEach((agent, slot) => {
       const stroke = colour(slot ? CLASSES[agent.class] : "ego");
       if (poses[slot]) this.trail(ctx, agent.poses, agent.first, stroke, poses[slot]);
     });
     this.drawPlan(ctx, tick, poses[0]);
-    for (let slot = log.agents.length - 1; slot >= 0; slot--) {
+    for (let slot = rollout.agents.length - 1; slot >= 0; slot--) {
       if (poses[slot]) this.drawAgent(ctx, slot, poses[slot]);
     }
     this.drawEvents(ctx, poses[0]);
     drawScale(ctx, this.canvas, this.scale);
     this.drawStrip();
-    const speed = log.speed[tick] === null ? "" : ` · ${(3.6 * log.speed[tick]).toFixed(0)} km/h`;
-    this.clock.textContent = `${(this.tick * log.dt).toFixed(1)} s${speed}`;
+    const speed = rollout.speed[tick];
+    const speedText = speed === null ? "" : ` · ${(3.6 * speed).toFixed(0)} km/h`;
+    this.clock.textContent = `${(this.tick * rollout.dt).toFixed(1)} s${speedText}`;
     this.scrub.value = tick;
   }
 
   drawForecasts(ctx, tick, poses) {
-    for (const [slot, modes] of this.log.forecasts[tick]) {
-      const agent = this.log.agents[slot];
+    for (const [slot, modes] of this.rollout.forecasts[tick]) {
+      const agent = this.rollout.agents[slot];
       const start = agent.poses[tick - agent.first] || poses[slot];
       if (!start) continue;
       drawModes(ctx, modes, [start[0] / 100, start[1] / 100], colour("forecast"), this.scale);
@@ -182,35 +184,35 @@ class Replay {
   }
 
   drawPlan(ctx, tick, ego) {
-    const plan = this.log.plans[tick];
+    const plan = this.rollout.plans[tick];
     if (!plan || !plan.length || !ego) return;
     const xy = points(plan);
     drawPath(ctx, [ego[0], ego[1], ...xy], colour("plan"), 4, 0.9, this.scale);
   }
 
   drawAgent(ctx, slot, pose) {
-    const agent = this.log.agents[slot];
+    const agent = this.rollout.agents[slot];
     const size = [agent.size[0] / 100, agent.size[1] / 100];
     if (slot) {
       drawBox(ctx, pose, size, colour(CLASSES[agent.class]), colour("box-edge"), this.scale);
       return;
     }
-    const recorded = this.ghost.checked && this.pose(this.log.log, 0);
+    const recorded = this.ghost.checked && this.pose(this.rollout.log, 0);
     drawBox(ctx, pose, size, colour("ego"), colour("box-edge"), this.scale);
     if (recorded) drawGhost(ctx, recorded, size, this.scale);
   }
 
   drawEvents(ctx, ego) {
-    const dt = this.log.dt;
-    const now = this.log.events.filter(([, first, last]) =>
+    const dt = this.rollout.dt;
+    const active = this.rollout.events.filter(([, first, last]) =>
       first <= this.tick && (this.tick - last) * dt < FLASH_S);
-    this.event.replaceChildren(...now.map(([name]) => {
+    this.event.replaceChildren(...active.map(([name]) => {
       const badge = document.createElement("span");
       badge.textContent = name;
       badge.style.background = this.eventColour(name);
       return badge;
     }));
-    for (const [name, first] of now) {
+    for (const [name, first] of active) {
       const age = (this.tick - first) * dt / FLASH_S;
       if (!ego || age > 1) continue;
       ctx.save();
@@ -228,15 +230,15 @@ class Replay {
     return colour(/collision/.test(name) ? "alarm" : "warning");
   }
 
-  /* Speed over time: the ego's line and the recorded one, events as marks, now as a bar. */
+  /* Speed of the ego and the recorded ego over time, events as marks, the current time as a bar. */
   drawStrip() {
     const { width, height, ratio } = fit(this.strip);
-    const ctx = this.strip.getContext("2d"), log = this.log;
+    const ctx = this.strip.getContext("2d"), rollout = this.rollout;
     ctx.setTransform(ratio, 0, 0, ratio, 0, 0);
     ctx.clearRect(0, 0, width, height);
-    const top = Math.max(5, ...log.speed.filter(Number.isFinite), ...log.log_speed
+    const top = Math.max(5, ...rollout.speed.filter(Number.isFinite), ...rollout.log_speed
       .filter(Number.isFinite)) * 1.1;
-    const px = (tick) => tick / Math.max(1, log.ticks - 1) * width;
+    const px = (tick) => tick / Math.max(1, rollout.ticks - 1) * width;
     const py = (speed) => height - 4 - speed / top * (height - 10);
     const line = (speeds, stroke, dash) => {
       ctx.strokeStyle = stroke;
@@ -255,9 +257,9 @@ class Replay {
     ctx.fillStyle = colour("muted");
     ctx.font = "11px system-ui, sans-serif";
     ctx.fillText("speed", 4, 12);
-    line(log.log_speed, colour("muted"), [4, 3]);
-    line(log.speed, colour("ego"), []);
-    for (const [name, first, last] of log.events) {
+    line(rollout.log_speed, colour("muted"), [4, 3]);
+    line(rollout.speed, colour("ego"), []);
+    for (const [name, first, last] of rollout.events) {
       ctx.fillStyle = this.eventColour(name);
       ctx.globalAlpha = 0.18;
       ctx.fillRect(px(first), 0, Math.max(2, px(last) - px(first)), height);

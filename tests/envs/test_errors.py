@@ -1,4 +1,4 @@
-"""What the environment refuses, each in one line that tells what to do."""
+"""Errors of the single environment: one line that names what was given and what is expected."""
 
 import gymnasium
 import numpy as np
@@ -9,7 +9,7 @@ from asp_env.errors import AspEnvError
 
 
 @pytest.mark.parametrize(
-    ("options", "what"),
+    ("options", "message"),
     [
         ({"observations": ("stat",)}, r"unknown observation 'stat' \(did you mean 'state'"),
         ({"observations": ()}, "no observation given"),
@@ -24,15 +24,13 @@ from asp_env.errors import AspEnvError
     ],
     ids=lambda value: next(iter(value)) if isinstance(value, dict) else None,
 )
-def test_a_wrong_argument_is_refused(crossing, options, what):
-    """An `AspEnvError` of one line that names what is expected."""
-    with pytest.raises(AspEnvError, match=what) as caught:
+def test_invalid_arguments_are_rejected(crossing, options, message):
+    with pytest.raises(AspEnvError, match=message) as caught:
         ReplayEnv(crossing, **options)
     assert "\n" not in str(caught.value)
 
 
-def test_data_that_is_not_there_is_refused(tmp_path):
-    """A folder that does not exist, and a sample that is not shipped."""
+def test_missing_data_are_rejected(tmp_path):
     with pytest.raises(AspEnvError, match="does not exist"):
         ReplayEnv(str(tmp_path / "nothing"))
     with pytest.raises(AspEnvError, match="unknown sample 'motorway'"):
@@ -40,7 +38,7 @@ def test_data_that_is_not_there_is_refused(tmp_path):
 
 
 @pytest.mark.parametrize(
-    ("options", "what"),
+    ("options", "message"),
     [
         ({"scenari": 3}, r"unknown reset option 'scenari' \(did you mean 'scenario'"),
         ({"scenario": 6}, "scenario 6: expected 0 to 5"),
@@ -49,14 +47,13 @@ def test_data_that_is_not_there_is_refused(tmp_path):
         ({"scenario": "first"}, "unknown scenario 'first'"),
     ],
 )
-def test_a_wrong_reset_option_is_refused(crossing, options, what):
-    """The error says which scenarios there are."""
-    with pytest.raises(AspEnvError, match=what):
+def test_invalid_reset_options_are_rejected(crossing, options, message):
+    with pytest.raises(AspEnvError, match=message):
         ReplayEnv(crossing, observations=("state",)).reset(options=options)
 
 
 @pytest.mark.parametrize(
-    ("action", "what"),
+    ("action", "message"),
     [
         (np.array([np.nan, 0.0]), "expected two finite numbers"),
         (np.array([0.0, np.inf]), "expected two finite numbers"),
@@ -68,20 +65,19 @@ def test_a_wrong_reset_option_is_refused(crossing, options, what):
     ],
     ids=["nan", "infinite", "three", "table", "number", "text", "nothing"],
 )
-def test_a_wrong_action_is_refused(crossing, action, what):
-    """One line, and the episode can go on with a right one."""
+def test_invalid_actions_are_rejected(crossing, action, message):
+    """The episode continues with a valid one."""
     env = ReplayEnv(crossing, observations=("state",))
     env.reset(seed=0)
-    with pytest.raises(AspEnvError, match=what) as caught:
+    with pytest.raises(AspEnvError, match=message) as caught:
         env.step(action)
     assert "\n" not in str(caught.value)
     info = env.step(np.zeros(2))[4]
     assert info["tick"] == 1
 
 
-def test_nothing_happens_before_reset(crossing):
-    """Step, scene and render ask for a reset first."""
+def test_step_scene_and_render_need_a_reset(crossing):
     env = ReplayEnv(crossing, observations=("state",), render_mode="rgb_array")
-    for ask in (lambda: env.step(np.zeros(2)), env.scene, env.render):
+    for call in (lambda: env.step(np.zeros(2)), env.scene, env.render):
         with pytest.raises(gymnasium.error.ResetNeeded):
-            ask()
+            call()

@@ -1,4 +1,4 @@
-"""The command `asp-env train`."""
+"""The command `asp-env train`; importing it needs neither torch nor Lightning."""
 
 import dataclasses
 from collections.abc import Mapping
@@ -14,59 +14,59 @@ from asp_env.errors import MissingExtraError
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Train:
-    """Train a predictor; a run that was killed goes on where its last epoch ended."""
+    """Train a predictor; an interrupted run resumes after its last complete epoch."""
 
     predictor: Annotated[str, tyro.conf.Positional]
-    """Which one, such as ffw-asp."""
+    """Predictor to train, such as ffw-asp."""
     data: Annotated[str, tyro.conf.Positional]
-    """A folder with recordings, or a source such as synthetic:intersection."""
+    """A folder of recordings, or a source such as synthetic:intersection."""
     out: Path
     """Folder of the run."""
     recipe: str = "cpu"
-    """cpu (the paper's structure in minutes on two cores), ours (better, as small) or paper (the
-    paper's network and schedule)."""
+    """Recipe: cpu (the paper's structure, minutes on two cores), ours (more accurate at the same
+    size) or paper (the paper's size and schedule)."""
     variant: str | None = None
-    """The preset with a change by name, such as no-trail: an ablation."""
+    """Variant of the recipe by name, such as no-trail, for ablations."""
     view: str = "chauffeurnet"
-    """What the network looks at: chauffeurnet, mtp or vectors."""
+    """View that the network observes: chauffeurnet, mtp or vectors."""
     horizon: float = 3.0
-    """How far it forecasts, seconds. Over 3 s, ssp-asp and the variant staged of the others go on
-    from a run for 3 s, in OUT/3s."""
+    """Horizon of the forecasts, seconds. Above 3 s, ssp-asp and the variant staged of the others
+    start from a run for 3 s in OUT/3s."""
     start: Path | None = None
     """A finished run to start from, or a safetensors file of ResNet18 weights."""
     validation: str | None = None
-    """Other data to select on; all of DATA is learned from then."""
+    """Separate validation data; all of DATA is trained on then."""
     history: Literal["recorded", "causal"] = "recorded"
-    """Histories as recorded, or filtered again by a filter that knows no later frame."""
+    """Histories as recorded, or filtered again without later frames."""
     split: Literal["recording", "blocks"] = "recording"
     """What is held out: whole recordings, or blocks of time within each."""
     epochs: int | None = None
-    """Instead of the preset's; of each stage where there are two."""
+    """Number of epochs instead of the recipe's; of each stage if there are two."""
     seed: int = 0
-    """Of the initial weights and the order of the data."""
+    """Seed of the initial weights and of the order of the data."""
     max_snippets: int | None = None
-    """Learn from no more than so many, chosen at random."""
+    """Largest number of training snippets, chosen at random."""
 
     precision: Literal["32-true", "bf16-mixed"] | None = None
-    """Of the encoder, instead of the preset's; all that follows it is always float32."""
+    """Precision of the encoder instead of the recipe's; the rest is always float32."""
     devices: int | Literal["auto"] = 1
     """Processes on each node, with a GPU each if there are GPUs; auto is one per GPU. They share
     every batch."""
     nodes: int = 1
-    """Machines that take part. The same command is started on each, with OUT and DATA in folders
-    that all of them see, and with MASTER_ADDR, MASTER_PORT and NODE_RANK set or by torchrun."""
+    """Number of machines. The same command is started on each, with OUT and DATA in folders that
+    all of them see, and with MASTER_ADDR, MASTER_PORT and NODE_RANK set, or by torchrun."""
     strategy: Literal["auto", "ddp"] = "auto"
-    """How processes work together; ddp takes it also where there is but one."""
+    """Strategy of distributed training; ddp forces it even for a single process."""
     compile: bool = False
-    """Compile the encoder with torch.compile: some tens of seconds at first, faster later."""
+    """Compile the encoder with torch.compile: tens of seconds at first, faster later."""
     num_workers: int = 0
-    """Processes that draw batches ahead for each device, where one thread is too slow for a GPU."""
+    """Processes for data loading of each device, where one thread is too slow for a GPU."""
 
     def run(self) -> None:
         """Trains.
 
         Raises:
-            AspEnvError: an option, the data or the folder is bad.
+            AspEnvError: An option, the data or the folder is bad.
         """
         try:
             from predictors.training.fitting import train, train_stages
@@ -99,10 +99,10 @@ class Train:
 
     @staticmethod
     def warm_starts_from_3s(predictor: str, variant: str | None = None) -> bool:
-        """Whether a run for more than 3 s goes on from one for 3 s.
+        """Whether a run for more than 3 s starts from a run for 3 s.
 
         Raises:
-            AspEnvError: the predictor has no such variant.
+            AspEnvError: The predictor has no such variant.
         """
         from predictors.training.variants import warm_starts_from_3s
 
@@ -110,16 +110,16 @@ class Train:
 
     @staticmethod
     def variants(predictor: str) -> Mapping[str, Any]:
-        """What `variant` can be for a predictor, by name."""
+        """The variants of a predictor by name."""
         from predictors.training.variants import VARIANTS
 
         return VARIANTS.get(predictor, {})
 
     def config_for(self, horizon_s: float) -> Any:
-        """All that decides the weights of a run for a horizon, besides data and start.
+        """The configuration of a run for a horizon in seconds.
 
         Raises:
-            AspEnvError: a name is unknown, or a number out of its range.
+            AspEnvError: A name is unknown, or a number is out of its range.
         """
         from predictors.training.recipes import recipe
         from predictors.training.variants import variant

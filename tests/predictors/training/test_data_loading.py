@@ -1,4 +1,4 @@
-"""Batches drawn by processes are those that a thread draws, and the processes end with the run."""
+"""Batches of processes equal those of a thread, and the processes end with the run."""
 
 import os
 import select
@@ -19,7 +19,7 @@ from asp_env.data.source import open_data
 from asp_env.errors import AspEnvError
 from asp_env.views import make_view
 from predictors.training.data import Batches
-from predictors.training.data_loading import BatchWorkers, Drawn, batch_workers
+from predictors.training.data_loading import BatchWorkers, Sample, batch_workers
 from predictors.training.fitting import train
 from predictors.training.trainer import Hardware
 from tests.builders import make_recording
@@ -28,8 +28,8 @@ from tests.predictors.tiny import PIXELS, tiny_config, write_data
 PROCESSES = 2
 
 
-def named(folder: str) -> Batches:
-    """Pictures of causal histories, of recordings that are opened by name."""
+def opened(folder: str) -> Batches:
+    """Rasters with causal histories, of recordings that processes open by name."""
     recordings = open_data(folder)
     return Batches(
         recordings,
@@ -41,8 +41,8 @@ def named(folder: str) -> Batches:
     )
 
 
-def held() -> Batches:
-    """Vectors of a recording that is nowhere but in memory."""
+def in_memory() -> Batches:
+    """Vectors of a recording that exists only in memory."""
     recordings = [make_recording()]
     index = index_snippets(recordings, dt_s=0.2, horizon_s=3.0)
     return Batches(recordings, index, view=make_view("vectors"), batch_size=16)
@@ -50,45 +50,45 @@ def held() -> Batches:
 
 @pytest.fixture(scope="module")
 def both(tmp_path_factory: pytest.TempPathFactory) -> Iterator[tuple[BatchWorkers, list[Batches]]]:
-    """A crew that knows two drawings."""
-    batches = [named(write_data(tmp_path_factory.mktemp("data"))), held()]
-    with batch_workers([each.drawing for each in batches], PROCESSES) as crew:
-        assert crew is not None
-        yield crew, batches
+    """Two processes with two sources."""
+    batches = [opened(write_data(tmp_path_factory.mktemp("data"))), in_memory()]
+    with batch_workers([each.source for each in batches], PROCESSES) as workers:
+        assert workers is not None
+        yield workers, batches
 
 
-def same(first: Drawn, second: Drawn) -> bool:
-    """Whether two batches agree in every bit."""
+def equal(first: Sample, second: Sample) -> bool:
+    """Whether two batches are equal bit for bit."""
     pairs = zip(tree_flatten(first)[0], tree_flatten(second)[0], strict=True)
     return all(torch.equal(one, other) for one, other in pairs)
 
 
-@pytest.mark.parametrize("number", [0, 1], ids=["named, causal", "held"])
-def test_processes_draw_what_a_thread_draws(
+@pytest.mark.parametrize("number", [0, 1], ids=["opened, causal", "in memory"])
+def test_processes_load_the_batches_of_a_thread(
     both: tuple[BatchWorkers, list[Batches]], number: int
 ) -> None:
-    """In the same order, bit for bit, also of a share of a shuffle."""
-    crew, batches = both
+    """In the same order, bit for bit, for a shard of a shuffle."""
+    workers, batches = both
     rows = np.random.default_rng(0).permutation(len(batches[number].snippets))
-    alone = batches[number].reordered(rows).dealt(1, 2)
-    together = alone.drawn_by(crew, number)
-    pairs = list(zip(alone, together, strict=True))
-    assert len(pairs) == len(alone) > PROCESSES
-    assert all(same(*pair) for pair in pairs)
-    assert not same(pairs[0][0], pairs[1][0])
+    by_thread = batches[number].reordered(rows).shard(1, 2)
+    by_workers = by_thread.with_workers(workers, number)
+    pairs = list(zip(by_thread, by_workers, strict=True))
+    assert len(pairs) == len(by_thread) > PROCESSES
+    assert all(equal(*pair) for pair in pairs)
+    assert not equal(pairs[0][0], pairs[1][0])
 
 
-def test_fault_in_a_process_reaches_the_reader(both: tuple[BatchWorkers, list[Batches]]) -> None:
-    """As it was raised, and the crew goes on drawing."""
-    crew, batches = both
-    index = index_snippets(batches[1].drawing.recordings, dt_s=0.2, horizon_s=3.0, history_s=1.0)
+def test_error_in_a_process_is_raised(both: tuple[BatchWorkers, list[Batches]]) -> None:
+    """The error is raised where the batch is read; the processes continue."""
+    workers, batches = both
+    index = index_snippets(batches[1].source.recordings, dt_s=0.2, horizon_s=3.0, history_s=1.0)
     with pytest.raises(ValueError, match="needs 15 past ticks"):
-        crew.submit(1, index).result()
-    assert len(crew.submit(1, batches[1].snippets.select(np.arange(3))).result()[1].states) == 3
+        workers.submit(1, index).result()
+    assert len(workers.submit(1, batches[1].snippets.select(np.arange(3))).result()[1].states) == 3
 
 
-def test_processes_change_no_weights(tmp_path: Path) -> None:
-    """Training ends with the same bits, whoever draws."""
+def test_processes_do_not_change_the_weights(tmp_path: Path) -> None:
+    """Training with a thread and with a process has equal results, bit for bit."""
     data = write_data(tmp_path / "data")
     config = tiny_config("ssp-asp", "vectors", epochs=1, pretraining_epochs=1)
     runs = [
@@ -100,8 +100,7 @@ def test_processes_change_no_weights(tmp_path: Path) -> None:
     assert all(torch.equal(value, weights[1][name]) for name, value in weights[0].items())
 
 
-def test_too_few_processes_are_refused() -> None:
-    """None at all is a thread."""
+def test_negative_number_of_processes_is_refused() -> None:
     with pytest.raises(AspEnvError, match="num_workers is -1, expected 0 or more"):
         Hardware(num_workers=-1)
 
@@ -109,18 +108,18 @@ def test_too_few_processes_are_refused() -> None:
 KILLED = """
 import os, signal
 from predictors.training.data_loading import BatchWorkers
-from tests.predictors.training.test_drawing import held
+from tests.predictors.training.test_data_loading import in_memory
 
 if __name__ == "__main__":
-    batches = held()
-    crew = BatchWorkers([batches.drawing], 2)
-    crew.submit(0, batches.snippets).result()
+    batches = in_memory()
+    workers = BatchWorkers([batches.source], 2)
+    workers.submit(0, batches.snippets).result()
     os.kill(os.getpid(), signal.SIGKILL)
 """
 
 
 def test_processes_end_when_the_run_is_killed(tmp_path: Path) -> None:
-    """They share its standard output, which ends with the last of them."""
+    """They share its standard output, which is closed when the last of them ends."""
     script = tmp_path / "killed.py"
     script.write_text(KILLED)
     reading, writing = os.pipe()
@@ -135,5 +134,5 @@ def test_processes_end_when_the_run_is_killed(tmp_path: Path) -> None:
     os.close(writing)
     with os.fdopen(reading, "rb") as output:
         assert process.returncode < 0, process.stderr
-        assert select.select([output], [], [], 60)[0], "still there after a minute"
+        assert select.select([output], [], [], 60)[0], "still running after a minute"
         assert output.read() == b""

@@ -1,4 +1,4 @@
-"""Recordings and episodes of every world, for what holds of all of them."""
+"""Episodes in every world, for the suite of worlds."""
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
@@ -9,7 +9,7 @@ import pytest
 
 from asp_env.data.scenarios.scenario import Scenario, find_scenarios
 from asp_env.sim.simulation import Simulation
-from asp_env.sim.world import ReplayWorld, World, world_of
+from asp_env.sim.world import ReplayWorld, World, world_class
 from tests.builders import make_recording
 from tests.highway_folders import highway_data, highway_recordings, highway_scenarios
 from tests.sim.worlds import DT_S, HISTORY, TRAFFICS, scenario, simulate
@@ -19,30 +19,30 @@ OWN_TRAFFICS = (
     *("predictor:constant-turn-rate", "predictor:every=3:mode=sampled:oracle"),
     "default=own,3=policy,20=idm,18=log-actions,4=predictor:constant-velocity",
 )
-"""Every driver that runs no network in a world whose vehicles drive themselves, and a table."""
+"""Every driver of a self-driving world without a network, and a table of several."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Place:
+class WorldCase:
     """Four episodes of different lengths with different numbers of agents."""
 
     data: str | None
-    """DATA's scheme, if the world is that of one."""
-    kind: Callable[[], type[World]]
+    """The scheme that the world is registered under, None for `ReplayWorld`."""
+    world_class: Callable[[], type[World]]
     recordings: Callable[[], Sequence[Any]]
     scenarios: Callable[[], list[Scenario]]
     found: Callable[[], list[Scenario]]
-    """What the table of scenarios offers, or some of it."""
+    """Scenarios found in the recordings, or some of them."""
     traffics: tuple[str, ...]
     steps: int
-    """Two of the four are over by then."""
+    """Ticks after which two of the four episodes are over."""
 
     def simulate(
         self, scenarios: Sequence[Scenario] | Scenario, traffic: str | None = None
     ) -> Simulation:
-        """Episodes that have just begun, by default with everybody left to the world."""
+        """Episodes that have just started, by default with all agents left to the world."""
         name = self.traffics[0] if traffic is None else traffic
-        return simulate(self.recordings(), scenarios, name, self.kind())
+        return simulate(self.recordings(), scenarios, name, self.world_class())
 
 
 @cache
@@ -54,10 +54,10 @@ def _recordings() -> list[Any]:
     ]
 
 
-def _replayed() -> Place:
-    return Place(
+def _replay() -> WorldCase:
+    return WorldCase(
         data=None,
-        kind=lambda: ReplayWorld,
+        world_class=lambda: ReplayWorld,
         recordings=_recordings,
         scenarios=lambda: [
             scenario(1, start=15, length=24),
@@ -73,27 +73,27 @@ def _replayed() -> Place:
     )
 
 
-def _highway(site: str, scenarios: Sequence[Scenario], traffics: tuple[str, ...]) -> Place:
-    return Place(
+def _highway(site: str, scenarios: Sequence[Scenario], traffics: tuple[str, ...]) -> WorldCase:
+    return WorldCase(
         data="highway",
-        kind=lambda: world_of(highway_data(site)),
+        world_class=lambda: world_class(highway_data(site)),
         recordings=lambda: highway_recordings(site),
         scenarios=lambda: [*scenarios],
         found=lambda: list(highway_scenarios(site))[
             :: len(highway_scenarios(site)) // 5
-        ],  # stepping them takes its time
+        ],  # stepping all of them takes long
         traffics=traffics,
         steps=14,
     )
 
 
-PLACES = {
-    "replay": _replayed(),
+WORLD_CASES = {
+    "replay": _replay(),
     "highway intersection": _highway(
         "intersection",
         [
-            scenario(18, start=150, length=11),  # turns left, gives way
-            scenario(2, start=70, length=20, recording=1),  # amid crashes
+            scenario(18, start=150, length=11),  # turns left and gives way
+            scenario(2, start=70, length=20, recording=1),  # among crashes
             scenario(13, start=70, length=12),
             scenario(16, start=125, length=40, recording=1),
         ],
@@ -103,7 +103,7 @@ PLACES = {
         "roundabout",
         [
             scenario(7, start=115, length=9),
-            scenario(4, start=28, length=20, recording=1),  # amid a change of lanes, then a crash
+            scenario(4, start=28, length=20, recording=1),  # during a lane change, then a crash
             scenario(2, start=20, length=12),
             scenario(9, start=130, length=40, recording=1),
         ],
@@ -111,12 +111,12 @@ PLACES = {
     ),
 }
 
-everywhere = pytest.mark.parametrize("place", PLACES.values(), ids=list(PLACES))
+every_world = pytest.mark.parametrize("case", WORLD_CASES.values(), ids=list(WORLD_CASES))
 every_traffic = pytest.mark.parametrize(
-    ("place", "traffic"),
+    ("case", "traffic"),
     [
-        pytest.param(place, traffic, id=f"{name}-{traffic}")
-        for name, place in PLACES.items()
-        for traffic in place.traffics
+        pytest.param(case, traffic, id=f"{name}-{traffic}")
+        for name, case in WORLD_CASES.items()
+        for traffic in case.traffics
     ],
 )

@@ -1,4 +1,4 @@
-"""Where an episode begins: scenarios by number, name and tag; any vehicle at any tick."""
+"""Starts of episodes: scenarios by number, name and filter, and any vehicle at any tick."""
 
 import gymnasium
 import numpy as np
@@ -15,7 +15,7 @@ def _make(data: str, **options) -> ReplayEnv:
 
 
 def test_a_scenario_by_number_and_by_name(crossing):
-    """Both start the same; the seed decides nothing then."""
+    """For any seed."""
     env = _make(crossing)
     for number, scenario in enumerate(env.scenarios):
         by_number = env.reset(seed=number, options={"scenario": number})
@@ -25,8 +25,7 @@ def test_a_scenario_by_number_and_by_name(crossing):
         assert by_name[1]["scenario"] == scenario.name
 
 
-def test_a_seed_is_no_index(crossing):
-    """Seeds beyond the number of scenarios are fine, and neighbouring ones draw others."""
+def test_a_seed_is_not_the_number_of_a_scenario(crossing):
     env = _make(crossing)
     drawn = [env.reset(seed=seed)[1]["scenario"] for seed in range(100, 140)]
     assert len(set(drawn)) == len(env.scenarios)
@@ -34,7 +33,7 @@ def test_a_seed_is_no_index(crossing):
 
 
 def test_any_vehicle_at_any_tick(crossing):
-    """The motorcycle (6) is there from 4 s to 14 s: drivable from tick 20 + 15 to tick 69."""
+    """The motorcycle (id 6) is present from 4 s to 14 s and starts at ticks 20 + 15 to 69."""
     env = _make(crossing)
     obs, info = env.reset(options={"ego": 6, "start_tick": 41})
     assert obs in env.observation_space
@@ -53,7 +52,6 @@ def test_any_vehicle_at_any_tick(crossing):
 
 
 def test_a_scenario_from_another_tick_or_with_another_ego(crossing):
-    """The recording is that of the scenario; without `ego` its ego drives."""
     env = _make(crossing)
     first = env.scenarios[0]
     info = env.reset(options={"scenario": 0, "start_tick": first.start_tick + 7})[1]
@@ -63,7 +61,7 @@ def test_a_scenario_from_another_tick_or_with_another_ego(crossing):
 
 
 @pytest.mark.parametrize(
-    ("options", "what"),
+    ("options", "message"),
     [
         ({"ego": 99}, "ego 99: recording 00 has no such track"),
         ({"ego": "2"}, "ego '2': expected a whole number"),
@@ -77,17 +75,16 @@ def test_a_scenario_from_another_tick_or_with_another_ego(crossing):
     ],
     ids=str,
 )
-def test_what_does_not_exist_is_refused(crossing, options, what):
-    """One line with what there is; the environment can be reset afterwards."""
+def test_starts_that_do_not_exist_are_rejected(crossing, options, message):
+    """The environment can be reset afterwards."""
     env = _make(crossing)
-    with pytest.raises(AspEnvError, match=what) as caught:
+    with pytest.raises(AspEnvError, match=message) as caught:
         env.reset(options=options)
     assert "\n" not in str(caught.value)
     env.reset(seed=0)
 
 
-def test_a_pedestrian_is_no_ego(crossing):
-    """The error says what it is."""
+def test_a_pedestrian_cannot_be_the_ego(crossing):
     env = _make(crossing)
     recorded = env.recordings[0]
     pedestrian = int(recorded.track_ids[np.flatnonzero(recorded.classes == 8)[0]])
@@ -96,7 +93,7 @@ def test_a_pedestrian_is_no_ego(crossing):
 
 
 def test_an_ego_of_several_recordings_needs_a_scenario(tmp_path):
-    """Track ids are unique within a recording alone."""
+    """Track ids are unique only within a recording."""
     env = _make(str(write_crossing(tmp_path, drives=(ON_ROAD, ON_ROAD[:3]))))
     with pytest.raises(AspEnvError, match="has 2 recordings; name a scenario"):
         env.reset(options={"ego": 1})
@@ -105,15 +102,14 @@ def test_an_ego_of_several_recordings_needs_a_scenario(tmp_path):
     assert info["scenario"].startswith("01-2-")
 
 
-def test_recordings_shorter_than_the_history_are_refused(tmp_path):
-    """Of 2 s nothing can be driven after 3 s of history."""
+def test_recordings_shorter_than_the_history_are_rejected(tmp_path):
     data = str(write_crossing(tmp_path, drives=(ON_ROAD[:3],), seconds=2.0))
     with pytest.raises(AspEnvError, match="after 3 s of history"):
         _make(data)
 
 
-def test_scenarios_by_a_filter(crossing):
-    """In words or as an object; what is drawn fits. Words survive a specification as JSON."""
+def test_scenarios_of_a_filter(crossing):
+    """As text, which can be part of a JSON spec, or as an object."""
     everything = _make(crossing).scenarios
     for wanted in ("left", ScenarioFilter.parse("left")):
         env = _make(crossing, scenarios=wanted)
@@ -127,16 +123,16 @@ def test_scenarios_by_a_filter(crossing):
     assert "left" in spec.to_json()
 
 
-def test_scenarios_of_the_callers_choice(crossing):
-    """A set of scenarios, in its own order."""
+def test_scenarios_of_a_set(crossing):
+    """In the order of the set."""
     chosen = _make(crossing).scenarios.select(np.array([4, 3, 2]))
     env = _make(crossing, scenarios=chosen)
     for number, scenario in enumerate(chosen):
         assert env.reset(options={"scenario": number})[1]["scenario"] == scenario.name
 
 
-def test_scenarios_that_do_not_exist_are_refused(crossing, tmp_path):
-    """Unknown tags, none that fits, an empty set, and scenarios of other data or ticks."""
+def test_invalid_scenarios_are_rejected(crossing, tmp_path):
+    """Unknown tags, no match, an empty set, and sets of other data or another time step."""
     everything = _make(crossing).scenarios
     with pytest.raises(AspEnvError, match=r"'lefts' \(did you mean 'left'"):
         _make(crossing, scenarios="lefts")

@@ -1,4 +1,4 @@
-"""The same bits in every instance and every process, and behind Gymnasium's vector environments."""
+"""Environments return the same bits in every instance and every process."""
 
 import subprocess
 import sys
@@ -12,8 +12,8 @@ from tests.envs.same import same
 from tests.envs.traces import make, trace, trace_vector
 
 
-def test_two_instances_agree_bit_for_bit(crossing):
-    """Same seed, same 500 actions, with other environments made and stepped in between."""
+def test_two_instances_return_the_same_bits(crossing):
+    """With other environments made and stepped in between."""
     first = make(crossing)
     expected = trace(first, steps=500)
     other = make(crossing, traffic="idm", observations=("state",))
@@ -25,8 +25,8 @@ def test_two_instances_agree_bit_for_bit(crossing):
 
 
 @pytest.mark.parametrize("traffic", ["log", "idm"])
-def test_another_process_agrees_bit_for_bit(crossing, traffic):
-    """The hashes over 500 steps, alone and batched, are the same in a fresh interpreter."""
+def test_another_process_returns_the_same_bits(crossing, traffic):
+    """Over 500 steps of a single and a vector environment."""
     script = (
         "import sys; from tests.envs.traces import make, trace, trace_vector;"
         "print(trace(make(sys.argv[1], traffic=sys.argv[2]), steps=500));"
@@ -45,8 +45,7 @@ def test_another_process_agrees_bit_for_bit(crossing, traffic):
     assert done.stdout.split() == expected
 
 
-def test_processes_of_gymnasium_agree_with_one(crossing):
-    """`AsyncVectorEnv` over `gymnasium.make` returns what the batched environment does."""
+def test_async_vector_env_returns_the_same_bits(crossing):
     options = {"data": crossing, "observations": ("state", "vectors", "route")}
     one = gymnasium.make_vec(
         "asp_env/Replay-v0", num_envs=2, vectorization_mode="vector_entry_point", **options

@@ -1,4 +1,4 @@
-"""Training data: which snippets, in which order, and the range of their actions."""
+"""Training data: choice and order of snippets, range of actions, batches."""
 
 import math
 
@@ -25,7 +25,7 @@ from tests.builders import Drive, make_recording
 
 EAST = Drive(kind=AgentClass.CAR, start=(-50.0, 2.0, 0.0, 10.0))
 WAITING = Drive(kind=AgentClass.CAR, start=(20.0, -2.0, 0.0, 0.0), appears_s=0.4)
-"""Stands all the time, but is not there from the first frame: not parked."""
+"""Stands all the time, but is absent in the first frame, so it is not parked."""
 
 SMALL = make_picture_view("chauffeurnet", pixels=(36, 24))
 
@@ -36,18 +36,18 @@ SMALL = make_picture_view("chauffeurnet", pixels=(36, 24))
     seed=st.integers(0, 3),
     epochs=st.integers(1, 4),
 )
-def test_epochs_walk_through_whole_shuffles(
+def test_epochs_are_stretches_of_whole_shuffles(
     count: int, per_epoch: int, seed: int, epochs: int
 ) -> None:
-    """Epochs laid end to end show every snippet once before any is shown again."""
+    """Consecutive epochs contain every snippet once before any is repeated."""
     rows = np.concatenate(
         [epoch_rows(count, per_epoch=per_epoch, epoch=epoch, seed=seed) for epoch in range(epochs)]
     )
     assert len(rows) == per_epoch * epochs
-    whole = len(rows) // count * count
-    for shuffle in rows[:whole].reshape(-1, count):
+    complete = len(rows) // count * count
+    for shuffle in rows[:complete].reshape(-1, count):
         assert sorted(shuffle) == list(range(count))
-    assert len(set(rows[whole:])) == len(rows) - whole
+    assert len(set(rows[complete:])) == len(rows) - complete
 
 
 def test_epochs_differ_in_order() -> None:
@@ -60,28 +60,28 @@ def test_epochs_differ_in_order() -> None:
     assert first.tolist() != other.tolist()
 
 
-def test_standing_targets_are_held_back() -> None:
-    """Of as many standing as moving targets, a share of 0.2 keeps one for every four that move."""
+def test_share_of_standing_targets_is_limited() -> None:
+    """A share of 0.2 leaves one standing target for every four that move."""
     recordings = [make_recording(drives=(EAST, WAITING), duration_s=16.0)]
     index = index_snippets(recordings, dt_s=0.2, horizon_s=3.0)
     is_moving = moving_snippets(recordings, index)
-    going = int(is_moving.sum())
-    assert going == np.sum(index.track == 0)
-    kept = choose_snippets(recordings, index, standing_share=0.2, max_snippets=None, seed=0)
-    assert np.sum(kept.track == 0) == going
-    assert np.sum(kept.track == 1) == going // 4
+    num_moving = int(is_moving.sum())
+    assert num_moving == np.sum(index.track == 0)
+    chosen = choose_snippets(recordings, index, standing_share=0.2, max_snippets=None, seed=0)
+    assert np.sum(chosen.track == 0) == num_moving
+    assert np.sum(chosen.track == 1) == num_moving // 4
     every = choose_snippets(recordings, index, standing_share=1.0, max_snippets=None, seed=0)
     assert len(every) == len(index)
 
 
-def test_traffic_that_never_moves_is_refused() -> None:
-    """With a share of 0.5 for standing ones and none that moves, nothing would be left."""
+def test_traffic_without_moving_targets_is_refused() -> None:
+    """With a share of 0.5 for standing targets and no moving ones, no snippet is left."""
     recordings = [make_recording(drives=(EAST, WAITING), duration_s=16.0)]
     index = index_snippets(recordings, dt_s=0.2, horizon_s=3.0)
     index = index.select(index.track == 1)
     assert len(index) > 0
     with pytest.raises(
-        AspEnvError, match=rf"none of the {len(index)} snippets .* 0\.5 at"
+        AspEnvError, match=rf"none of the {len(index)} training snippets .* at most 0\.5"
     ) as caught:
         choose_snippets(recordings, index, standing_share=0.5, max_snippets=None, seed=0)
     assert "\n" not in str(caught.value)
@@ -89,21 +89,21 @@ def test_traffic_that_never_moves_is_refused() -> None:
     assert len(every) == len(index)
 
 
-def test_max_snippets_keeps_a_random_few_in_order() -> None:
-    """Five of all, the same five for the same seed, still ordered by time."""
+def test_max_snippets_are_random_and_in_order() -> None:
+    """Five snippets, equal for equal seeds, ordered by time."""
     recordings = [make_recording(duration_s=16.0)]
     index = index_snippets(recordings, dt_s=0.2, horizon_s=3.0)
-    kept, again = (
+    chosen, again = (
         choose_snippets(recordings, index, standing_share=1.0, max_snippets=5, seed=3)
         for _ in range(2)
     )
-    assert len(kept) == 5
-    assert kept.tick.tolist() == again.tick.tolist()
-    assert kept.tick.tolist() == sorted(kept.tick.tolist())
+    assert len(chosen) == 5
+    assert chosen.tick.tolist() == again.tick.tolist()
+    assert chosen.tick.tolist() == sorted(chosen.tick.tolist())
 
 
 def test_action_range_is_that_of_the_futures() -> None:
-    """A car that brakes at 2 m/s² and steers 0.2 rad: the range is (2, 0.2)."""
+    """A car that brakes at 2 m/s² and steers 0.2 rad has the range (2, 0.2)."""
     braking = Drive(kind=AgentClass.CAR, start=(0.0, 0.0, 0.0, 25.0), phases=((60.0, -2.0, 0.2),))
     recordings = [make_recording(drives=(braking,), duration_s=8.0)]
     index = index_snippets(recordings, dt_s=0.2, horizon_s=3.0)
@@ -113,8 +113,10 @@ def test_action_range_is_that_of_the_futures() -> None:
 
 
 @pytest.mark.parametrize("count", [1, 2, 3, 70, 131])
-def test_action_range_is_the_percentile_of_all(count: int, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Read in chunks of 7 or at once by NumPy: the same to the last bit."""
+def test_action_range_is_the_percentile_of_all_actions(
+    count: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """In chunks of 7 and by NumPy at once: equal bit for bit."""
     weaving = Drive(
         kind=AgentClass.CAR,
         start=(0.0, 0.0, 0.0, 12.0),
@@ -134,7 +136,7 @@ def test_action_range_is_the_percentile_of_all(count: int, monkeypatch: pytest.M
 
 
 def test_action_range_stays_within_limits() -> None:
-    """Standing still gives the least range, braking at 9 m/s² no more than 5."""
+    """Standing still has the lowest range; braking at 9 m/s² has the limit of 5 m/s²."""
     wild = Drive(kind=AgentClass.CAR, start=(0.0, 0.0, 0.0, 30.0), phases=((9.0, -9.0, 0.0),))
     for drive, expected in ((WAITING, (0.5, 0.05)), (wild, (5.0, 0.05))):
         recordings = [make_recording(drives=(drive,), duration_s=8.0)]
@@ -143,24 +145,24 @@ def test_action_range_stays_within_limits() -> None:
 
 
 def test_batches_hold_every_snippet_in_order() -> None:
-    """Batches of four of ten snippets: 4, 4, 2, equal to what is drawn directly."""
+    """Ten snippets in batches of 4, 4 and 2, with the observations drawn at once."""
     recordings = [make_recording()]
     index = index_snippets(recordings, dt_s=0.2, horizon_s=3.0)
     chosen = index.select(np.array([9, 3, 50, 41, 7, 60, 2, 1, 80, 30]))
     batches = Batches(recordings, chosen, view=SMALL, batch_size=4)
     assert len(batches) == 3
-    found = list(batches)
-    assert [len(batch.actions) for batch, _ in found] == [4, 4, 2]
+    samples = list(batches)
+    assert [len(batch.actions) for batch, _ in samples] == [4, 4, 2]
     scene = gather_scene(recordings, chosen)
-    packed = np.concatenate([np.asarray(batch.seen) for batch, _ in found])
+    packed = np.concatenate([np.asarray(batch.observation) for batch, _ in samples])
     np.testing.assert_array_equal(packed, pack_bits(SMALL.draw(scene)))
-    actions = np.concatenate([batch.actions.numpy() for batch, _ in found])
-    at = (scene.targets[:, 0], scene.targets[:, 1])
-    np.testing.assert_array_equal(actions, scene.actions[at])
+    actions = np.concatenate([batch.actions.numpy() for batch, _ in samples])
+    index = (scene.targets[:, 0], scene.targets[:, 1])
+    np.testing.assert_array_equal(actions, scene.actions[index])
 
 
-def test_labels_are_seen_from_the_target() -> None:
-    """A car that heads south at 10 m/s is 30 m straight ahead of itself after 3 s."""
+def test_labels_are_in_the_frame_of_the_target() -> None:
+    """A car that heads south at 10 m/s is at (30, 0) after 3 s."""
     south = Drive(kind=AgentClass.CAR, start=(5.0, 60.0, -math.pi / 2, 10.0))
     recordings = [make_recording(drives=(south,), duration_s=8.0)]
     index = index_snippets(recordings, dt_s=0.2, horizon_s=3.0)
@@ -169,8 +171,8 @@ def test_labels_are_seen_from_the_target() -> None:
     assert gather_future(recordings, index).valid.all()
 
 
-def test_fault_while_drawing_reaches_the_reader() -> None:
-    """What goes wrong in the drawing thread is raised where batches are asked for."""
+def test_error_in_the_loading_thread_is_raised() -> None:
+    """The error is raised where batches are read."""
     recordings = [make_recording()]
     index = index_snippets(recordings, dt_s=0.2, horizon_s=3.0, history_s=1.0)
     with pytest.raises(ValueError, match="needs 15 past ticks"):

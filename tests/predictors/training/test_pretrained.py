@@ -1,4 +1,4 @@
-"""Runs that start from other runs: which weights they take, and what is refused."""
+"""Runs that start from other weights: which ones are loaded, and what is refused."""
 
 import json
 from pathlib import Path
@@ -11,7 +11,7 @@ from safetensors.torch import load_file, save_file
 from asp_env import registry
 from asp_env.errors import CheckpointError
 from asp_env.views import make_view
-from predictors.models.network import LearnedPlug
+from predictors.inference.checkpoint import PredictorSpec
 from predictors.training.pretrained import PretrainedWeights
 from tests.predictors.tiny import (
     PIXELS,
@@ -24,65 +24,65 @@ from tests.predictors.tiny import (
 )
 
 
-def plug(predictor: str) -> LearnedPlug:
-    """What is registered under a name."""
+def spec_of(predictor: str) -> PredictorSpec:
+    """The registered specification."""
     return registry.find("predictors", predictor)
 
 
 def read(
     run: Path, predictor: str, view: str = "chauffeurnet", dt_s: float = 0.2
 ) -> PretrainedWeights:
-    """The start for a run of a predictor on a view."""
+    """The weights for a run of a predictor on a view."""
     drawn = make_view(view, pixels=pixels_of(view))
-    return PretrainedWeights.read(run, plug(predictor), view=drawn, dt_s=dt_s)
+    return PretrainedWeights.read(run, spec_of(predictor), view=drawn, dt_s=dt_s)
 
 
-KEEPS: dict[str, set[str]] = {
+NOT_LOADED: dict[str, set[str]] = {
     "ssp-asp": set(),
     "ffw-asp": {"head.layers.0.weight", "head.layers.0.bias"},
     "dkm": {"head.layers.2.weight", "head.layers.2.bias"},
     "mtp": {"head.layers.2.weight", "head.layers.2.bias"},
 }
-"""What a network for 6 s does not take from one for 3 s."""
+"""Weights that a network for 6 s does not load from one for 3 s."""
 
 
 @pytest.mark.parametrize("view", ["chauffeurnet", "vectors"])
-@pytest.mark.parametrize("predictor", KEEPS)
-def test_6_s_take_what_fits_of_3_s(predictor: str, view: str, tmp_path: Path) -> None:
-    """SSP-ASP takes all, the others all but their output, whose size is that of the horizon."""
+@pytest.mark.parametrize("predictor", NOT_LOADED)
+def test_network_for_6_s_loads_what_fits_of_3_s(predictor: str, view: str, tmp_path: Path) -> None:
+    """SSP-ASP loads all weights, the others all but the output, whose size is the horizon's."""
     run = save_random(tmp_path / "3s", predictor, view, seed=1)
     start = read(run, predictor, view)
     assert start.action_range == RANGE
     network = make_network(predictor, tiny_network(predictor, view), tiny_shape(view, 30))
     before = {name: value.clone() for name, value in network.state_dict().items()}
-    assert set(start.apply(network)) == KEEPS[predictor]
+    assert set(start.apply(network)) == NOT_LOADED[predictor]
     weights = load_file(run / "weights.safetensors")
     for name, value in network.state_dict().items():
-        expected = before[name] if name in KEEPS[predictor] else weights[name]
+        expected = before[name] if name in NOT_LOADED[predictor] else weights[name]
         assert torch.equal(value, expected), name
 
 
-def test_followers_start_where_their_leaders_do(tmp_path: Path) -> None:
-    """A run with a second encoder from one without: that starts as a copy of the first."""
+def test_second_encoder_starts_as_a_copy_of_the_first(tmp_path: Path) -> None:
+    """A run with a second encoder starts from a run without one."""
     run = save_random(tmp_path / "3s", "ssp-asp", "vectors", seed=1)
     config = tiny_network("ssp-asp", "vectors", ema=0.9)
     network = make_network("ssp-asp", config, tiny_shape("vectors", 30))
     read(run, "ssp-asp", "vectors").apply(network)
-    found = network.state_dict()
-    pairs = [(n, n.removeprefix("target_")) for n in found if n.startswith("target_encoder.")]
+    state = network.state_dict()
+    pairs = [(n, n.removeprefix("target_")) for n in state if n.startswith("target_encoder.")]
     assert pairs
-    for follower, leader in pairs:
-        assert torch.equal(found[follower], found[leader])
+    for second, first in pairs:
+        assert torch.equal(state[second], state[first])
 
 
 def change(run: Path, **fields: Any) -> None:
-    """Other values for some fields of a run's configuration."""
+    """Changes fields of a run's configuration."""
     path = run / "config.json"
     path.write_text(json.dumps({**json.loads(path.read_text()), **fields}))
 
 
-def test_start_of_another_kind_is_one_line(tmp_path: Path) -> None:
-    """Another predictor, view, encoder or time step; without a trail is another view as well."""
+def test_weights_of_another_kind_are_refused(tmp_path: Path) -> None:
+    """Another predictor, view (also one without a trail), encoder or time step."""
     run = save_random(tmp_path / "run", "ffw-asp")
     refusals = {
         "the predictor 'ffw-asp', which 'dkm' cannot": (
@@ -104,13 +104,13 @@ def test_start_of_another_kind_is_one_line(tmp_path: Path) -> None:
     assert "\n" not in str(caught.value)
 
 
-def test_damaged_starts_are_one_line(tmp_path: Path) -> None:
-    """No run, no normaliser, weights cut short: what is wrong, and nothing is loaded."""
+def test_damaged_runs_are_refused(tmp_path: Path) -> None:
+    """A missing run, no normaliser, truncated weights."""
     with pytest.raises(CheckpointError, match="holds no trained predictor"):
         read(tmp_path / "nothing", "dkm")
     run = save_random(tmp_path / "run", "dkm")
     change(run, normaliser={})
-    with pytest.raises(CheckpointError, match="does not say its normaliser"):
+    with pytest.raises(CheckpointError, match="does not name its normaliser"):
         read(run, "dkm")
     weights = run / "weights.safetensors"
     weights.write_bytes(weights.read_bytes()[:1000])
@@ -118,8 +118,8 @@ def test_damaged_starts_are_one_line(tmp_path: Path) -> None:
         read(run, "dkm")
 
 
-def test_file_of_resnet_weights_is_a_start_for_resnets(tmp_path: Path) -> None:
-    """It has no normaliser, and starts the encoder of any predictor that has a ResNet18."""
+def test_resnet_weights_are_loaded_into_any_resnet(tmp_path: Path) -> None:
+    """The file has no normaliser and fits the encoder of any predictor with a ResNet18."""
     source = make_network("dkm", tiny_network("dkm", encoder="resnet18"), tiny_shape(), seed=1)
     body = source.get_submodule("encoder.body").state_dict()
     path = tmp_path / "resnet18.safetensors"
@@ -134,9 +134,9 @@ def test_file_of_resnet_weights_is_a_start_for_resnets(tmp_path: Path) -> None:
         start.apply(make_network("ffw-asp", tiny_network("ffw-asp"), tiny_shape()))
 
 
-def test_pictures_of_another_size_are_another_view(tmp_path: Path) -> None:
-    """ResNet18 reads pictures of any size, but they show the world at another scale."""
+def test_rasters_of_another_size_are_another_view(tmp_path: Path) -> None:
+    """ResNet18 reads rasters of any size, but their scale differs."""
     run = save_random(tmp_path / "run", "dkm")
     drawn = make_view("chauffeurnet", pixels=(2 * PIXELS[0], 2 * PIXELS[1]))
     with pytest.raises(CheckpointError, match="another view"):
-        PretrainedWeights.read(run, plug("dkm"), view=drawn, dt_s=0.2)
+        PretrainedWeights.read(run, spec_of("dkm"), view=drawn, dt_s=0.2)

@@ -1,0 +1,148 @@
+"""What all file layouts share: the search for files, agent classes, and the table of tracks."""
+
+import os
+import re
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+from jaxtyping import Bool, Float, Int
+
+from asp_env.data.classes import parse_class
+from asp_env.data.readers.tables import find_line
+from asp_env.errors import DataError
+from asp_env.geometry import wrap_angle
+
+MAP_SUFFIXES = (".osm", ".osm_xy")
+"""Suffixes of map files, in order of preference: in degrees, in local metres."""
+
+COURSE_ABOVE_MPS = 0.3
+"""Speed above which the direction of motion is the heading of a vulnerable road user. Chosen by
+hand: slower motion is mostly jitter of the tracker."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class TrackTable:
+    """The columns of a `Recording` that come from its tracks, and a list of repairs."""
+
+    track_ids: Int[np.ndarray, " tracks"]
+    classes: Int[np.ndarray, " tracks"]
+    """`AgentClass` of each track."""
+    sizes: Float[np.ndarray, "tracks 2"]
+    """Length and width, metres."""
+    first_frames: Int[np.ndarray, " tracks"]
+    starts: Int[np.ndarray, " tracks+1"]
+    """Track i has the rows `starts[i]:starts[i + 1]`."""
+    states: Float[np.ndarray, "rows 4"]
+    """[x m, y m, heading rad, speed m/s signed along the heading]."""
+    repairs: tuple[str, ...]
+    """One line for each kind of repair."""
+
+
+def walk(root: Path) -> list[tuple[Path, list[str]]]:
+    """Every folder in and below `root` with the names of its files.
+
+    Hidden folders are skipped; links are followed, but no folder is visited twice.
+    """
+    visited: set[str] = set()
+    found = []
+    for folder, folders, names in os.walk(root, followlinks=True):
+        real = os.path.realpath(folder)
+        if real in visited:
+            folders.clear()
+            continue
+        visited.add(real)
+        folders[:] = sorted(name for name in folders if not name.startswith("."))
+        found.append((Path(folder), sorted(names)))
+    return found
+
+
+def with_parents(folder: Path, top: Path) -> list[Path]:
+    """A folder and its parents up to and including `top`, nearest first."""
+    found = [folder]
+    while folder != top and folder.is_relative_to(top):
+        folder = folder.parent
+        found.append(folder)
+    return found
+
+
+def find_maps(folder: Path, maps_by_folder: dict[Path, list[Path]]) -> list[Path]:
+    """The map files in and below a folder, sorted by path.
+
+    Args:
+        folder: where to search.
+        maps_by_folder: results of earlier searches. The result is added.
+    """
+    if folder not in maps_by_folder:
+        paths = (place / name for place, names in walk(folder) for name in names)
+        maps_by_folder[folder] = sorted(path for path in paths if path.suffix in MAP_SUFFIXES)
+    return maps_by_folder[folder]
+
+
+def natural_key(name: str) -> list[tuple[int, int, str]]:
+    """A sort key that orders numbers in names by value: `9` before `10`."""
+    parts = re.split(r"(\d+)", name)
+    return [(1, int(part), "") if part.isdigit() else (0, 0, part) for part in parts]
+
+
+def shorten(names: list[str], limit: int = 5) -> str:
+    """The first few items of a list, and how many more there are."""
+    more = f" and {len(names) - limit} more" if len(names) > limit else ""
+    return ", ".join(names[:limit]) + more
+
+
+def classes_of(path: Path, column: str, names: np.ndarray) -> Int[np.ndarray, " rows"]:
+    """`AgentClass` of each row.
+
+    Args:
+        path: the file that the names are from, for error messages.
+        column: the name of their column.
+        names: (rows,) class names as the file has them.
+
+    Raises:
+        DataError: a name is unknown.
+    """
+    codes, known = pd.factorize(names)
+    numbers = []
+    for name in known:
+        try:
+            numbers.append(int(parse_class(str(name))))
+        except DataError as error:
+            line = find_line(path, {column: str(name)})
+            raise DataError(f"{path}, line {line}: {error}") from None
+    return np.array(numbers, dtype=np.int8)[codes]
+
+
+def states_of(
+    measured: Float[np.ndarray, "rows 5"],
+    first_row: Int[np.ndarray, " rows"],
+    vulnerable: Bool[np.ndarray, " rows"],
+) -> Float[np.ndarray, "rows 4"]:
+    """Converts measured rows to states.
+
+    The heading of a vulnerable road user is its latest direction of motion, of the past alone. The
+    speed of a vehicle has the sign of its motion along the heading.
+
+    Args:
+        measured: x m, y m, heading in degrees, velocity along x and y in m/s.
+        first_row: index of the first row of each row's track.
+        vulnerable: mask of the rows of vulnerable road users.
+
+    Returns:
+        States [x m, y m, heading rad, speed m/s].
+    """
+    heading = np.radians(measured[:, 2])
+    velocity_x, velocity_y = measured[:, 3], measured[:, 4]
+    total = np.hypot(velocity_x, velocity_y)
+    moves = vulnerable & (total > COURSE_ABOVE_MPS)
+    row = np.arange(len(measured))
+    last_moving = np.maximum.accumulate(np.where(moves, row, -1))
+    has_course = vulnerable & (last_moving >= first_row)
+    course = np.arctan2(velocity_y, velocity_x)
+    heading = np.where(has_course, course[last_moving], heading)
+    along = velocity_x * np.cos(heading) + velocity_y * np.sin(heading)
+    # The bicycle model's speed is that of the box's centre, which moves sideways in bends.
+    speed = np.where(vulnerable, total, np.copysign(total, along))
+    states = np.stack([measured[:, 0], measured[:, 1], wrap_angle(heading), speed], axis=-1)
+    return states.astype(np.float32)

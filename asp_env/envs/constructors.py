@@ -1,0 +1,123 @@
+"""Constructors of the environments that need packages of the extra `rl`, imported when called."""
+
+from collections.abc import Mapping, Sequence
+from typing import TYPE_CHECKING
+
+from asp_env.data.recording import DEFAULT_DT_S
+from asp_env.data.scenarios.scenario import ScenarioFilter, ScenarioSet
+from asp_env.envs.options import suggest_options
+from asp_env.envs.vector import ReplayVectorEnv
+from asp_env.errors import MissingExtraError
+from asp_env.sim.traffic.assignment import TrafficSpec
+
+if TYPE_CHECKING:
+    from asp_env.envs.parallel import ParallelReplayEnv
+    from asp_env.envs.sb3 import ReplayVecEnv
+
+
+@suggest_options
+def parallel_env(
+    data: str = "sample:intersection",
+    *,
+    classes: Sequence[str] | None = None,
+    ids: Sequence[int] | None = None,
+    max_agents: int | None = None,
+    render_mode: str | None = None,
+    observations: Sequence[str] = ("raster", "actions", "state"),
+    view: str = "chauffeurnet",
+    raster_px: tuple[int, int] | None = None,
+    traffic: TrafficSpec | None = None,
+    dt_s: float = DEFAULT_DT_S,
+    reward_weights: Mapping[str, float] | None = None,
+    scenarios: ScenarioSet | ScenarioFilter | str = "",
+) -> "ParallelReplayEnv":
+    """Makes a PettingZoo parallel environment that controls many vehicles of a recording.
+
+    Args:
+        data: a folder with recordings, or `scheme:argument`.
+        classes: names of the classes of vehicles that are agents, such as `car`; by default all.
+        ids: track ids of the vehicles that are agents; by default all.
+        max_agents: the largest number of agents; those nearest to `vehicle_0` are taken.
+        render_mode: `rgb_array` or None.
+        observations: see `ReplayEnv`, as for the following arguments.
+        view: the view that draws the `raster`.
+        raster_px: height and width of the `raster` in pixels.
+        traffic: the driver of the uncontrolled agents, or a table of drivers.
+        dt_s: length of a tick in seconds.
+        reward_weights: weights of reward terms that differ from the defaults.
+        scenarios: the scenarios to draw from, or a filter.
+
+    Raises:
+        AspEnvError: an argument is invalid, or no scenario fits.
+        MissingExtraError: PettingZoo is not installed.
+    """
+    try:
+        from asp_env.envs.parallel import ParallelReplayEnv
+    except ModuleNotFoundError as error:
+        raise MissingExtraError(str(error.name), "rl", "asp_env.parallel_env") from error
+    return ParallelReplayEnv(
+        data,
+        classes=classes,
+        ids=ids,
+        max_agents=max_agents,
+        render_mode=render_mode,
+        observations=observations,
+        view=view,
+        raster_px=raster_px,
+        traffic=traffic,
+        dt_s=dt_s,
+        reward_weights=reward_weights,
+        scenarios=scenarios,
+    )
+
+
+@suggest_options
+def sb3_vec_env(
+    num_envs: int,
+    data: str = "sample:intersection",
+    *,
+    render_mode: str | None = None,
+    observations: Sequence[str] = ("raster", "actions", "state"),
+    view: str = "chauffeurnet",
+    raster_px: tuple[int, int] | None = None,
+    traffic: TrafficSpec | None = None,
+    dt_s: float = DEFAULT_DT_S,
+    reward_weights: Mapping[str, float] | None = None,
+    scenarios: ScenarioSet | ScenarioFilter | str = "",
+) -> "ReplayVecEnv":
+    """Makes a vector environment for stable-baselines3, batched like `ReplayVectorEnv`.
+
+    Args:
+        num_envs: number of environments.
+        data: a folder with recordings, or `scheme:argument`.
+        render_mode: `rgb_array` or None.
+        observations: see `ReplayEnv`, as for the following arguments.
+        view: the view that draws the `raster`.
+        raster_px: height and width of the `raster` in pixels.
+        traffic: the driver of the uncontrolled agents, or a table of drivers.
+        dt_s: length of a tick in seconds.
+        reward_weights: weights of reward terms that differ from the defaults.
+        scenarios: the scenarios to draw from, or a filter.
+
+    Raises:
+        AspEnvError: an argument is invalid, or the data hold no scenario.
+        MissingExtraError: stable-baselines3 is not installed.
+    """
+    try:
+        from asp_env.envs.sb3 import ReplayVecEnv
+    except ModuleNotFoundError as error:
+        raise MissingExtraError(str(error.name), "rl", "asp_env.sb3_vec_env") from error
+    envs = ReplayVectorEnv(
+        num_envs,
+        data,
+        autoreset_mode="SameStep",
+        render_mode=render_mode,
+        observations=observations,
+        view=view,
+        raster_px=raster_px,
+        traffic=traffic,
+        dt_s=dt_s,
+        reward_weights=reward_weights,
+        scenarios=scenarios,
+    )
+    return ReplayVecEnv(envs)

@@ -1,0 +1,67 @@
+"""The options that all replay environments share, and the error for an unknown one."""
+
+import difflib
+import functools
+import inspect
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any, TypeVar, cast
+
+from asp_env.data.recording import DEFAULT_DT_S
+from asp_env.data.scenarios.scenario import ScenarioFilter, ScenarioSet
+from asp_env.errors import AspEnvError
+from asp_env.sim.traffic.assignment import TrafficSpec
+
+Function = TypeVar("Function", bound=Callable[..., Any])
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class ReplayOptions:
+    """Options of a replay environment.
+
+    The constructors of the environments have each of these fields as a keyword parameter with the
+    same default, so that editors complete them; a test compares the signatures with this class.
+    """
+
+    observations: Sequence[str] = ("raster", "actions", "state")
+    """Components of the observation: some of `raster`, `vectors`, `actions`, `state`, `route` and
+    the names of views that draw pictures."""
+    view: str = "chauffeurnet"
+    """The view that draws the `raster`."""
+    raster_px: tuple[int, int] | None = None
+    """Height and width of the `raster` in pixels; the view's own by default."""
+    traffic: TrafficSpec | None = None
+    """The driver of the uncontrolled agents, or a table of drivers by id and class; by default the
+    world moves them."""
+    dt_s: float = DEFAULT_DT_S
+    """Length of a tick in seconds."""
+    reward_weights: Mapping[str, float] | None = None
+    """Weights of reward terms by name, where they differ from the defaults."""
+    scenarios: ScenarioSet | ScenarioFilter | str = ""
+    """The scenarios to draw from: a set of them, or a filter such as `left,length>=8`."""
+
+
+class UnknownOptionError(AspEnvError, TypeError):
+    """A call with a keyword argument that the function does not have."""
+
+
+def suggest_options(function: Function) -> Function:
+    """Makes a call with an unknown keyword argument fail with the nearest known name.
+
+    Python itself names only the unknown argument. The signature stays that of the function.
+    """
+    known = [name for name in inspect.signature(function).parameters if name != "self"]
+    caller = function.__qualname__.removesuffix(".__init__")
+
+    @functools.wraps(function)
+    def checked(*args: Any, **kwargs: Any) -> Any:
+        for name in kwargs:
+            if name not in known:
+                nearest = difflib.get_close_matches(name, known, n=1)
+                hint = f"did you mean {nearest[0]!r}?" if nearest else f"known: {', '.join(known)}"
+                raise UnknownOptionError(
+                    f"{caller}() got an unexpected keyword argument {name!r}; {hint}"
+                )
+        return function(*args, **kwargs)
+
+    return cast("Function", checked)
