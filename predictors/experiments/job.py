@@ -16,7 +16,7 @@ from asp_env.data.recording import DEFAULT_DT_S, ticks
 from asp_env.data.source import open_data
 from asp_env.errors import AspEnvError
 from predictors.experiments.errors import compute_errors, snippets_to_evaluate, stamp_of
-from predictors.training.train import Train
+from predictors.training.command import Train
 
 FINISHED = "config.json"
 """Every finished run contains this file."""

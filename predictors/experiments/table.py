@@ -31,7 +31,7 @@ from predictors.experiments.cells import (
 from predictors.experiments.job import EvaluationJob, Job
 from predictors.experiments.results import ORACLE
 from predictors.experiments.tables import PAGE_WIDTH, export, read_findings, rows, tables
-from predictors.training.train import Train
+from predictors.training.command import Train
 
 CHAININGS = ("top1", ORACLE)
 """Ways of chaining segments that are evaluated besides a predictor's own."""
