@@ -155,7 +155,7 @@ def test_the_end_of_a_process_leaves_its_neighbour_alone() -> None:
 def test_an_interrupt_ends_running_tasks() -> None:
     """With both processes at tasks of an hour."""
     began = time.monotonic()
-    processes: list[int] = []
+    processes: list[Any] = []
 
     def interrupted() -> None:
         with WorkerPool(operator.call, 2) as pool:

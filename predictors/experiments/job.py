@@ -160,12 +160,11 @@ class Job:
         """
         self.check()
         if self.train is not None and not self.trained:
-            paths = {
-                name: Path(self.train[name])
-                for name in ("out", "start")
-                if self.train.get(name) is not None
-            }
-            Train(**self.train | paths).run()
+            options = dict(self.train)
+            for name in ("out", "start"):
+                if options.get(name) is not None:
+                    options[name] = Path(options[name])
+            Train(**options).run()
         if self.evaluation is not None and not self.evaluation.done:
             self.evaluation.execute()
 

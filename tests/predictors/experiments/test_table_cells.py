@@ -218,10 +218,10 @@ def test_a_killed_cell_is_resumed(
     """A process killed after an epoch fails its cell; the next run starts after that epoch."""
     cell = Cell(site="a", predictor="dkm", horizon_s=3.0, view="vectors", seed=0)
     run = tmp_path / "run"
-    started: list[subprocess.Popen[bytes]] = []
+    started: list[subprocess.Popen[Any]] = []
     popen = subprocess.Popen
 
-    def spy(*args: Any, **kwargs: Any) -> subprocess.Popen[bytes]:
+    def spy(*args: Any, **kwargs: Any) -> subprocess.Popen[Any]:
         started.append(popen(*args, **kwargs))
         return started[-1]
 
