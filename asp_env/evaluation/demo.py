@@ -50,9 +50,9 @@ LEAD = (
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Demo:
-    """Show the whole workflow: make traffic, train, evaluate forecasts, drive, write a report.
+    """Show the whole workflow: synthesize, train, evaluate, drive, write a report.
 
-    After an interruption, the same command continues behind the last finished step.
+    After an interruption, the same command resumes at the unfinished step.
     """
 
     out: Path = Path("demo")

@@ -99,7 +99,7 @@ class Findings:
 
 @dataclass(frozen=True, kw_only=True)
 class Inspect:
-    """Show recordings, maps, counts of snippets and scenarios, drift, and all faults of DATA."""
+    """Show the recordings, maps, snippets, scenarios and faults of DATA."""
 
     data: Annotated[tyro.conf.Positional[str], tyro.conf.arg(metavar="DATA")]
     """Folder in the inD/rounD or INTERACTION layout, sample:SITE or synthetic:SITE."""

@@ -41,10 +41,11 @@ PLAN, LOCK = "plan.json", ".lock"
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Table:
-    """Train and evaluate the predictors of the paper's table. The same command resumes.
+    """Train and evaluate the predictors of the paper's table; repeat to resume.
 
-    Predictors, views, seeds, horizons and ablations can be added to a folder later; finished runs
-    are not repeated. Every cell with a seed is a run of asp-env train, in OUT/runs.
+    Predictors, views, seeds, horizons and ablations can be added to OUT later.
+
+    Every cell with a seed is a run of asp-env train, in OUT/runs.
     """
 
     data: Annotated[tyro.conf.Positional[tuple[str, ...]], tyro.conf.arg(metavar="DATA …")]
@@ -66,13 +67,13 @@ class Table:
     seeds: tuple[int, ...] = (0, 1, 2)
     """Training seeds."""
     ablations: tuple[str, ...] = ("none",)
-    """Variants of the recipes at the first site: none, all, or names such as no-trail or
-    ssp-asp:skip."""
+    """Variants of the recipes at the first site: none, all, or
+    names such as no-trail or ssp-asp:skip."""
     ablation_view: str = "chauffeurnet"
     """View of the ablations."""
     jobs: int = 2
-    """Number of cells that run at a time, with one thread each. 0 prints the finished ones, also
-    while another command runs."""
+    """Number of cells that run at a time, with one thread each.
+    0 prints the finished ones, even while another command runs."""
     per_recording: int | None = None
     """Largest number of test snippets of each recording; they are chosen at random."""
     epochs: int | None = None

@@ -62,12 +62,12 @@ class Drive:
     )
     """Predictors by name; trained ones with their run folder. Each is compared."""
     traffic: str | None = None
-    """Driver of all other agents, such as log, log-actions, idm, hybrid or predictor:NAME, or a
-    table such as default=idm,truck=log,17=predictor:constant-velocity. The default is log for
-    recordings and own for highway:…."""
+    """Driver of all other agents: log, log-actions, idm, hybrid,
+    predictor:NAME, or a table such as default=idm,truck=log.
+    The default is log for recordings and own for highway:…."""
     scenarios: Annotated[str, tyro.conf.arg(metavar="FILTER|FILE")] = ""
-    """Scenarios: tags and comparisons, such as 'left,!stopping,length>=8', or the scenarios.json
-    of another run. The default is all."""
+    """Tags and comparisons, such as 'left,!stopping,length>=8',
+    or the scenarios.json of another run. The default is all."""
     max_scenarios: int | None = None
     """Largest number of scenarios; evenly spaced ones are chosen."""
     horizon: float = 3.0

@@ -68,11 +68,12 @@ class Evaluate:
     part: PartChoice = "auto"
     """Part of DATA; auto is all that no predictor was trained or selected on."""
     history: Literal["recorded", "causal"] = "recorded"
-    """Histories that predictors observe: as recorded, which were smoothed with later frames, or
-    filtered again without later frames. The ground truth is always as recorded."""
+    """Histories that predictors observe: as recorded (smoothed
+    with later frames), or filtered again without later frames.
+    The ground truth is always as recorded."""
     best_by: ModeRule = "fde"
-    """How the best of 3 modes is chosen: lowest final error, lowest mean error, or the rule of the
-    paper."""
+    """How the best of 3 modes is chosen: lowest final error,
+    lowest mean error, or the rule of the paper."""
 
     def run(self) -> None:
         """Evaluates, writes the folder and prints the tables.
