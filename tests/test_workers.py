@@ -1,35 +1,29 @@
-"""Processes that work side by side, and how they end."""
+"""Worker processes: what tasks return, how errors arrive, and how the processes end."""
 
 import operator
 import os
 import signal
 import subprocess
+import sys
 import time
 from collections.abc import Callable
 from functools import partial
-from multiprocessing.connection import Connection
 from pathlib import Path
-from socket import socketpair
-from threading import Event
 from typing import Any
 
 import pytest
 
 from asp_env.data.source import open_data
-from asp_env.errors import AspEnvError
-from asp_env.workers import ABANDONED, start, worker_pool
+from asp_env.errors import AspEnvError, DataError, MissingExtraError
+from asp_env.workers import WorkerExitError, WorkerPool
 
 
-def done(processes: int, tasks: list[Callable[[], Any]]) -> dict[int, Any]:
-    """Results by the tasks' numbers, of which each comes once."""
-    with worker_pool(processes) as crew:
-        found = list(crew.do(operator.call, tasks))
-    assert len(found) == len(tasks)
-    return dict(found)
+def results(processes: int, tasks: list[Callable[[], Any]]) -> list[Any]:
+    with WorkerPool(operator.call, processes) as pool:
+        return list(pool.map(tasks))
 
 
-def is_there(process: int) -> bool:
-    """Whether a process exists."""
+def exists(process: int) -> bool:
     try:
         os.kill(process, 0)
     except ProcessLookupError:
@@ -37,126 +31,188 @@ def is_there(process: int) -> bool:
     return True
 
 
-class Elsewhere:
-    """A task of another process. Here it waits until one like it is on its way there."""
-
-    def __init__(self, sent: Event, what: Callable[..., Any], *about: Any) -> None:
-        """The task is `what(*about)`."""
-        self._sent, self._what, self._about = sent, what, about
-
-    def __reduce__(self) -> tuple[Any, ...]:
-        """The task itself."""
-        self._sent.set()
-        return partial, (self._what, *self._about)
-
-    def __call__(self) -> None:
-        """Nothing else."""
-        assert self._sent.wait(60)
-
-
 @pytest.mark.parametrize("processes", [1, 2])
-def test_every_task_is_done_once(processes: int) -> None:
-    """Five tasks, more than there are processes."""
-    assert done(processes, [partial(pow, 3, n) for n in range(5)]) == {
-        0: 1, 1: 3, 2: 9, 3: 27, 4: 81
-    }  # fmt: skip
+def test_results_are_in_the_order_of_the_tasks(processes: int) -> None:
+    """The first of five tasks takes the longest."""
+    slow = partial(time.sleep, 0.5)
+    assert results(processes, [slow, *(partial(pow, 3, n) for n in range(4))]) == [
+        None,
+        1,
+        3,
+        9,
+        27,
+    ]
 
 
-def test_who_works() -> None:
-    """One process is this one; of two, this one and another, which is gone afterwards."""
-    assert done(1, [os.getpid]) == {0: os.getpid()}
-    sent = Event()
-    here, there = sorted(done(2, [Elsewhere(sent, os.getpid)] * 2).values(), key=bool)
-    assert here is None
-    assert there != os.getpid()
-    assert not is_there(there)
+def test_tasks_run_in_other_processes_that_are_gone_afterwards() -> None:
+    processes = set(results(2, [partial(_slowly, os.getpid)] * 4))
+    assert len(processes) == 2
+    assert os.getpid() not in processes
+    assert not any(exists(process) for process in processes)
 
 
-def test_whoever_is_ready_goes_on(tmp_path: Path) -> None:
-    """While one process waits for the last task to be done, the other does all the rest."""
+def _slowly(function: Callable[[], Any]) -> Any:
+    time.sleep(0.3)
+    return function()
+
+
+def test_an_idle_process_takes_the_next_task(tmp_path: Path) -> None:
+    """While one process waits for the last task, the other one does all the rest."""
     sign = tmp_path / "done"
     wait = ["sh", "-c", 'until [ -e "$0" ]; do sleep 0.05; done', str(sign)]
     tasks = [partial(subprocess.run, wait, timeout=60), *[os.getpid] * 3, partial(sign.touch)]
-    found = done(2, tasks)
-    assert len({found[n] for n in (1, 2, 3)}) == 1
+    assert len(set(results(2, tasks)[1:4])) == 1
 
 
-@pytest.mark.parametrize("where", ["here", "elsewhere"])
-def test_bad_input_is_told_as_if_it_were_here(where: str, tmp_path: Path) -> None:
-    """The same line; of the system's errors, the same file."""
-
-    def failing(*task: Any) -> None:
-        if where == "here":
-            done(1, [partial(*task)])
-        else:
-            done(2, [Elsewhere(Event(), *task)] * 2)
-
+def test_errors_arrive_as_they_were_raised(tmp_path: Path) -> None:
+    """The same type and message; of the system's errors, the same file."""
     with pytest.raises(AspEnvError, match="nowhere does not exist; expected a folder"):
-        failing(open_data, str(tmp_path / "nowhere"))
+        results(1, [partial(open_data, str(tmp_path / "nowhere"))])
     with pytest.raises(FileNotFoundError) as caught:
-        failing(os.stat, "nowhere")
+        results(1, [partial(os.stat, "nowhere")])
     assert caught.value.filename == "nowhere"
+    with pytest.raises(DataError, match="broken"):
+        results(1, [partial(_fail, DataError("broken"))])
 
 
-def test_work_that_cannot_be_copied_is_told_too(tmp_path: Path) -> None:
-    """Data that are gone before another process opens them."""
-    sent = Event()
+def _fail(error: Exception) -> None:
+    raise error
 
-    class Work:
-        def __reduce__(self) -> tuple[Any, ...]:
-            sent.set()
-            return open_data, (str(tmp_path / "nowhere"),)
 
-        def __call__(self, task: object) -> object:
-            assert sent.wait(60)
-            return task
+def _fail_with_missing_extra() -> None:
+    raise MissingExtraError("torch", "train", "training")
 
-    with pytest.raises(AspEnvError, match="nowhere does not exist"), worker_pool(2) as crew:
-        list(crew.do(Work(), [1, 2]))
+
+def test_errors_that_cannot_be_unpickled_keep_their_message() -> None:
+    with pytest.raises(AspEnvError, match="training needs the package 'torch'"):
+        results(1, [_fail_with_missing_extra])
+
+
+def test_other_exceptions_carry_the_traceback_of_the_process() -> None:
+    with pytest.raises(ZeroDivisionError) as caught:
+        results(1, [partial(operator.truediv, 1, 0)])
+    assert "In a worker process:\nTraceback" in caught.value.__notes__[0]
+
+
+def test_a_process_goes_on_after_an_error() -> None:
+    with WorkerPool(operator.call, 1) as pool:
+        first, second = pool.submit(partial(os.stat, "nowhere")), pool.submit(os.getpid)
+        assert isinstance(first.exception(), FileNotFoundError)
+        assert second.result() != os.getpid()
+
+
+class Unloadable:
+    """Work that opens data which do not exist when a process unpickles it."""
+
+    def __init__(self, folder: Path) -> None:
+        self._folder = folder
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        return open_data, (str(self._folder),)
+
+    def __call__(self, task: object) -> object:
+        return task
+
+
+def test_errors_of_unpickling_the_work_arrive(tmp_path: Path) -> None:
+    with (
+        pytest.raises(AspEnvError, match="nowhere does not exist"),
+        WorkerPool(Unloadable(tmp_path / "nowhere"), 2) as pool,
+    ):
+        list(pool.map([1, 2, 3]))
+
+
+def test_the_initializer_runs_once_in_every_process(tmp_path: Path) -> None:
+    initializer = partial(os.chdir, tmp_path)
+    with WorkerPool(operator.call, 1, initializer=initializer) as pool:
+        assert list(pool.map([os.getcwd] * 2)) == [str(tmp_path)] * 2
 
 
 @pytest.mark.parametrize(
-    ("task", "how"),
+    ("task", "status", "message"),
     [
-        ((signal.raise_signal, signal.SIGKILL), "was killed by signal 9; if memory ran out"),
-        ((os._exit, 7), "ended with exit status 7"),
+        (partial(signal.raise_signal, signal.SIGKILL), -9, "was killed by signal 9; if memory ran"),
+        (partial(os._exit, 7), 7, "ended with exit status 7"),
     ],
     ids=["killed", "ended"],
 )
-def test_a_process_that_ends_is_told(task: tuple[Callable[..., Any], int], how: str) -> None:
-    """One line instead of waiting for ever."""
-    with pytest.raises(AspEnvError, match=how):
-        done(2, [Elsewhere(Event(), *task)] * 2)
+def test_the_end_of_a_process_is_an_error(
+    task: Callable[[], Any], status: int, message: str
+) -> None:
+    with pytest.raises(WorkerExitError, match=message) as caught:
+        results(2, [task] * 2)
+    assert caught.value.status == status
 
 
-def test_nobody_is_left_behind() -> None:
-    """Interrupted, with a process at a task of an hour."""
-    began, sent = time.monotonic(), Event()
-    short, long = Elsewhere(sent, os.getpid), Elsewhere(sent, time.sleep, 3600.0)
-    found: list[int] = []
+def test_the_end_of_a_process_leaves_its_neighbour_alone() -> None:
+    with WorkerPool(operator.call, 2) as pool:
+        killed = pool.submit(partial(signal.raise_signal, signal.SIGKILL))
+        slow = pool.submit(partial(_slowly, os.getpid))
+        assert isinstance(killed.exception(), WorkerExitError)
+        assert slow.result() != os.getpid()
+
+
+def test_an_interrupt_ends_running_tasks() -> None:
+    """With both processes at tasks of an hour."""
+    began = time.monotonic()
+    processes: list[Any] = []
 
     def interrupted() -> None:
-        with worker_pool(2) as crew:
-            for _, process in crew.do(operator.call, [short, short, long, long]):
-                if process is not None:
-                    found.append(process)
-                    raise KeyboardInterrupt
+        with WorkerPool(operator.call, 2) as pool:
+            for process in pool.map([os.getpid, *[partial(time.sleep, 3600.0)] * 3]):
+                processes.append(process)
+                raise KeyboardInterrupt
 
     with pytest.raises(KeyboardInterrupt):
         interrupted()
     assert time.monotonic() - began < 60
-    assert not is_there(*found)
+    assert len(processes) == 1
+    assert not exists(*processes)
 
 
-def test_a_process_ends_with_whoever_started_it() -> None:
-    """In the midst of a task of an hour."""
-    ours, theirs = socketpair()
-    with Connection(ours.detach()) as link, theirs:
-        number = theirs.fileno()
-        process = start("asp_env.workers", str(number), pass_fds=(number,))
-        for what in (operator.call, os.getpid, partial(time.sleep, 3600.0)):
-            link.send(what)
-        assert link.recv() == (None, process.pid)
-        assert process.stdin is not None
-        process.stdin.close()
-        assert process.wait(timeout=60) == ABANDONED
+def test_output_environment_and_cost_of_a_process(tmp_path: Path) -> None:
+    """Both streams go to the file, also what is buffered; CPU time counts once it has ended."""
+    path = tmp_path / "log.txt"
+    with path.open("wb") as output:
+        env = {**os.environ, "ASP_ENV_TEST": "word"}
+        pool = WorkerPool(operator.call, 1, output=output, env=env)
+    with pool:
+        pool.submit(partial(os.system, "echo $ASP_ENV_TEST >&2")).result()
+        pool.submit(partial(print, "buffered")).result()
+        assert pool.cpu_s == 0.0
+    assert sorted(path.read_text().split()) == ["buffered", "word"]
+    assert pool.cpu_s > 0.01
+
+
+SCRIPT = """
+import operator, os, signal, sys, time
+from functools import partial
+from asp_env.workers import WorkerPool
+
+pool = WorkerPool(operator.call, 2)
+pool.submit(os.getpid).result()
+if sys.argv[1] == "killed":
+    pool.submit(partial(time.sleep, 3600.0))
+    os.kill(os.getpid(), signal.SIGKILL)
+with pool:
+    print(list(pool.map([partial(pow, 2, 3)])))
+"""
+
+
+def run_script(folder: Path, argument: str) -> tuple[int, bytes]:
+    """Exit status and output of the script, once all processes that share its output have ended."""
+    script = folder / "script.py"
+    script.write_text(SCRIPT)
+    env = {**os.environ, "PYTHONPATH": os.pathsep.join(path for path in sys.path if path)}
+    command = [sys.executable, str(script), argument]
+    done = subprocess.run(command, stdout=subprocess.PIPE, env=env, timeout=120, check=False)
+    return done.returncode, done.stdout
+
+
+def test_processes_end_when_their_parent_is_killed(tmp_path: Path) -> None:
+    """One of them idle, one at a task of an hour."""
+    assert run_script(tmp_path, "killed") == (-signal.SIGKILL, b"")
+
+
+def test_a_script_needs_no_main_guard(tmp_path: Path) -> None:
+    assert run_script(tmp_path, "ended") == (0, b"[8]\n")

@@ -1,4 +1,4 @@
-"""`asp-env demo`: the main job on embedded data, from traffic to report."""
+"""`asp-env demo`: the whole workflow on synthetic traffic, from recordings to a report."""
 
 import json
 import shutil
@@ -23,11 +23,14 @@ from asp_env.metrics.driving.rules import DEFAULT_RULES, RULES
 
 SITE = "intersection"
 PREDICTOR = "ffw-asp"
-TRAINING = {"recordings": 30, "minutes": 2.5, "seed": 0, "locations": 6}
-HELD_OUT = {"recordings": 9, "minutes": 2.0, "seed": 48_271}
-"""Traffic of other seeds, so of other places; no predictor sees it before it is judged."""
-SCENARIOS = 48
 RECIPE = "ours"
+TRAINING = {"recordings": 30, "minutes": 2.5, "seed": 0, "locations": 6}
+"""Options of `asp-env synthesize` for the traffic that the predictor is trained on."""
+HELD_OUT = {"recordings": 9, "minutes": 2.0, "seed": 48_271}
+"""The same for the traffic that it is evaluated on: another seed, so other locations."""
+SCENARIOS = 48
+"""Number of scenarios that each method drives."""
+
 PLAN = {
     "site": SITE,
     "training": TRAINING,
@@ -36,49 +39,53 @@ PLAN = {
     "preset": RECIPE,
     "asp-env": metadata.version("asp-env"),
 }
-"""What a demo's folder is made by; kept in it, so that another demo's remains are not taken up."""
+"""Options of a demo. Its folder contains them, so that only the same demo is resumed there."""
 
 LEAD = (
-    "Traffic was made, a predictor was trained on it, judged on recordings of places that it has "
-    "never seen, and put before a planner there. The logged driver stands first: its scores are "
-    "the noise floor."
+    "A predictor is trained on synthetic traffic. On traffic at other locations, its forecasts are "
+    "compared with the recorded future, and a planner drives the ego with them. The method expert "
+    "replays the recorded drives; its scores are the reference for all others."
 )
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Demo:
-    """Show the main job: make traffic, train, evaluate open loop, drive, write the report.
+    """Show the whole workflow: synthesize, train, evaluate, drive, write a report.
 
-    What an interrupted demo has finished is kept, and the next one goes on from there.
+    After an interruption, the same command resumes at the unfinished step.
     """
 
     out: Path = Path("demo")
-    """Folder to write, the report and all it is made from."""
+    """Folder to write: recordings, the trained predictor and the report."""
 
     def run(self) -> None:
-        """Runs every step that is not done yet, then writes the results anew."""
+        """Runs the steps that are not finished, then writes the results.
+
+        Raises:
+            AspEnvError: a package is missing, or the folder contains something else.
+        """
         check_report_possible()
         console = Console()
         _claim(self.out)
         training, held_out = self.out / "traffic", self.out / "held-out"
-        for folder, what in ((training, TRAINING), (held_out, HELD_OUT)):
+        for folder, options in ((training, TRAINING), (held_out, HELD_OUT)):
             if not folder.exists():
-                console.rule(f"making traffic: {folder}")
-                _command("synthesize", out=folder, site=SITE, **what)
+                console.rule(f"Simulating traffic: {folder}")
+                _run_command("synthesize", out=folder, site=SITE, **options)
         run = self.out / PREDICTOR
         if not (run / "config.json").exists():
-            console.rule(f"training {PREDICTOR}")
-            _command("train", predictor=PREDICTOR, data=str(training), out=run, recipe=RECIPE)
-        console.rule("judging forecasts and driving")
+            console.rule(f"Training the predictor {PREDICTOR}")
+            _run_command("train", predictor=PREDICTOR, data=str(training), out=run, recipe=RECIPE)
+        console.rule("Evaluating forecasts and driving")
         trained = f"{PREDICTOR}:{run}"
-        opened = evaluate(
+        open_loop = evaluate(
             Evaluate(
                 data=str(held_out),
                 out=self.out,
                 predictors=("constant-velocity", "constant-turn-rate", trained),
             )
         )
-        closed = drive(
+        closed_loop = drive(
             Drive(
                 data=str(held_out),
                 out=self.out,
@@ -86,40 +93,41 @@ class Demo:
                 max_scenarios=SCENARIOS,
             )
         )
+        open_privileged = open_loop.manifest["privileged"]
+        closed_privileged = closed_loop.manifest["privileged"]
         with _replacing(self.out) as folder:
-            write_metrics(folder, [*opened.rows, *closed.rows])
-            privileged = sorted({*opened.manifest["privileged"], *closed.manifest["privileged"]})
+            write_metrics(folder, [*open_loop.rows, *closed_loop.rows])
+            privileged = sorted({*open_privileged, *closed_privileged})
             write_manifest(
                 folder,
                 "demo",
                 plan=PLAN,
                 privileged=privileged,
-                open_loop=opened.manifest,
-                closed_loop=closed.manifest,
+                open_loop=open_loop.manifest,
+                closed_loop=closed_loop.manifest,
             )
-            save_rollouts(folder, closed)
+            save_rollouts(folder, closed_loop)
             write_report(
                 folder,
                 title="Does the predictor make the car drive better?",
                 lead=LEAD,
-                maps=closed.maps,
-                examples=opened.examples,
+                maps=closed_loop.maps,
+                examples=open_loop.examples,
             )
-        for table in (
-            *open_loop_tables(opened.rows, opened.manifest["privileged"]),
-            driving_table(closed.rows, closed.manifest["privileged"], RULES[DEFAULT_RULES].shown),
-        ):
+        tables = open_loop_tables(open_loop.rows, open_privileged)
+        shown = RULES[DEFAULT_RULES].shown
+        for table in (*tables, driving_table(closed_loop.rows, closed_privileged, shown)):
             console.print(table)
         console.print(f"wrote {self.out / 'report.html'}")
 
 
-def _command(name: str, **options: Any) -> None:
-    """Another package's command, with its options by field name."""
+def _run_command(name: str, **options: Any) -> None:
+    """Runs a registered command; options have the names of its fields."""
     registry.find("commands", name)(**options).run()
 
 
 def _claim(out: Path) -> None:
-    """Makes the folder this demo's own, or finds that it is already."""
+    """Creates the folder, or checks that it was created by the same demo."""
     path = out / "plan.json"
     if out.exists() and (not out.is_dir() or any(out.iterdir())):
         try:
@@ -128,7 +136,7 @@ def _claim(out: Path) -> None:
             same = False
         if not same:
             raise AspEnvError(
-                f"{out}: holds no demo that this version began; choose another --out or remove it"
+                f"{out}: contains no demo of this version; choose another --out or remove it"
             )
         return
     out.mkdir(parents=True, exist_ok=True)
@@ -137,13 +145,13 @@ def _claim(out: Path) -> None:
 
 @contextmanager
 def _replacing(out: Path) -> Iterator[Path]:
-    """A folder whose content takes the place of what `out` holds under the same names."""
+    """A new folder whose files and folders then replace those of the same names in `out`."""
     fresh = out / "fresh"
     shutil.rmtree(fresh, ignore_errors=True)
     with atomic_folder(fresh) as folder:
         yield folder
-    for made in fresh.iterdir():
-        old = out / made.name
+    for new in fresh.iterdir():
+        old = out / new.name
         shutil.rmtree(old) if old.is_dir() else old.unlink(missing_ok=True)
-        made.rename(old)
+        new.rename(old)
     fresh.rmdir()

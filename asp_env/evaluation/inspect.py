@@ -1,7 +1,4 @@
-"""How far inferred actions lead away from the log: the floor of every action-space predictor.
-
-MERGED: `asp-env inspect`: what DATA holds, and every fault found in it.
-"""
+"""`asp-env inspect`: the contents of DATA, the drift of inferred actions, and all faults."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -27,7 +24,14 @@ from asp_env.errors import DataError
 from asp_env.metrics.drivable import CELL_M, drivable_field
 from asp_env.metrics.forecast.errors import moving
 
-_CHUNK = 10_000
+HORIZONS_S = (3.0, 6.0)
+"""Horizons of the counted snippets and of the drift."""
+PERCENTILES = (50, 90, 99)
+"""Percentiles of the drift."""
+PIPED_WIDTH = 160
+"""Width of the tables in characters where the output is no terminal."""
+CHUNK = 10_000
+"""Number of snippets that are rolled out at once, which bounds the memory."""
 
 
 def drift_m(
@@ -38,71 +42,76 @@ def drift_m(
     dt_s: float,
     horizon: int,
 ) -> tuple[Float[np.ndarray, " n"], Bool[np.ndarray, " n"]]:
-    """Distance between the log and the rollout of its own actions after `horizon` ticks.
+    """Drift of inferred actions: distance between a track and the rollout of its own actions.
 
-    From the logged state at each (track, tick) the actions inferred from the following states
-    are rolled out (Heun), and the positions at the end compared. The tracks must last that long.
+    The actions are inferred from the recorded states and rolled out with Heun's method from the
+    recorded state at the given tick. The drift is the distance of the positions at the end. It is
+    a lower bound of the error of any predictor that forecasts actions.
+
+    Args:
+        recording: the recording.
+        tracks: indices of the tracks.
+        ticks: tick of each track from which its actions are rolled out; the track must last for
+            `horizon` more ticks.
+        dt_s: duration of a tick in seconds.
+        horizon: number of ticks.
 
     Returns:
-        Metres, and which of the vehicles move: over 1 m/s at the start, or displaced over 2 m.
+        The drift of each track in metres, and a mask of the tracks that move: over 1 m/s at the
+        start, or over 2 m away from there at any later tick.
     """
     stride = frames_per_tick(recording.frame_rate_hz, dt_s)
     metres, moves = [np.zeros(0)], [np.zeros(0, dtype=bool)]
-    for start in range(0, len(tracks), _CHUNK):
-        some = slice(start, start + _CHUNK)
-        track = tracks[some]
-        begin = recording.starts[track] - recording.first_frames[track] + ticks[some] * stride
+    for start in range(0, len(tracks), CHUNK):
+        chunk = slice(start, start + CHUNK)
+        track = tracks[chunk]
+        begin = recording.starts[track] - recording.first_frames[track] + ticks[chunk] * stride
         rows = begin[:, None] + np.arange(horizon + 1) * stride
         states = recording.states[rows].astype(np.float64)
         lengths_m = recording.sizes[track, 0].astype(np.float64)
         known = np.ones(rows.shape, dtype=bool)
         actions = infer_actions(states, known, lengths_m, dt_s)
-        driven = rollout(states[:, 0], actions, lengths_m, dt_s, reverse=True)
-        metres.append(np.hypot(*(driven[:, -1, :2] - states[:, -1, :2]).T))
+        rolled_out = rollout(states[:, 0], actions, lengths_m, dt_s, reverse=True)
+        metres.append(np.hypot(*(rolled_out[:, -1, :2] - states[:, -1, :2]).T))
         moves.append(moving(states[:, 0], states[:, 1:, :2], known[:, 1:]))
     return np.concatenate(metres), np.concatenate(moves)
 
 
-HORIZONS_S = (3.0, 6.0)
-PERCENTILES = (50, 90, 99)
-PIPED_WIDTH = 160
-"""Columns of text where the output is no terminal."""
-
-
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Drifts:
-    """How far the actions of one or more recordings' snippets drift, per horizon."""
+    """Drift of all snippets of a recording, by horizon in seconds."""
 
     metres: Mapping[float, Float[np.ndarray, " _"]]
     moving: Mapping[float, Bool[np.ndarray, " _"]]
+    """Mask of the snippets whose target moves."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Findings:
-    """One recording that could be read."""
+    """What the tables show of one recording."""
 
     recording: Recording
     on_road: float
-    """Share of the vehicles' positions inside the drivable area."""
+    """Share of the vehicles' positions inside the drivable area; NaN without vehicles."""
     drifts: Drifts
     scenarios: ScenarioSet
 
 
 @dataclass(frozen=True, kw_only=True)
 class Inspect:
-    """Show recordings, classes, maps, counts of snippets and scenarios, drift, and every fault."""
+    """Show the recordings, maps, snippets, scenarios and faults of DATA."""
 
     data: Annotated[tyro.conf.Positional[str], tyro.conf.arg(metavar="DATA")]
-    """A folder in the inD/rounD or INTERACTION layout, `sample:SITE` or `synthetic:SITE`."""
+    """Folder in the inD/rounD or INTERACTION layout, sample:SITE or synthetic:SITE."""
     dt: float = DEFAULT_DT_S
-    """Time step in seconds; it must divide the recordings' frame rate."""
+    """Duration of a tick in seconds; a whole number of frames."""
 
     def run(self) -> None:
-        """Prints the tables.
+        """Prints the tables; with faults, those of the recordings that can be read.
 
         Raises:
-            AspEnvError: the data are not there, some of them cannot be read, or the time step
-                does not divide them. What can be read is shown first.
+            AspEnvError: the data do not exist, some recordings cannot be read, or a tick is no
+                whole number of frames.
         """
         recordings = open_data(self.data)
         console = Console()
@@ -180,7 +189,12 @@ def _on_road(recording: Recording) -> float:
 
 
 def _recording_table(data: str, found: list[Findings]) -> Table:
-    table = Table(title=f"Recordings of {data}", title_justify="left")
+    table = Table(
+        title=f"Recordings of {data}",
+        title_justify="left",
+        caption="3+3 s, 3+6 s: snippets with a history of 3 s and a horizon of 3 s or 6 s",
+        caption_justify="left",
+    )
     for name in ("name", "location"):
         table.add_column(name)
     for name in ("Hz", "duration s", "rows", "tracks"):
@@ -188,7 +202,7 @@ def _recording_table(data: str, found: list[Findings]) -> Table:
     table.add_column("classes", overflow="fold")
     for name in ("parked", "on road %", "3+3 s", "3+6 s"):
         table.add_column(name, justify="right")
-    table.add_column("picture")
+    table.add_column("image")
     for each in found:
         recording = each.recording
         table.add_row(
@@ -210,7 +224,7 @@ def _recording_table(data: str, found: list[Findings]) -> Table:
             sum(len(each.drifts.metres[horizon_s]) for each in found) for horizon_s in HORIZONS_S
         ]
         table.add_row(
-            f"{len(found)} in all",
+            f"all {len(found)}",
             "",
             "",
             f"{sum(each.recording.duration_s for each in found):.1f}",
@@ -249,7 +263,7 @@ def _map_table(maps: list[RoadMap]) -> Table:
 
 
 def _drift_table(found: list[Findings], dt_s: float) -> Table:
-    title = f"Drift of inferred actions (Heun, {dt_s:g} s): median / 90 % / 99 %, metres"
+    title = f"Drift of inferred actions (Heun, {dt_s:g} s) in metres: median / 90 % / 99 %"
     table = Table(title=title, title_justify="left")
     table.add_column("name")
     for horizon_s in HORIZONS_S:
@@ -269,14 +283,13 @@ def _drift_cells(drifts: list[Drifts]) -> list[str]:
     for horizon_s in HORIZONS_S:
         metres = np.concatenate([each.metres[horizon_s] for each in drifts])
         moves = np.concatenate([each.moving[horizon_s] for each in drifts])
-        for chosen in (metres, metres[moves]):
-            cells += [f"{len(chosen):,}", _quantiles(chosen)]
+        for values in (metres, metres[moves]):
+            cells += [f"{len(values):,}", _percentiles(values)]
     return cells
 
 
 def _scenario_table(found: list[Findings]) -> Table:
-    """Counts by tag, and medians of the columns."""
-    table = Table(title="Scenarios by tag; medians of their measures", title_justify="left")
+    table = Table(title="Scenarios by tag, with medians of their measures", title_justify="left")
     for name in ("tag", "n", *COLUMNS):
         table.add_column(name, justify="left" if name == "tag" else "right")
     values = np.concatenate([each.scenarios.values for each in found])
@@ -289,7 +302,7 @@ def _scenario_table(found: list[Findings]) -> Table:
     return table
 
 
-def _quantiles(metres: Float[np.ndarray, " n"]) -> str:
+def _percentiles(metres: Float[np.ndarray, " n"]) -> str:
     if not len(metres):
         return "-"
     return " / ".join(f"{value:.2f}" for value in np.percentile(metres, PERCENTILES))
@@ -315,5 +328,5 @@ def _summary(recordings: Recordings, faults: Mapping[str, str]) -> str:
         return next(iter(faults.values()))
     return (
         f"data {recordings.source!r}: {len(faults)} of {len(recordings)} recordings cannot be "
-        f"read ({', '.join(faults)}); mend or remove the files named above"
+        f"read ({', '.join(faults)}); repair or remove the files named above"
     )

@@ -1,4 +1,4 @@
-"""What every output folder holds."""
+"""Files of an output folder: `metrics.csv` and `manifest.json`."""
 
 import csv
 import json
@@ -12,35 +12,58 @@ from typing import Any
 from asp_env.files import atomic_file
 
 PACKAGES = ("asp-env", "numpy", "numba", "torch", "gymnasium", "eclipse-sumo")
+"""Packages whose versions the manifest states, as far as they are installed."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Row:
-    """One line of `metrics.csv`: the long form. Fields that do not apply stay empty."""
+    """One line of `metrics.csv`, in long form. Fields that do not apply are empty."""
 
     data: str
+    """DATA as given on the command line."""
     predictor: str = ""
+    """Name of the predictor as given, with its run folder if it is trained."""
     trained_on: str = ""
+    """Training data of the predictor."""
     view: str = ""
+    """View of the predictor's network."""
     recipe: str = ""
+    """Training recipe of the predictor and, after a plus sign, its variant."""
     chaining: str = ""
+    """How the predictor chains segments for horizons beyond its own."""
     planner: str = ""
+    """Name of the planner; empty in open loop."""
     traffic: str = ""
+    """Drivers of the other agents, as given by `--traffic`."""
     latency_ticks: int | None = None
+    """Delay of the plans in ticks."""
     horizon_s: float | None = None
+    """Forecast horizon in seconds."""
     selection: str = ""
+    """Which mode an error is of: `most-probable`, `best-of-3`, or empty for all modes together."""
     subset: str = "all"
+    """Targets or scenarios that are averaged over, such as `moving` or a scenario tag."""
     metric: str
+    """Name of the metric."""
     value: float
+    """Mean, or ratio of means."""
     low: float | None = None
+    """Lower bound of the 95 % interval."""
     high: float | None = None
+    """Upper bound of the 95 % interval."""
     n: int
+    """Number of snippets or episodes."""
     rules: str = ""
-    """By which preset of metrics, and which version of it, drives were judged."""
+    """Driving rules and their version, such as `nuplan 1`; empty in open loop."""
 
 
 def write_metrics(folder: Path, rows: Sequence[Row]) -> None:
-    """`metrics.csv`."""
+    """Writes `metrics.csv`; numbers have six significant digits.
+
+    Args:
+        folder: an existing folder.
+        rows: the lines of the file, in order.
+    """
     with (
         atomic_file(folder / "metrics.csv") as partial,
         partial.open("w", newline="") as file,
@@ -57,14 +80,20 @@ def _cell(value: object) -> object:
     return "" if value is None else value
 
 
-def write_manifest(folder: Path, command: str, **what: Any) -> None:
-    """`manifest.json`: configuration, data, seeds and versions; no time, no machine."""
+def write_manifest(folder: Path, command: str, **content: Any) -> None:
+    """Writes `manifest.json`, which contains no time and no machine, so that runs repeat exactly.
+
+    Args:
+        folder: an existing folder.
+        command: name of the command.
+        **content: configuration, data and seeds; values that JSON lacks become strings.
+    """
     versions: dict[str, str] = {"python": platform.python_version()}
     for package in PACKAGES:
         try:
             versions[package] = metadata.version(package)
         except metadata.PackageNotFoundError:
             continue
-    manifest: Mapping[str, Any] = {"command": command, **what, "versions": versions}
+    manifest: Mapping[str, Any] = {"command": command, **content, "versions": versions}
     with atomic_file(folder / "manifest.json") as partial:
         partial.write_text(json.dumps(manifest, indent=2, default=str) + "\n")

@@ -1,7 +1,4 @@
-"""The predictors that a run compares: loaded, checked, and told apart by short names.
-
-MERGED: What of DATA may be used to judge predictors that were trained on some of it.
-"""
+"""Which predictors are evaluated, and which part of DATA they are evaluated on."""
 
 from collections import Counter
 from collections.abc import Callable, Sequence
@@ -23,12 +20,20 @@ from asp_env.data.split import (
 )
 from asp_env.errors import AspEnvError
 
+PartChoice = Literal["auto", "train", "validation", "test", "all"]
+
 
 def load_predictors(names: Sequence[str], *, horizon: int, dt_s: float) -> list[Predictor]:
-    """The predictors of some names, each of which forecasts at least `horizon` ticks.
+    """Loads predictors by name.
+
+    Args:
+        names: registered names, with `:RUN` for a trained predictor.
+        horizon: number of ticks that each must forecast.
+        dt_s: duration of a tick in seconds.
 
     Raises:
-        AspEnvError: there is none, one is named twice, or one forecasts less.
+        AspEnvError: no name is given, a name is given twice, or a predictor cannot be loaded or
+            forecasts fewer ticks.
     """
     if not names:
         raise AspEnvError("--predictors: none given; expected at least one, such as oracle")
@@ -46,40 +51,49 @@ def load_predictors(names: Sequence[str], *, horizon: int, dt_s: float) -> list[
 
 
 def short_names(names: Sequence[str]) -> dict[str, str]:
-    """By full name: without its folder, or with what of the folder tells it from the others."""
-    found = {name: name.partition(":")[0] for name in names}
-    found = _lengthen(found, lambda name: PurePath(name.partition(":")[2]).name)
-    return _lengthen(found, lambda name: name.partition(":")[2].strip("/").replace("/", "-"))
+    """The shortest distinct labels of predictors, by their full names.
+
+    A label is the name without its run folder (`mtp`). Where that is ambiguous, the last part of
+    the folder is added (`mtp 1`), and where that is ambiguous too, the whole path (`mtp a-1`).
+    """
+    labels = {name: name.partition(":")[0] for name in names}
+    labels = _lengthen(labels, lambda name: PurePath(name.partition(":")[2]).name)
+    return _lengthen(labels, lambda name: name.partition(":")[2].strip("/").replace("/", "-"))
 
 
-def _lengthen(short: dict[str, str], add: Callable[[str], str]) -> dict[str, str]:
-    taken = Counter(short.values())
+def _lengthen(labels: dict[str, str], suffix: Callable[[str], str]) -> dict[str, str]:
+    counts = Counter(labels.values())
     return {
-        name: f"{name.partition(':')[0]} {add(name)}".strip() if taken[label] > 1 else label
-        for name, label in short.items()
+        name: f"{name.partition(':')[0]} {suffix(name)}".strip() if counts[label] > 1 else label
+        for name, label in labels.items()
     }
 
 
-PartChoice = Literal["auto", "train", "validation", "test", "all"]
-
-
-def ticks_to_judge(
+def ticks_to_evaluate(
     recordings: Recordings, predictors: Sequence[Predictor], part: PartChoice, *, dt_s: float
 ) -> tuple[list[Bool[np.ndarray, " _"]], str]:
-    """The ticks of each recording that may be judged on, and in words which they are.
+    """Masks of the ticks that predictors are evaluated on.
 
-    `auto`: what no predictor has learned from or was selected on. `train`, `validation` and `test`:
-    that part of what the predictors were trained on; where none was trained on these recordings,
-    that part of them under the split by recording for 3 s. `all`: everything, seen or not.
+    Args:
+        recordings: DATA.
+        predictors: all predictors that are compared.
+        part: `auto` excludes everything that any of the predictors was trained or selected on.
+            `train`, `validation` and `test` are that part of the predictors' training split; if
+            none of the predictors was trained on these recordings, that part of the split by
+            recording for a horizon of 3 s. `all` excludes nothing.
+        dt_s: duration of a tick in seconds.
+
+    Returns:
+        A mask of ticks for each recording, and a description of the choice.
 
     Raises:
         AspEnvError: these recordings cannot be split.
     """
     contents = set(recordings.hashes())
     trained = [
-        known
+        trained_on
         for predictor in predictors
-        if (known := predictor.trained_on) is not None and contents & set(known.parts)
+        if (trained_on := predictor.trained_on) is not None and contents & set(trained_on.parts)
     ]
     if part == "auto":
         label = "what no predictor has seen" if trained else "all, of which no predictor saw any"
@@ -92,36 +106,44 @@ def ticks_to_judge(
         return ticks_of_part(recordings, trained, part, dt_s), label
     index = index_snippets(recordings, dt_s=dt_s, horizon_s=SPLIT_HORIZON_S)
     try:
-        _, dealt = snippet_parts(recordings, index, "recording")
+        _, split = snippet_parts(recordings, index, "recording")
     except AspEnvError as error:
         raise AspEnvError(
             f"--part {part}: no location has three recordings with snippets, so there is no split "
-            "by recording; say --part all"
+            "by recording; use --part all"
         ) from error
-    return ticks_of_part(recordings, [dealt], part, dt_s), f"{part} of the split by recording"
+    return ticks_of_part(recordings, [split], part, dt_s), f"{part} of the split by recording"
 
 
-def keep_within(index: SnippetIndex, allowed: Sequence[Bool[np.ndarray, " _"]]) -> SnippetIndex:
-    """The snippets whose every tick is allowed.
+def snippets_within(index: SnippetIndex, allowed: Sequence[Bool[np.ndarray, " _"]]) -> SnippetIndex:
+    """The snippets whose history, present and horizon lie within the allowed ticks.
+
+    Args:
+        index: snippets.
+        allowed: a mask of ticks for each recording.
 
     Raises:
-        AspEnvError: there is none.
+        AspEnvError: no snippet is left.
     """
     keep = np.zeros(len(index), dtype=bool)
     for number, ticks in enumerate(allowed):
         total = np.concatenate([[0], np.cumsum(ticks)])
-        mine = np.flatnonzero(index.recording == number)
-        first = index.tick[mine] - index.history
-        after = np.minimum(index.tick[mine] + index.horizon_ticks + 1, len(ticks))
-        keep[mine] = total[after] - total[first] == index.history + index.horizon_ticks + 1
+        rows = np.flatnonzero(index.recording == number)
+        first = index.tick[rows] - index.history
+        after = np.minimum(index.tick[rows] + index.horizon_ticks + 1, len(ticks))
+        keep[rows] = total[after] - total[first] == index.history + index.horizon_ticks + 1
     if not keep.any():
         raise no_data_error("snippet")
     return index.select(keep)
 
 
 def no_data_error(what: str) -> AspEnvError:
-    """The error for data without anything to judge on."""
+    """The error for data that contain nothing to evaluate on.
+
+    Args:
+        what: what is missing, in the singular, such as `snippet` or `scenario`.
+    """
     return AspEnvError(
-        f"no {what} is left to judge on: these recordings are too short, or the predictors were "
-        "trained on them; give other data, or say --part all"
+        f"no {what} is left to evaluate on: these recordings are too short, or the predictors were "
+        "trained on them; give other data, or use --part all"
     )

@@ -1,6 +1,6 @@
-"""Tables for terminals, 80 columns wide; all intervals are in `metrics.csv` and the report."""
+"""Result tables for terminals of 80 columns. All intervals are in `metrics.csv` and the report."""
 
-from collections.abc import Collection, Sequence
+from collections.abc import Collection, Mapping, Sequence
 
 from rich import box
 from rich.table import Table
@@ -8,9 +8,12 @@ from rich.table import Table
 from asp_env.evaluation.results import Row
 from asp_env.evaluation.selection import short_names
 
-OPEN_LOOP = {"FDE": "FDE m", "FDE / constant velocity": "FDE / const. vel."}
-OPEN_LOOP_SHORT = {"ADE": "ADE m", "miss": "miss"}
-MORE = {
+Headings = Mapping[str, str]
+"""Column headings by metric."""
+
+FORECAST_INTERVALS: Headings = {"FDE": "FDE m", "FDE / constant velocity": "FDE / const. vel."}
+FORECAST_VALUES: Headings = {"ADE": "ADE m", "miss": "miss"}
+FORECAST_MORE = {
     ("most-probable", "MAE"): "MAE",
     ("most-probable", "MSE"): "MSE",
     ("best-of-3", "MAE"): "MAE₃",
@@ -21,8 +24,10 @@ MORE = {
     ("", "overlap"): "over",
     ("", "infeasible"): "infeas",
 }
-DRIVING = {"score": "score"}
-DRIVING_SHORT = {
+"""Headings of the last open-loop table, by selection and metric."""
+
+DRIVING_INTERVALS: Headings = {"score": "score"}
+DRIVING_VALUES: Headings = {
     "no collision": "no coll.",
     "no at-fault collision": "no fault",
     "on road": "road",
@@ -37,64 +42,70 @@ DRIVING_SHORT = {
     "log divergence": "to log m",
 }
 
-
-ROOMY = 6
-"""More metrics than this stand closer together."""
+MAX_PADDED_COLUMNS = 6
+"""With more metrics than this, columns have no padding, so that a table fits 80 columns."""
 
 MARK = " *"
-"""Stands behind who was handed the recorded future."""
+"""Follows the name of a privileged predictor or planner."""
 
 
 def open_loop_tables(rows: Sequence[Row], privileged: Collection[str] = ()) -> list[Table]:
-    """Predictor by metric for moving targets, or all if none moves; * knows the future.
+    """A table for each selection of modes and one of the other metrics, by predictor.
 
-    A table for either selection, and one of the other metrics.
+    The tables are of the moving targets, or of all targets if none moves.
+
+    Args:
+        rows: open-loop rows of `metrics.csv`.
+        privileged: full names of the privileged predictors, which are marked.
     """
     subset = "moving" if any(row.subset == "moving" for row in rows) else "all"
     short = short_names([row.predictor for row in rows])
-    groups: dict[str, dict[str, dict[str, Row]]] = {}
+    by_selection: dict[str, dict[str, dict[str, Row]]] = {}
     more: dict[str, dict[str, Row]] = {}
     for row in rows:
         if row.subset != subset:
             continue
         name = short[row.predictor] + (MARK if row.predictor in privileged else "")
         if row.selection:
-            members = groups.setdefault(row.selection, {})
-            members.setdefault(name, {})[row.metric] = row
-        heading = MORE.get((row.selection, row.metric))
+            lines = by_selection.setdefault(row.selection, {})
+            lines.setdefault(name, {})[row.metric] = row
+        heading = FORECAST_MORE.get((row.selection, row.metric))
         if heading is not None:
             more.setdefault(name, {})[heading] = row
     tables = []
-    for selection, members in groups.items():
-        table = _table(f"{subset} targets, {selection}, 95 % intervals over recordings")
-        _fill(table, "predictor", members, OPEN_LOOP, OPEN_LOOP_SHORT)
+    for selection, lines in by_selection.items():
+        table = _table(f"{subset} targets, {selection} mode, 95 % intervals over recordings")
+        _fill(table, "predictor", lines, FORECAST_INTERVALS, FORECAST_VALUES)
         tables.append(table)
     if more:
-        table = _table(f"{subset} targets, ₃: best of 3; from NLL on all modes together")
-        _fill(table, "predictor", more, {}, {name: name for name in MORE.values()})
+        table = _table(f"{subset} targets; ₃: best of 3 modes; NLL and later columns: all modes")
+        _fill(table, "predictor", more, {}, {name: name for name in FORECAST_MORE.values()})
         tables.append(table)
     return tables
 
 
 def driving_table(rows: Sequence[Row], privileged: Collection[str], shown: Sequence[str]) -> Table:
-    """Driver by the shown metrics over all scenarios, and score, if there is one.
+    """Driving metrics over all scenarios, by method.
 
-    The expert, which is the noise floor, stands first; * knows the future.
+    Args:
+        rows: closed-loop rows of `metrics.csv`.
+        privileged: names of the privileged planners and predictors, which are marked.
+        shown: metrics to show after the score.
     """
     rules = " and ".join(dict.fromkeys(row.rules for row in rows))
     table = _table(f"driving by {rules}, mean per episode, 95 % interval over recordings")
-    if len(shown) > ROOMY:
+    if len(shown) > MAX_PADDED_COLUMNS:
         table.padding = 0
     short = short_names([row.predictor for row in rows])
-    members: dict[str, dict[str, Row]] = {}
+    lines: dict[str, dict[str, Row]] = {}
     for row in rows:
         if row.subset != "all":
             continue
         name = " + ".join(part for part in (row.planner, short[row.predictor]) if part)
         mark = MARK if row.planner in privileged or row.predictor in privileged else ""
-        members.setdefault(name + mark, {})[row.metric] = row
-    scored = DRIVING if any(row.metric in DRIVING for row in rows) else {}
-    _fill(table, "driver", members, scored, {name: DRIVING_SHORT[name] for name in shown})
+        lines.setdefault(name + mark, {})[row.metric] = row
+    scored = DRIVING_INTERVALS if any(row.metric in DRIVING_INTERVALS for row in rows) else {}
+    _fill(table, "method", lines, scored, {name: DRIVING_VALUES[name] for name in shown})
     return table
 
 
@@ -109,22 +120,31 @@ def _table(title: str) -> Table:
 
 def _fill(
     table: Table,
-    who: str,
-    members: dict[str, dict[str, Row]],
-    with_interval: dict[str, str],
-    without: dict[str, str],
+    first_heading: str,
+    lines: Mapping[str, Mapping[str, Row]],
+    with_interval: Headings,
+    without_interval: Headings,
 ) -> None:
-    table.add_column(who, min_width=18)
-    if any(name.endswith(MARK) for name in members):
-        table.caption = f"{MARK.strip()} knows the recorded future"
-    counted = ["n"] if with_interval else []
-    for heading in (*with_interval.values(), *without.values(), *counted):
+    """Adds columns and lines.
+
+    Args:
+        table: an empty table.
+        first_heading: heading of the names.
+        lines: rows by name and metric.
+        with_interval: metrics shown with their intervals; they are followed by the count n.
+        without_interval: metrics shown without.
+    """
+    table.add_column(first_heading, min_width=18)
+    if any(name.endswith(MARK) for name in lines):
+        table.caption = f"{MARK.strip()} uses the recorded future"
+    count_heading = ["n"] if with_interval else []
+    for heading in (*with_interval.values(), *without_interval.values(), *count_heading):
         table.add_column(heading, justify="right", no_wrap=True)
-    for name, metrics in members.items():
+    for name, metrics in lines.items():
         wide = (_cell(metrics.get(metric), interval=True) for metric in with_interval)
-        slim = (_cell(metrics.get(metric), interval=False) for metric in without)
-        counts = [str(max(row.n for row in metrics.values()))] if with_interval else []
-        table.add_row(name, *wide, *slim, *counts)
+        narrow = (_cell(metrics.get(metric), interval=False) for metric in without_interval)
+        count = [str(max(row.n for row in metrics.values()))] if with_interval else []
+        table.add_row(name, *wide, *narrow, *count)
 
 
 def _cell(row: Row | None, *, interval: bool) -> str:

@@ -1,1 +1,1 @@
-"""The table of Janjoš et al. (2021) on other data, with ablations."""
+"""Experiments with several trainings: the table of Janjoš et al. (2021), with ablations."""

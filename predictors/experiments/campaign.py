@@ -1,10 +1,10 @@
-"""Runs the cells of a table in processes side by side, and keeps account of what they cost."""
+"""Runs the cells of a table side by side, each in a process of its own, and records their costs."""
 
 import json
 import os
-import subprocess
 import time
 from collections.abc import Mapping, Sequence
+from concurrent.futures import FIRST_COMPLETED, Future, wait
 from dataclasses import dataclass
 from pathlib import Path
 from typing import final
@@ -14,22 +14,22 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, T
 
 from asp_env.errors import AspEnvError
 from asp_env.files import atomic_file
-from asp_env.workers import start
+from asp_env.workers import WorkerExitError, WorkerPool
 from predictors.experiments.cells import Cell
-from predictors.experiments.worker import Job
+from predictors.experiments.job import Job, run_job
 
 ONE_THREAD = {"OMP_NUM_THREADS": "1", "NUMBA_NUM_THREADS": "1"}
-POLL_S = 0.1
+"""Environment of the processes: results do not depend on the number of cores."""
 COST = "cost.json"
 LOGS = "logs"
 
 
 @final
 class Costs:
-    """CPU time by cell, over all starts of the command; a file of its own beside the results."""
+    """CPU and wall time of every cell, over all runs of the command, in a JSON file."""
 
     def __init__(self, path: Path) -> None:
-        """Goes on with what the file holds."""
+        """Reads the file if it exists."""
         self._path = path
         self._cells: dict[str, dict[str, float]] = {}
         if path.exists():
@@ -37,19 +37,19 @@ class Costs:
 
     @property
     def total_cpu_s(self) -> float:
-        """Of all cells."""
+        """CPU time of all cells in seconds."""
         return sum(cell["cpu_s"] for cell in self._cells.values())
 
     def cpu_s(self, name: str) -> float:
-        """Of one cell."""
+        """CPU time of one cell in seconds."""
         return self._cells.get(name, {}).get("cpu_s", 0.0)
 
     def add(self, name: str, *, cpu_s: float, wall_s: float) -> None:
-        """Adds a process that has ended, whatever became of it."""
-        known = self._cells.setdefault(name, {"cpu_s": 0.0, "wall_s": 0.0, "processes": 0})
-        known["cpu_s"] = round(known["cpu_s"] + cpu_s, 1)
-        known["wall_s"] = round(known["wall_s"] + wall_s, 1)
-        known["processes"] += 1
+        """Adds the cost of a process that has ended, with or without success."""
+        cell = self._cells.setdefault(name, {"cpu_s": 0.0, "wall_s": 0.0, "processes": 0})
+        cell["cpu_s"] = round(cell["cpu_s"] + cpu_s, 1)
+        cell["wall_s"] = round(cell["wall_s"] + wall_s, 1)
+        cell["processes"] += 1
         content = {"total_cpu_s": round(self.total_cpu_s, 1), "cells": self._cells}
         with atomic_file(self._path) as partial:
             partial.write_text(json.dumps(content, indent=1) + "\n")
@@ -57,22 +57,27 @@ class Costs:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class _Running:
-    process: subprocess.Popen[bytes]
+    pool: WorkerPool[Job, None]
+    result: Future[None]
     log: Path
-    since_s: float
+    start_s: float
 
 
 @final
 class Campaign:
-    """All cells of a table, from the first start of the command to the last."""
+    """All cells of a table and their states.
+
+    Each cell has a pool with one process, so that its output goes to a log file of its own, its
+    CPU time can be measured, and the end of its process affects no other cell.
+    """
 
     def __init__(self, jobs: Mapping[Cell, Job], out: Path, console: Console) -> None:
         """Runs nothing yet.
 
         Args:
-            jobs: what a cell's process is to do; each cell behind the one that it starts from.
-            out: the table's folder.
-            console: where progress is told.
+            jobs: the work of every cell; each cell comes after the one that it starts from.
+            out: folder of the table.
+            console: console for progress.
         """
         self._jobs = jobs
         self._out = out
@@ -84,14 +89,18 @@ class Campaign:
 
     @property
     def failed(self) -> Mapping[Cell, str]:
-        """Why, by cell."""
+        """Reasons of the failed cells."""
         return self._failed
 
     def run(self, processes: int) -> None:
-        """Runs what is not finished, so many processes at a time; with 0 nothing."""
+        """Runs the cells that are not finished.
+
+        Args:
+            processes: number of cells at a time; 0 only checks the finished ones.
+        """
         waiting = []
         for cell, job in self._jobs.items():
-            if self._fits(cell, job):
+            if self._is_valid(cell, job):
                 if job.done and (cell.start is None or self._jobs[cell.start].trained):
                     self._done.add(cell)
                 else:
@@ -102,41 +111,36 @@ class Campaign:
             TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(),
             TimeRemainingColumn(),
         )  # fmt: skip
-        shown = self._console.is_terminal
-        with Progress(*columns, console=self._console, transient=True, disable=not shown) as bar:
+        hidden = not self._console.is_terminal
+        with Progress(*columns, console=self._console, transient=True, disable=hidden) as bar:
             task = bar.add_task("cells", total=len(waiting))
             try:
                 while waiting or self._running:
                     waiting = self._start(waiting, processes)
-                    for cell in self._reap():
+                    bar.update(task, description=", ".join(cell.name for cell in self._running))
+                    for cell in self._collect():
                         bar.advance(task)
-                        self._tell(cell, len(waiting) + len(self._running))
-                    bar.update(task, description=", ".join(c.name for c in self._running))
-                    if self._running:
-                        time.sleep(POLL_S)
+                        self._report(cell, len(waiting) + len(self._running))
             finally:
                 self._stop()
 
-    def _fits(self, cell: Cell, job: Job) -> bool:
-        """Whether what there is of a cell is what was asked for, and what it started from too."""
+    def _is_valid(self, cell: Cell, job: Job) -> bool:
+        """Whether the results of a cell, and of the cell that it starts from, are current."""
         try:
-            self._check_start(cell)
+            if cell.start is not None and cell.start in self._failed:
+                raise AspEnvError(f"{cell.start.name}, which it starts from, failed")
             job.check()
         except AspEnvError as error:
             self._failed[cell] = str(error)
-            self._tell(cell, len(self._jobs))
+            self._report(cell, len(self._jobs))
         return cell not in self._failed
 
-    def _check_start(self, cell: Cell) -> None:
-        if cell.start is not None and cell.start in self._failed:
-            raise AspEnvError(f"{cell.start.name}, which it starts from, failed")
-
     def _start(self, waiting: Sequence[Cell], processes: int) -> list[Cell]:
-        """Starts the first cells that can be; those that still wait."""
+        """Starts cells as far as possible; the cells that still wait."""
         left = []
         for cell in waiting:
             if cell.start is not None and cell.start in self._failed:
-                self._fits(cell, self._jobs[cell])
+                self._is_valid(cell, self._jobs[cell])
             elif len(self._running) < processes and (
                 cell.start is None or cell.start in self._done
             ):
@@ -149,63 +153,50 @@ class Campaign:
         log = self._out / LOGS / f"{cell.name}.txt"
         log.parent.mkdir(parents=True, exist_ok=True)
         with log.open("ab") as file:
-            process = start(
-                "predictors.experiments.worker",
-                self._jobs[cell].dump(),
-                output=file,
-                env={**os.environ, **ONE_THREAD},
-            )
-        return _Running(process=process, log=log, since_s=time.monotonic())
+            pool = WorkerPool(run_job, 1, output=file, env={**os.environ, **ONE_THREAD})
+        result = pool.submit(self._jobs[cell])
+        return _Running(pool=pool, result=result, log=log, start_s=time.monotonic())
 
-    def _reap(self) -> list[Cell]:
-        """Takes leave of the processes that have ended; their cells."""
-        ended = []
-        for cell, running in list(self._running.items()):
-            if self._ended(cell, running, os.WNOHANG):
-                ended.append(cell)
-                if running.process.returncode == 0:
-                    self._done.add(cell)
-                else:
-                    self._failed[cell] = _why(running)
+    def _collect(self) -> list[Cell]:
+        """Waits until a cell has ended; all cells that have."""
+        wait([running.result for running in self._running.values()], return_when=FIRST_COMPLETED)
+        ended = [cell for cell, running in self._running.items() if running.result.done()]
+        for cell in ended:
+            running = self._running[cell]
+            running.pool.close()
+            self._remove(cell)
+            error = running.result.exception()
+            if error is None:
+                self._done.add(cell)
+            else:
+                self._failed[cell] = _reason(error, running.log)
         return ended
 
-    def _ended(self, cell: Cell, running: _Running, options: int) -> bool:
-        process = running.process
-        pid, status, usage = os.wait4(process.pid, options)
-        if not pid:
-            return False
-        process.returncode = os.waitstatus_to_exitcode(status)
-        if process.stdin is not None:
-            process.stdin.close()
-        del self._running[cell]
-        self._costs.add(
-            cell.name,
-            cpu_s=usage.ru_utime + usage.ru_stime,
-            wall_s=time.monotonic() - running.since_s,
-        )
-        return True
+    def _remove(self, cell: Cell) -> None:
+        """Removes a cell whose process has ended and records its cost."""
+        running = self._running.pop(cell)
+        wall_s = time.monotonic() - running.start_s
+        self._costs.add(cell.name, cpu_s=running.pool.cpu_s, wall_s=wall_s)
 
     def _stop(self) -> None:
-        """Ends what still runs; it is gone on with at the next start."""
-        for running in self._running.values():
-            running.process.terminate()
+        """Terminates the running cells; the next run of the command resumes them."""
         for cell, running in list(self._running.items()):
-            self._ended(cell, running, 0)
+            running.pool.terminate()
+            self._remove(cell)
 
-    def _tell(self, cell: Cell, left: int) -> None:
-        what = f"finished, {self._costs.cpu_s(cell.name):.0f} s of CPU time"
+    def _report(self, cell: Cell, left: int) -> None:
+        state = f"finished, {self._costs.cpu_s(cell.name):.0f} s of CPU time"
         if cell in self._failed:
-            what = f"failed: {self._failed[cell]}"
+            state = f"failed: {self._failed[cell]}"
         self._console.print(
-            f"{cell.name}: {what} ({left} to go)", soft_wrap=True, highlight=False, markup=False
+            f"{cell.name}: {state} ({left} left)", soft_wrap=True, highlight=False, markup=False
         )
 
 
-def _why(running: _Running) -> str:
-    """The last line that a process said, or how it ended."""
-    lines = [line.strip() for line in running.log.read_text(errors="replace").splitlines()]
-    said = [line.removeprefix("asp-env: ") for line in lines if line]
-    code = running.process.returncode
-    if code < 0:
-        return f"killed by signal {-code}; see {running.log}"
-    return f"{said[-1] if said else f'exit status {code}'}; see {running.log}"
+def _reason(error: BaseException, log: Path) -> str:
+    """The last line of the log, or the signal that ended the process."""
+    if isinstance(error, WorkerExitError) and error.status < 0:
+        return f"killed by signal {-error.status}; see {log}"
+    lines = [line.strip() for line in log.read_text(errors="replace").splitlines()]
+    stated = [line.removeprefix("asp-env: ") for line in lines if line]
+    return f"{stated[-1] if stated else error}; see {log}"

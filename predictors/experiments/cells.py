@@ -1,6 +1,7 @@
-"""The sites of a table: where is learned, selected and judged, one group of columns each.
+"""Sites and cells of a table: what is trained and evaluated, and what each run starts from.
 
-MERGED: The cells of the table: what is trained and judged, and what has to be there before.
+A site is a data set with its own group of columns. A cell is one predictor, or one ablation of it,
+for one horizon and seed at one site.
 """
 
 from collections.abc import Callable, Mapping, Sequence
@@ -11,37 +12,57 @@ from typing import Any
 from asp_env.data.source import open_data
 from asp_env.errors import AspEnvError, unknown_name
 
+SEGMENT_S = 3.0
+"""A run for a longer horizon that does not start from scratch starts from a run for this one."""
+
+PHYSICAL = ("constant-velocity", "constant-turn-rate")
+"""Predictors without training; every table has them."""
+
+CAUSAL = "causal"
+"""The variant with histories that were filtered without later frames. The physical predictors have
+it too."""
+
+INPUT_VARIANTS = (CAUSAL, "no-trail", "long")
+"""Variants of the input of all predictors. Other predictors are compared with them only if they
+have the same input."""
+
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Site:
-    """Data and their content."""
+    """Data of a site and hashes of their content."""
 
     name: str
     data: str
     data_hash: str
     validation: str | None = None
-    """Data to select on; the part validation of `data` if None."""
+    """Data to select on; None for the part validation of `data`."""
     validation_hash: str | None = None
     test: str | None = None
-    """Data to judge on; the part test of `data` if None."""
+    """Data to evaluate on; None for the part test of `data`."""
     test_hash: str | None = None
 
     @property
-    def judged_on(self) -> str:
-        """The data that errors are of."""
+    def evaluated_on(self) -> str:
+        """The data that errors are computed on."""
         return self.test or self.data
 
     @property
-    def judged_hash(self) -> str:
-        """Of their content."""
+    def evaluated_hash(self) -> str:
+        """Hash of the data that errors are computed on."""
         return self.test_hash or self.data_hash
 
 
 def open_sites(data: Sequence[str], validation: Sequence[str], test: Sequence[str]) -> list[Site]:
-    """The sites of some data.
+    """Opens the data of all sites.
+
+    Args:
+        data: DATA of each site.
+        validation: data to select on, for each site or for none.
+        test: data to evaluate on, for each site or for none.
 
     Raises:
-        AspEnvError: not as many for each part, data that cannot be read, or a recording twice.
+        AspEnvError: the numbers differ, data cannot be read, or test recordings are also trained
+            or selected on.
     """
     for option, given in (("--validation", validation), ("--test", test)):
         if given and len(given) != len(data):
@@ -50,7 +71,7 @@ def open_sites(data: Sequence[str], validation: Sequence[str], test: Sequence[st
             )
     if validation and not test:
         raise AspEnvError(
-            "--validation: all of DATA is learned from then, so nothing is left to judge on; "
+            "--validation: all of DATA is trained on then, so nothing is left to evaluate on; "
             "give --test too"
         )
     return [
@@ -67,12 +88,12 @@ def open_sites(data: Sequence[str], validation: Sequence[str], test: Sequence[st
 def _open_site(name: str, data: str, validation: str | None, test: str | None) -> Site:
     opened = {given: open_data(given) for given in (data, validation, test) if given is not None}
     if test is not None:
-        judged = dict(zip(opened[test].hashes(), opened[test].names, strict=True))
+        names = dict(zip(opened[test].hashes(), opened[test].names, strict=True))
         for other in (each for each in (data, validation) if each is not None):
-            if both := set(judged) & set(opened[other].hashes()):
+            if both := set(names) & set(opened[other].hashes()):
                 raise AspEnvError(
-                    f"recording {judged[min(both)]} of {test!r} is in {other!r} too: judge on "
-                    "recordings that are neither learned from nor selected on"
+                    f"recording {names[min(both)]} of {test!r} is also in {other!r}: evaluate on "
+                    "recordings that are neither trained nor selected on"
                 )
     hashes = {given: recordings.data_hash() for given, recordings in opened.items()}
     return Site(
@@ -86,45 +107,47 @@ def _open_site(name: str, data: str, validation: str | None, test: str | None) -
     )
 
 
-SEGMENT_S = 3.0
-"""Runs for longer horizons that go on from others do so from one for this, of the same seed."""
+def site_names(data: Sequence[str]) -> list[str]:
+    """The name of each site: the last part of its path, without characters unfit for a file name.
 
-PHYSICAL = ("constant-velocity", "constant-turn-rate")
-"""These learn nothing; every table has them."""
-
-CAUSAL = "causal"
-"""The variant whose histories know nothing that came later; the physical ones have it too."""
-
-GIVEN = (CAUSAL, "no-trail", "long")
-"""Variants of what every predictor is given: compared with others of the same alone."""
+    Raises:
+        AspEnvError: two sites have the same name.
+    """
+    names = [each.rstrip("/").rpartition("/")[2].replace(":", "-") for each in data]
+    for name in names:
+        if names.count(name) > 1 or not name.strip("."):
+            raise AspEnvError(
+                f"DATA: {name!r} names {names.count(name)} sites; each needs a name of its own"
+            )
+    return names
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Cell:
-    """One predictor for one horizon at one site."""
+    """One predictor for one horizon and seed at one site."""
 
     site: str
     predictor: str
     horizon_s: float
     view: str = ""
-    """What it looks at; for a variant without the trail, the view with it."""
-    preset: str = ""
-    """Where it is another than the table's."""
+    """View of the network; for a variant without the trail, the view that has it."""
+    recipe: str = ""
+    """Recipe, if it is not the table's."""
     variant: str = ""
-    """A change of the recipe by name; none for the table itself."""
+    """Variant of the recipe; empty for the main table."""
     seed: int | None = None
-    """None for one that learns nothing."""
+    """None for a predictor without training."""
     start: "Cell | None" = None
-    """The cell whose weights it goes on from."""
+    """The cell whose weights the training starts from."""
 
     @property
     def label(self) -> str:
-        """Predictor, preset and variant."""
-        return "-".join(part for part in (self.predictor, self.preset, self.variant) if part)
+        """Predictor, recipe and variant."""
+        return "-".join(part for part in (self.predictor, self.recipe, self.variant) if part)
 
     @property
     def name(self) -> str:
-        """Where it lies below the folders of runs, errors and logs."""
+        """Path below the folders of runs, errors and logs."""
         parts = [self.site, self.view, self.label, f"{self.horizon_s:g}s"]
         if self.seed is not None:
             parts.append(f"seed{self.seed}")
@@ -133,20 +156,26 @@ class Cell:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class ModelSpec:
-    """A predictor of the table, by its recipe."""
+    """A predictor of the table and its recipe."""
 
     predictor: str
-    preset: str = ""
-    """Where it is another than the table's."""
+    recipe: str = ""
+    """Recipe, if it is not the table's."""
     warm_starts_from_3s: bool
-    """Whether a run for more than 3 s goes on from the weights of one for 3 s."""
+    """Whether a run for more than 3 s starts from the weights of a run for 3 s."""
 
     @classmethod
     def from_name(cls, name: str, warm_starts_from_3s: Callable[[str], bool]) -> "ModelSpec":
-        """Of `ssp-asp` or `ssp-asp:ours`; `warm_starts_from_3s` tells it of a predictor."""
-        predictor, _, preset = name.partition(":")
+        """Parses `PREDICTOR` or `PREDICTOR:RECIPE`.
+
+        Args:
+            name: such as `ssp-asp` or `ssp-asp:ours`.
+            warm_starts_from_3s: of a predictor, whether its runs for more than 3 s start from
+                runs for 3 s.
+        """
+        predictor, _, recipe = name.partition(":")
         return cls(
-            predictor=predictor, preset=preset, warm_starts_from_3s=warm_starts_from_3s(predictor)
+            predictor=predictor, recipe=recipe, warm_starts_from_3s=warm_starts_from_3s(predictor)
         )
 
 
@@ -157,9 +186,9 @@ class Ablation:
     predictor: str
     name: str
     horizons_s: tuple[float, ...]
-    """Those that it says something about."""
+    """Horizons that the variant is meant for."""
     warm_starts_from_3s: bool
-    """Whether a run for more than 3 s goes on from the weights of one for 3 s."""
+    """Whether a run for more than 3 s starts from the weights of a run for 3 s."""
 
 
 def choose_ablations(
@@ -167,74 +196,84 @@ def choose_ablations(
     variants: Mapping[str, Mapping[str, Any]],
     warm_starts_from_3s: Callable[[str, str], bool],
 ) -> list[Ablation]:
-    """The ablations of some names.
+    """Ablations by name.
 
     Args:
-        names: `none`, `all`, a name (of every predictor that has it) or `predictor:name`.
-        variants: by predictor and name; each with `horizons_s`.
-        warm_starts_from_3s: of a predictor and a name, whether runs for more than 3 s go on from others.
+        names: `none`, `all`, `VARIANT` (of every predictor that has it) or `PREDICTOR:VARIANT`.
+        variants: variants by predictor and name; each has `horizons_s`.
+        warm_starts_from_3s: of a predictor and a variant, whether runs for more than 3 s start
+            from runs for 3 s.
 
     Raises:
-        AspEnvError: no predictor has it.
+        AspEnvError: no predictor has such a variant.
     """
-    known = sorted({name for of in variants.values() for name in of})
+    known = sorted({name for by_name in variants.values() for name in by_name})
     chosen = []
     for given in names:
         if given == "none":
             continue
         predictor, _, name = given.rpartition(":")
-        found = [
+        matching = [
             Ablation(
                 predictor=each,
                 name=variant,
-                horizons_s=tuple(of[variant].horizons_s),
+                horizons_s=tuple(by_name[variant].horizons_s),
                 warm_starts_from_3s=warm_starts_from_3s(each, variant),
             )
-            for each, of in variants.items()
-            for variant in of
+            for each, by_name in variants.items()
+            for variant in by_name
             if name in ("all", variant) and predictor in ("", each)
         ]
-        if not found:
+        if not matching:
             raise unknown_name("ablation", given, ["none", "all", *known])
-        chosen += [each for each in found if each not in chosen]
+        chosen += [each for each in matching if each not in chosen]
     return chosen
 
 
 def plan_cells(
     *,
     sites: Sequence[str],
-    entrants: Sequence[ModelSpec],
+    models: Sequence[ModelSpec],
     views: Sequence[str],
     horizons_s: Sequence[float],
     seeds: Sequence[int],
     ablations: Sequence[Ablation] = (),
     ablation_view: str = "",
 ) -> list[Cell]:
-    """All cells, in the order in which they are best run: a whole table for one seed, then more.
+    """All cells in the order in which they run: the whole table for one seed, then for the next.
 
-    A cell stands behind the one that it starts from, even if nobody asked for that one.
-    Ablations are of the first site and one view.
+    A cell comes after the one that it starts from, which is added if it is not in the table.
+
+    Args:
+        sites: names of the sites.
+        models: predictors with training.
+        views: views of their networks.
+        horizons_s: horizons in seconds.
+        seeds: training seeds.
+        ablations: variants, which are run at the first site only.
+        ablation_view: the view of the ablations.
     """
     cells: list[Cell] = []
-    histories = ["", CAUSAL] if any(each.name == CAUSAL for each in ablations) else [""]
-    for site, horizon_s, predictor, variant in product(sites, horizons_s, PHYSICAL, histories):
+    variants = ["", CAUSAL] if any(each.name == CAUSAL for each in ablations) else [""]
+    for site, horizon_s, predictor, variant in product(sites, horizons_s, PHYSICAL, variants):
         _add(cells, Cell(site=site, predictor=predictor, horizon_s=horizon_s, variant=variant))
     for seed, site, horizon_s in product(seeds, sites, sorted(horizons_s)):
-        for view, entrant in product(views, entrants):
-            _add(cells, _base(site, view, entrant, horizon_s, seed))
+        for view, model in product(views, models):
+            _add(cells, _model_cell(site, view, model, horizon_s, seed))
     for seed, ablation in product(seeds, ablations):
         for horizon_s in sorted(set(horizons_s) & set(ablation.horizons_s)):
-            _add(cells, _changed(sites[0], ablation_view, ablation, horizon_s, seed))
+            _add(cells, _ablation_cell(sites[0], ablation_view, ablation, horizon_s, seed))
     return cells
 
 
-def _base(site: str, view: str, entrant: ModelSpec, horizon_s: float, seed: int) -> Cell:
-    later = horizon_s > SEGMENT_S and entrant.warm_starts_from_3s
-    start = _base(site, view, entrant, SEGMENT_S, seed) if later else None
+def _model_cell(site: str, view: str, model: ModelSpec, horizon_s: float, seed: int) -> Cell:
+    start = None
+    if horizon_s > SEGMENT_S and model.warm_starts_from_3s:
+        start = _model_cell(site, view, model, SEGMENT_S, seed)
     return Cell(
         site=site,
-        predictor=entrant.predictor,
-        preset=entrant.preset,
+        predictor=model.predictor,
+        recipe=model.recipe,
         view=view,
         horizon_s=horizon_s,
         seed=seed,
@@ -242,11 +281,11 @@ def _base(site: str, view: str, entrant: ModelSpec, horizon_s: float, seed: int)
     )
 
 
-def _changed(site: str, view: str, ablation: Ablation, horizon_s: float, seed: int) -> Cell:
+def _ablation_cell(site: str, view: str, ablation: Ablation, horizon_s: float, seed: int) -> Cell:
     start = None
     if horizon_s > SEGMENT_S and ablation.warm_starts_from_3s:
         if SEGMENT_S in ablation.horizons_s:
-            start = _changed(site, view, ablation, SEGMENT_S, seed)
+            start = _ablation_cell(site, view, ablation, SEGMENT_S, seed)
         else:
             start = Cell(
                 site=site,
@@ -267,20 +306,8 @@ def _changed(site: str, view: str, ablation: Ablation, horizon_s: float, seed: i
 
 
 def _add(cells: list[Cell], cell: Cell) -> None:
+    """Appends a cell behind the one that it starts from."""
     if cell.start is not None:
         _add(cells, cell.start)
     if cell not in cells:
         cells.append(cell)
-
-
-def site_names(data: Sequence[str]) -> list[str]:
-    """A name for each DATA: its folder's, fit for a path.
-
-    Raises:
-        AspEnvError: two have the same.
-    """
-    names = [each.rstrip("/").rpartition("/")[2].replace(":", "-") for each in data]
-    for name in names:
-        if names.count(name) > 1 or not name.strip("."):
-            raise AspEnvError(f"DATA: {name!r} names {names.count(name)} sites; one each is needed")
-    return names

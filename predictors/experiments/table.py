@@ -1,4 +1,4 @@
-"""`asp-env table`: what the paper's table has, trained and judged on any data."""
+"""`asp-env table`: the paper's table on any data, with ablations."""
 
 import fcntl
 import json
@@ -11,7 +11,6 @@ from typing import Annotated, Any
 import tyro
 from rich.console import Console
 
-from asp_env import registry
 from asp_env.data.recording import DEFAULT_DT_S, ticks
 from asp_env.errors import AspEnvError, MissingExtraError, unknown_name
 from asp_env.files import atomic_file, leftovers
@@ -29,94 +28,97 @@ from predictors.experiments.cells import (
     plan_cells,
     site_names,
 )
+from predictors.experiments.job import EvaluationJob, Job
 from predictors.experiments.results import ORACLE
 from predictors.experiments.tables import PAGE_WIDTH, export, read_findings, rows, tables
-from predictors.experiments.worker import Job, Judging
+from predictors.training.command import Train
 
 CHAININGS = ("top1", ORACLE)
-"""Judged besides a predictor's own way to chain segments."""
+"""Ways of chaining segments that are evaluated besides a predictor's own."""
 
 PLAN, LOCK = "plan.json", ".lock"
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Table:
-    """Train and judge what the paper's table has; started again, it goes on where it was.
+    """Train and evaluate the predictors of the paper's table; repeat to resume.
 
-    A folder may get more predictors, views, seeds, horizons and ablations later: what is finished
-    stays. Every seed of a predictor is a run of `asp-env train` in OUT/runs.
+    Predictors, views, seeds, horizons and ablations can be added to OUT later.
+
+    Every cell with a seed is a run of asp-env train, in OUT/runs.
     """
 
     data: Annotated[tyro.conf.Positional[tuple[str, ...]], tyro.conf.arg(metavar="DATA …")]
-    """What is learned from, a site each."""
+    """Training data; each DATA is a site of the table."""
     out: Path
-    """Folder of runs, errors and tables."""
+    """Folder of the runs, errors and tables."""
     validation: tuple[str, ...] = ()
-    """Data to select on, for each DATA; all of DATA is learned from then."""
+    """Data to select on, one for each DATA. Then all of DATA is trained on."""
     test: tuple[str, ...] = ()
-    """Data to judge on, for each DATA; without them, the part test of DATA."""
+    """Data to evaluate on, one for each DATA. The default is the part test of DATA."""
     recipe: str = "cpu"
-    """Recipes: cpu (minutes on two cores) or paper."""
+    """Training recipe: cpu (minutes on two cores) or paper."""
     views: tuple[str, ...] = ("chauffeurnet", "vectors")
-    """What networks look at."""
+    """Views of the networks."""
     predictors: tuple[str, ...] = ("mtp", "dkm", "ffw-asp", "ssp-asp")
-    """Rows, such as ssp-asp, or ssp-asp:ours for another preset."""
+    """Predictors, such as ssp-asp, or ssp-asp:ours with another recipe."""
     horizons: tuple[float, ...] = (3.0, 6.0)
-    """Columns, seconds. Those of ssp-asp over 3 s go on from the 3 s weights of the same seed."""
+    """Horizons in seconds. Runs of ssp-asp over 3 s start from the 3 s weights of the same seed."""
     seeds: tuple[int, ...] = (0, 1, 2)
-    """One run each."""
+    """Training seeds."""
     ablations: tuple[str, ...] = ("none",)
-    """Changes of recipes to try on the first DATA: none, all, or names such as no-trail or
-    ssp-asp:skip."""
+    """Variants of the recipes at the first site: none, all, or
+    names such as no-trail or ssp-asp:skip."""
     ablation_view: str = "chauffeurnet"
-    """What they look at."""
+    """View of the ablations."""
     jobs: int = 2
-    """Cells at a time, of one thread each; 0 prints what is there, even meanwhile."""
+    """Number of cells that run at a time, with one thread each.
+    0 prints the finished ones, even while another command runs."""
     per_recording: int | None = None
-    """Test snippets of each recording at most, at random."""
+    """Largest number of test snippets of each recording; they are chosen at random."""
     epochs: int | None = None
-    """Instead of the preset's; of each stage where there are two."""
+    """Number of epochs of each training stage instead of the recipe's."""
     max_snippets: int | None = None
-    """Learn from no more than so many, chosen at random."""
+    """Largest number of training snippets; they are chosen at random."""
 
     def run(self) -> None:
-        """Trains and judges what is not there yet, writes the folder, prints the tables.
+        """Runs the cells that are not finished, writes the folder and prints the tables.
 
         Raises:
-            AspEnvError: an option or the data are bad, or the folder holds another table.
-            SystemExit: of status 1, at the end, if a cell failed.
+            AspEnvError: an option or the data are bad, or the folder contains another table.
+            SystemExit: with status 1, at the end, if a cell failed.
         """
         self._check()
         cells = self._plan()
         sites = {site.name: site for site in open_sites(self.data, self.validation, self.test)}
         console = Console()
-        with _claimed(self.out, self._fixed(list(sites.values())), alone=self.jobs > 0):
+        with _claimed(self.out, self._fixed(list(sites.values())), exclusive=self.jobs > 0):
             jobs = {cell: self._job(cell, sites[cell.site]) for cell in cells}
             campaign = Campaign(jobs, self.out, console)
             campaign.run(self.jobs)
-            judged = {
-                cell: job.judging
+            evaluated = {
+                cell: job.evaluation
                 for cell, job in jobs.items()
-                if job.judging is not None and cell not in campaign.failed
+                if job.evaluation is not None and cell not in campaign.failed
             }
-            findings = read_findings(judged)
-            known = list(sites.values())
+            findings = read_findings(evaluated)
+            all_sites = list(sites.values())
             export(
                 self.out,
                 rows(findings, sites, self.recipe),
-                tables(findings, known, PAGE_WIDTH),
-                self._manifest(known, campaign),
+                tables(findings, all_sites, PAGE_WIDTH),
+                self._manifest(all_sites, campaign),
             )
-        for table in tables(findings, known, console.width):
+        for table in tables(findings, all_sites, console.width):
             console.print(table, "")
-        console.print(f"wrote {self.out}/report.html; what it took is in {self.out / COST}")
-        for cell, why in campaign.failed.items():
-            console.print(f"failed: {cell.name}: {why}", style="red", soft_wrap=True, markup=False)
+        console.print(f"wrote {self.out}/report.html; CPU times are in {self.out / COST}")
+        for cell, reason in campaign.failed.items():
+            line = f"failed: {cell.name}: {reason}"
+            console.print(line, style="red", soft_wrap=True, markup=False)
         if campaign.failed:
             raise SystemExit(1)
 
     def _check(self) -> None:
-        """Refuses options that no cell could be run with."""
         if not (self.data and self.views and self.predictors and self.horizons and self.seeds):
             raise AspEnvError("table: give DATA, views, predictors, horizons and seeds, each once")
         for view in (*self.views, self.ablation_view):
@@ -134,19 +136,18 @@ class Table:
         """All cells.
 
         Raises:
-            AspEnvError: there is no such recipe or ablation.
+            AspEnvError: a predictor, recipe or ablation is unknown.
         """
-        train = registry.find("commands", "train")
         try:
-            entrants = [
-                ModelSpec.from_name(name, train.warm_starts_from_3s) for name in self.predictors
-            ]
-            own = dict.fromkeys(each.predictor for each in entrants if not each.preset)
-            variants = {predictor: train.variants(predictor) for predictor in own}
-            ablations = choose_ablations(self.ablations, variants, train.warm_starts_from_3s)
+            from predictors.training.variants import VARIANTS, warm_starts_from_3s
+
+            models = [ModelSpec.from_name(name, warm_starts_from_3s) for name in self.predictors]
+            table_recipe = dict.fromkeys(each.predictor for each in models if not each.recipe)
+            variants = {predictor: VARIANTS.get(predictor, {}) for predictor in table_recipe}
+            ablations = choose_ablations(self.ablations, variants, warm_starts_from_3s)
             cells = plan_cells(
                 sites=site_names(self.data),
-                entrants=entrants,
+                models=models,
                 views=self.views,
                 horizons_s=self.horizons,
                 seeds=self.seeds,
@@ -154,29 +155,28 @@ class Table:
                 ablation_view=self.ablation_view,
             )
             for cell in cells:
-                self._recipes(cell)
+                self._configuration(cell)
         except ModuleNotFoundError as error:
             raise MissingExtraError(str(error.name), "train", "training") from error
         return cells
 
-    def _recipes(self, cell: Cell) -> dict[str, Any]:
-        """What the configuration of a cell's run must be, but for its data; nothing without one.
+    def _configuration(self, cell: Cell) -> dict[str, Any]:
+        """Configuration of a cell's run without its data, and defaults; empty without training.
 
         Raises:
             AspEnvError: there is no such recipe.
         """
         if cell.seed is None:
             return {}
-        train = registry.find("commands", "train")
-        config = train(**self._options(cell), data="", out=Path()).config_for(cell.horizon_s)
-        found = {"recipe": asdict(config), "defaults": _defaults(config)}
-        return json.loads(json.dumps(found))
+        config = Train(**self._options(cell), data="", out=Path()).config_for(cell.horizon_s)
+        fields = {"recipe": asdict(config), "defaults": _defaults(config)}
+        return json.loads(json.dumps(fields))
 
     def _options(self, cell: Cell) -> dict[str, Any]:
-        """The options of `train` that are not about data and folders."""
+        """Options of `train` except data and folders."""
         return {
             "predictor": cell.predictor,
-            "recipe": cell.preset or self.recipe,
+            "recipe": cell.recipe or self.recipe,
             "view": cell.view,
             "variant": cell.variant or None,
             "horizon": cell.horizon_s,
@@ -186,23 +186,22 @@ class Table:
         }
 
     def _job(self, cell: Cell, site: Site) -> Job:
-        """What the process of a cell does."""
         run = self.out / "runs" / cell.name
         train = None
         if cell.seed is not None:
             start = None if cell.start is None else str(self.out / "runs" / cell.start.name)
-            where = {"data": site.data, "validation": site.validation}
-            train = {**self._options(cell), **where, "out": str(run), "start": start}
+            data = {"data": site.data, "validation": site.validation}
+            train = {**self._options(cell), **data, "out": str(run), "start": start}
         if cell.horizon_s not in self.horizons:
-            return Job(train=train, judging=None, **self._recipes(cell))
+            return Job(train=train, evaluation=None, **self._configuration(cell))
         return Job(
             train=train,
-            **self._recipes(cell),
-            judging=Judging(
+            **self._configuration(cell),
+            evaluation=EvaluationJob(
                 predictor=cell.predictor,
                 run="" if train is None else str(run),
-                data=site.judged_on,
-                data_hash=site.judged_hash,
+                data=site.evaluated_on,
+                data_hash=site.evaluated_hash,
                 part="test" if site.test is None else "all",
                 horizon_s=cell.horizon_s,
                 history="causal" if cell.variant == CAUSAL else "recorded",
@@ -213,7 +212,7 @@ class Table:
         )
 
     def _fixed(self, sites: Sequence[Site]) -> dict[str, Any]:
-        """What all cells of a folder have in common, whenever they were run."""
+        """Content of `plan.json`: what all cells of a folder have in common."""
         hashes = {
             site.name: {k: v for k, v in asdict(site).items() if k.endswith("_hash")}
             for site in sites
@@ -233,47 +232,48 @@ class Table:
             "physical": PHYSICAL,
             "best-of-3": f"of the three most probable modes, {MODE_RULES['fde']}",
             "intervals": "95 %, bootstrap over recordings, of errors averaged over seeds",
-            "failed": {cell.name: why for cell, why in campaign.failed.items()},
+            "failed": {cell.name: reason for cell, reason in campaign.failed.items()},
         }
 
 
 def _defaults(config: Any) -> dict[str, Any]:
-    """Of a dataclass, those of its fields that have one, and of dataclasses in it."""
-    found = {each.name: each.default for each in fields(config) if each.default is not MISSING}
-    inner = {each.name: getattr(config, each.name) for each in fields(config)}
-    return found | {name: _defaults(value) for name, value in inner.items() if is_dataclass(value)}
+    """Defaults of the fields of a dataclass, and of the dataclasses in it."""
+    defaults = {each.name: each.default for each in fields(config) if each.default is not MISSING}
+    values = {each.name: getattr(config, each.name) for each in fields(config)}
+    inner = {name: _defaults(value) for name, value in values.items() if is_dataclass(value)}
+    return defaults | inner
 
 
 @contextmanager
-def _claimed(out: Path, fixed: dict[str, Any], *, alone: bool) -> Iterator[None]:
-    """The folder, for this table and, if `alone`, for this command.
+def _claimed(out: Path, fixed: dict[str, Any], *, exclusive: bool) -> Iterator[None]:
+    """Creates or checks the folder of the table and, if `exclusive`, locks it.
 
     Raises:
-        AspEnvError: it holds something else, or another command is at it.
+        AspEnvError: it contains something else, or another command has locked it.
     """
     path = out / PLAN
-    # An interrupted command may leave only these.
+    # A killed command may have left only these.
     begun = {LOCK, *(each.name for each in leftovers(path))}
     foreign = out.exists() and (not out.is_dir() or {each.name for each in out.iterdir()} - begun)
     if foreign and not path.exists():
-        raise AspEnvError(f"{out}: holds something that is no table; choose another --out")
+        raise AspEnvError(f"{out}: contains something that is no table; choose another --out")
     out.mkdir(parents=True, exist_ok=True)
     with (out / LOCK).open("w") as lock:
         try:
-            if alone:
+            if exclusive:
                 fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
         except OSError as error:
             raise AspEnvError(
-                f"{out}: another asp-env table is at it; --jobs 0 prints what is there"
+                f"{out}: another asp-env table uses it; --jobs 0 prints the finished cells"
             ) from error
-        same = json.loads(json.dumps(fixed))
+        expected = json.loads(json.dumps(fixed))
         if not path.exists():
             with atomic_file(path) as partial:
                 partial.write_text(json.dumps(fixed, indent=1) + "\n")
-        elif (found := _read_plan(path)) != same:
-            other = ", ".join(name for name in same if found.get(name) != same[name])
+        elif (plan := _read_plan(path)) != expected:
+            names = ", ".join(name for name in expected if plan.get(name) != expected[name])
             raise AspEnvError(
-                f"{out}: holds a table of other {other}; choose another --out or remove it"
+                f"{out}: contains a table with other {names}; choose another --out or remove it"
             )
         yield
 

@@ -1,7 +1,9 @@
-"""The table of Janjoš, Dolgov and Zöllner (2021): on inD and rounD, 3 s and 6 s.
+"""Tables of the results beside the numbers of the paper, and the files that they are written to.
 
-MERGED: The table in the paper's shape, the differences, and the ablations, for terminals and pages.
-MERGED: What is written and printed of findings: long form, page, and tables in the paper's shape.
+The paper is F. Janjoš, M. Dolgov and J. M. Zöllner, "Self-Supervised Action-Space Prediction for
+Automated Driving", IV 2021. Its table compares views and predictors on inD and rounD for horizons
+of 3 s and 6 s. The tables here have the same shape: a line for each view and predictor, a column
+for each site and horizon. The first site is compared with inD, the second one with rounD.
 """
 
 import io
@@ -21,6 +23,7 @@ from asp_env.evaluation.statistics import Estimate
 from asp_env.files import atomic_file
 from predictors.experiments.cells import Cell, Site
 from predictors.experiments.errors import Errors
+from predictors.experiments.job import EvaluationJob, errors_path
 from predictors.experiments.results import (
     CHOICES,
     FEATURES,
@@ -29,31 +32,30 @@ from predictors.experiments.results import (
     Choice,
     Findings,
     Key,
-    Number,
+    SeedMean,
     Sums,
     best_features,
     excludes_zero,
 )
-from predictors.experiments.worker import Judging, errors_path
 
-DATA = ("inD", "rounD")
-HORIZONS_S = (3.0, 6.0)
+PAPER_DATA = ("inD", "rounD")
+PAPER_HORIZONS_S = (3.0, 6.0)
 CAVEAT = "other data, not comparable in size"
 
 
-class Numbers(NamedTuple):
-    """Metres; MSE square metres."""
+class PaperErrors(NamedTuple):
+    """Errors in the paper, in metres and square metres."""
 
     mae: float
     mse: float
     fde: float
 
 
-PaperLine = tuple[Numbers, Numbers, Numbers, Numbers]
+PaperLine = tuple[PaperErrors, PaperErrors, PaperErrors, PaperErrors]
 
 
-def _line(*numbers: tuple[float, float, float]) -> PaperLine:
-    first, second, third, fourth = (Numbers(*each) for each in numbers)
+def _line(*errors: tuple[float, float, float]) -> PaperLine:
+    first, second, third, fourth = (PaperErrors(*each) for each in errors)
     return first, second, third, fourth
 
 
@@ -79,72 +81,80 @@ PAPER: Mapping[tuple[str, str], PaperLine] = MappingProxyType(
         ),
     }
 )
-"""By view and predictor: inD 3 s, inD 6 s, rounD 3 s, rounD 6 s."""
+"""The paper's table by view and predictor: inD 3 s, inD 6 s, rounD 3 s, rounD 6 s."""
 
 
-def paper_numbers(view: str, predictor: str, site: int, horizon_s: float) -> Numbers | None:
-    """What the paper has at a place of its table; None where it has nothing.
+def paper_errors(view: str, predictor: str, site: int, horizon_s: float) -> PaperErrors | None:
+    """The errors of a cell of the paper's table; None if the table has no such cell.
 
     Args:
-        view: of the table.
-        predictor: of the table.
-        site: 0 is inD, 1 is rounD.
-        horizon_s: seconds.
+        view: name of the view.
+        predictor: name of the predictor.
+        site: 0 for inD, 1 for rounD.
+        horizon_s: horizon in seconds.
     """
     line = PAPER.get((view, predictor))
-    if line is None or site >= len(DATA) or horizon_s not in HORIZONS_S:
+    if line is None or site >= len(PAPER_DATA) or horizon_s not in PAPER_HORIZONS_S:
         return None
-    return line[site * len(HORIZONS_S) + HORIZONS_S.index(horizon_s)]
+    return line[site * len(PAPER_HORIZONS_S) + PAPER_HORIZONS_S.index(horizon_s)]
 
 
 SHOWN = ("MAE", "MSE", "FDE")
 MARK = "*"
-SURE = f"{MARK} the interval excludes zero"
+SIGNIFICANT = f"{MARK} the interval excludes zero"
 COLUMN_WIDTH = 26
 LABEL_WIDTH = 28
 
-Line = tuple[str, str, str, str, str]
-"""View, predictor, preset, variant, chaining: a line of the table over all its columns."""
+
+class Line(NamedTuple):
+    """A line of a table, over all its columns."""
+
+    view: str
+    predictor: str
+    recipe: str = ""
+    variant: str = ""
+    chaining: str = ""
 
 
-def width_for(columns: int) -> int:
-    """Characters that a table of so many columns needs."""
+def table_width(columns: int) -> int:
+    """Width in characters of a table with this number of columns."""
     return LABEL_WIDTH + columns * COLUMN_WIDTH
 
 
 def main_table(
     findings: Findings, sites: Sequence[str], columns: Sequence[Key], choice: Choice
 ) -> Table:
-    """View and predictor by site and horizon: MAE / MSE / FDE, and the paper's below each.
+    """Errors by view and predictor (lines), site and horizon (columns), with those of the paper.
 
     Args:
-        findings: what was measured.
-        sites: all of them, in order: the first is set beside inD, the second beside rounD.
+        findings: results of the cells.
+        sites: names of all sites; the first is compared with inD, the second with rounD.
         columns: one key of each site and horizon that is shown.
         choice: selection of modes and subset of snippets.
     """
     table = _table(
         f"{choice.subset} targets, {choice.selection}: MAE m / MSE m² / FDE m, mean over seeds\n"
-        "[95 % interval over recordings] and ± deviation over seeds of FDE"
+        "FDE: [95 % interval over recordings] ± standard deviation over seeds"
     )
     table.caption = (
-        f"paper: Janjoš et al. 2021 on {' and '.join(DATA)}, which mode is not said;\n{CAVEAT};\n"
-        f"its SSP-ASP chains 6 s by label matching, as {ORACLE} {MARK} here does:\n"
-        f"{MARK} is handed the recorded future"
+        f"paper: Janjoš et al. 2021 on {' and '.join(PAPER_DATA)}, mode not stated;\n{CAVEAT};\n"
+        f"its SSP-ASP chains segments for 6 s by label matching, as {ORACLE} {MARK} does;\n"
+        f"{MARK} uses the recorded future"
     )
-    _heads(table, sites, columns)
+    _add_columns(table, sites, columns)
     lines = _lines(findings, columns, lambda key: not key.variant)
-    lines += [line for each in PAPER if (line := (*each, "", "", "")) not in lines]
+    lines += [line for each in PAPER if (line := Line(*each)) not in lines]
     for view, members in _by_view(lines).items():
         _section(table, view)
         for line in members:
             cells = []
             for column in columns:
-                cell = _means(findings.numbers(_key(line, column), choice))
-                paper = paper_numbers(line[0], line[1], sites.index(column.site), column.horizon_s)
+                cell = _means(findings.means(_key(line, column), choice))
+                site = sites.index(column.site)
+                paper = paper_errors(line.view, line.predictor, site, column.horizon_s)
                 if paper is not None and not any(line[2:]):
-                    said = " / ".join(f"{value:.2f}" for value in paper)
-                    cell.append(f"{chr(10) if cell else ''}paper {said}", style="dim")
+                    errors = " / ".join(f"{value:.2f}" for value in paper)
+                    cell.append(f"{chr(10) if cell else ''}paper {errors}", style="dim")
                 cells.append(cell)
             table.add_row(_name(line), *cells)
     return table
@@ -153,13 +163,20 @@ def main_table(
 def difference_table(
     findings: Findings, sites: Sequence[str], columns: Sequence[Key], choice: Choice
 ) -> Table:
-    """View, predictor and whom it is compared with by site and horizon."""
+    """Differences to the reference predictors by view and predictor, site and horizon.
+
+    Args:
+        findings: results of the cells.
+        sites: names of all sites.
+        columns: one key of each site and horizon that is shown.
+        choice: selection of modes and subset of snippets.
+    """
     table = _table(
-        f"{choice.subset} targets, {choice.selection}: what is between MAE m / MSE m² / FDE m\n"
-        "paired over snippets and seeds; [95 % interval over recordings] of FDE"
+        f"{choice.subset} targets, {choice.selection}: differences of MAE m / MSE m² / FDE m\n"
+        "paired over snippets and seeds; FDE: [95 % interval over recordings]"
     )
-    table.caption = f"{SURE}; {ORACLE} {MARK} is handed the recorded future"
-    _heads(table, sites, columns)
+    table.caption = f"{SIGNIFICANT}; {ORACLE} {MARK} uses the recorded future"
+    _add_columns(table, sites, columns)
     for view, members in _by_view(_lines(findings, columns, lambda k: not k.variant)).items():
         _section(table, view)
         for line in members:
@@ -167,7 +184,9 @@ def difference_table(
             others = [{each.predictor: each for each in findings.references(key)} for key in keys]
             for name in dict.fromkeys(name for each in others for name in each):
                 cells = [
-                    _less(findings.differences(key, each[name], choice)) if name in each else ""
+                    _differences(findings.differences(key, each[name], choice))
+                    if name in each
+                    else ""
                     for key, each in zip(keys, others, strict=True)
                 ]
                 table.add_row(f"{_name(line)}\n  less {_upper(name)}", *cells)
@@ -175,31 +194,42 @@ def difference_table(
 
 
 def ablation_table(findings: Findings, column: Key, choice: Choice) -> Table:
-    """Predictor and change: what it makes of the line without it, and of the features."""
+    """Differences of variants to their recipes, and feature statistics.
+
+    Args:
+        findings: results of the cells.
+        column: one key of the site and horizon that is shown.
+        choice: selection of modes and subset of snippets.
+    """
     table = _table(
         f"{column.site}, {column.horizon_s:g} s, {choice.subset} targets, {choice.selection}\n"
-        "a change less the recipe without it: MAE m / MSE m² / FDE m\n"
-        "paired over snippets and seeds; [95 % interval over recordings] of FDE"
+        "differences of the variants to the recipe: MAE m / MSE m² / FDE m\n"
+        "paired over snippets and seeds; FDE: [95 % interval over recordings]"
     )
-    table.caption = f"{SURE}\nR² of ẑ, deviation and effective rank of z on validation"
+    table.caption = (
+        f"{SIGNIFICANT}\non validation: R² of ẑ, standard deviation and effective rank of z"
+    )
     table.add_column("", no_wrap=True)
-    for heading in ("change", "FDE less DKM's"):
+    for heading in ("less recipe", "FDE less DKM"):
         table.add_column(heading, no_wrap=True)
-    for heading in ("R²", "dev.", "rank"):
+    for heading in ("R²", "std.", "rank"):
         table.add_column(heading, justify="right", no_wrap=True)
     lines = _lines(findings, [column], lambda key: key.view != "" and not key.chaining)
-    changed = {(line[0], line[1]) for line in lines if line[3]}
-    for view, members in _by_view([each for each in lines if each[:2] in changed]).items():
+    with_variants = {line[:2] for line in lines if line.variant}
+    for view, members in _by_view([line for line in lines if line[:2] in with_variants]).items():
         _section(table, view)
-        for line in sorted(members, key=lambda line: [each[1] for each in members].index(line[1])):
+        predictors = [line.predictor for line in members]
+        for line in sorted(members, key=lambda line: predictors.index(line.predictor)):
             key = _key(line, column)
             base = findings.base(key)
-            change = Text("the recipe")
+            to_recipe = Text("the recipe")
             if base is not None:
-                change = _less(findings.differences(key, base, choice))
+                to_recipe = _differences(findings.differences(key, base, choice))
             dkm = next((k for k in findings.references(key) if k.predictor == "dkm"), None)
-            less = _less(findings.differences(key, dkm, choice), ("FDE",)) if dkm else Text()
-            table.add_row(_name(line), change, less, *_feature_table(findings, key))
+            to_dkm = Text()
+            if dkm is not None:
+                to_dkm = _differences(findings.differences(key, dkm, choice), ("FDE",))
+            table.add_row(_name(line), to_recipe, to_dkm, *_feature_cells(findings, key))
     return table
 
 
@@ -207,12 +237,12 @@ def _table(title: str) -> Table:
     return Table(title=title, box=box.SIMPLE_HEAD, show_edge=False, padding=(0, 1, 0, 0))
 
 
-def _heads(table: Table, sites: Sequence[str], columns: Sequence[Key]) -> None:
+def _add_columns(table: Table, sites: Sequence[str], columns: Sequence[Key]) -> None:
     table.add_column("")
     for column in columns:
         site = sites.index(column.site)
-        beside = f"\nbeside {DATA[site]}" if site < len(DATA) else ""
-        heading = f"{column.site}\n{column.horizon_s:g} s{beside}"
+        paper = f"\n(paper: {PAPER_DATA[site]})" if site < len(PAPER_DATA) else ""
+        heading = f"{column.site}\n{column.horizon_s:g} s{paper}"
         table.add_column(heading, min_width=COLUMN_WIDTH - 1)
 
 
@@ -221,61 +251,63 @@ def _section(table: Table, view: str) -> None:
         table.add_row(Text(view, style="bold"))
 
 
-def _lines(findings: Findings, columns: Sequence[Key], wanted: Callable[[Key], bool]) -> list[Line]:
-    """The lines that have something in one of the columns, in the order of the findings."""
-    places = {(column.site, column.horizon_s) for column in columns}
-    found = (
-        (key.view, key.predictor, key.preset, key.variant, key.chaining)
+def _lines(
+    findings: Findings, columns: Sequence[Key], is_shown: Callable[[Key], bool]
+) -> list[Line]:
+    """The lines that have results in any of the columns, in the order of the findings."""
+    lines = (
+        Line(key.view, key.predictor, key.recipe, key.variant, key.chaining)
         for key in findings.sums
-        if (key.site, key.horizon_s) in places and wanted(key)
+        if any(_same_column(key, column) for column in columns) and is_shown(key)
     )
-    return list(dict.fromkeys(found))
+    return list(dict.fromkeys(lines))
 
 
 def _by_view(lines: Sequence[Line]) -> dict[str, list[Line]]:
-    found: dict[str, list[Line]] = {}
+    by_view: dict[str, list[Line]] = {}
     for line in lines:
-        found.setdefault(line[0], []).append(line)
-    return found
+        by_view.setdefault(line.view, []).append(line)
+    return by_view
 
 
 def _key(line: Line, column: Key) -> Key:
-    view, predictor, preset, variant, chaining = line
-    return column._replace(
-        view=view, predictor=predictor, preset=preset, variant=variant, chaining=chaining
-    )
+    return column._replace(**line._asdict())
+
+
+def _same_column(key: Key, column: Key) -> bool:
+    return (key.site, key.horizon_s) == (column.site, column.horizon_s)
 
 
 def _name(line: Line) -> str:
-    _, predictor, preset, variant, chaining = line
-    parts = [_upper(predictor), preset, variant, chaining]
-    return " ".join(part for part in parts if part) + (f" {MARK}" if chaining == ORACLE else "")
+    parts = [_upper(line.predictor), line.recipe, line.variant, line.chaining]
+    mark = f" {MARK}" if line.chaining == ORACLE else ""
+    return " ".join(part for part in parts if part) + mark
 
 
 def _upper(predictor: str) -> str:
     return predictor if predictor.startswith("constant") else predictor.upper()
 
 
-def _means(found: Mapping[str, Number]) -> Text:
-    if not found:
+def _means(means: Mapping[str, SeedMean]) -> Text:
+    if not means:
         return Text()
-    text = Text(" / ".join(f"{found[metric].estimate.value:.2f}" for metric in SHOWN))
-    spread = found["FDE"].spread
-    about = _interval(found["FDE"].estimate) + ("" if spread is None else f" ±{spread:.2f}")
-    return text.append(f"\n{about.strip()}", style="dim") if about else text
+    text = Text(" / ".join(f"{means[metric].estimate.value:.2f}" for metric in SHOWN))
+    spread = means["FDE"].spread
+    range_text = _interval(means["FDE"].estimate) + ("" if spread is None else f" ±{spread:.2f}")
+    return text.append(f"\n{range_text.strip()}", style="dim") if range_text else text
 
 
-def _less(found: Mapping[str, Number], shown: Sequence[str] = SHOWN) -> Text:
-    if not found:
+def _differences(means: Mapping[str, SeedMean], shown: Sequence[str] = SHOWN) -> Text:
+    if not means:
         return Text()
     text = Text()
     for number, metric in enumerate(shown):
-        estimate = found[metric].estimate
-        sure = excludes_zero(estimate)
-        style = ("green" if estimate.value < 0 else "red") if sure else ""
+        estimate = means[metric].estimate
+        significant = excludes_zero(estimate)
+        style = ("green" if estimate.value < 0 else "red") if significant else ""
         text.append(" / " if number else "")
-        text.append(f"{estimate.value:+.2f}{MARK if sure else ''}", style=style)
-    interval = _interval(found["FDE"].estimate)
+        text.append(f"{estimate.value:+.2f}{MARK if significant else ''}", style=style)
+    interval = _interval(means["FDE"].estimate)
     return text.append(f"\n{interval}", style="dim") if interval else text
 
 
@@ -285,7 +317,7 @@ def _interval(estimate: Estimate) -> str:
     return f"[{estimate.low:.2f}, {estimate.high:.2f}]"
 
 
-def _feature_table(findings: Findings, key: Key) -> list[str]:
+def _feature_cells(findings: Findings, key: Key) -> list[str]:
     seeds = [each for each in findings.features.get(key, ()) if each]
     if not seeds:
         return ["", "", ""]
@@ -298,6 +330,7 @@ def _feature_table(findings: Findings, key: Key) -> list[str]:
 
 REPORT, TEXT = "report.html", "table.txt"
 PAGE_WIDTH = 200
+"""Width of the tables in both files, in characters."""
 
 PAGE = """<!DOCTYPE html>
 <html lang="en"><head><meta charset="UTF-8"><title>The paper's table</title>
@@ -307,61 +340,75 @@ pre {{ font-family: ui-monospace, Menlo, Consolas, monospace; line-height: 1.25;
 """
 
 
-def read_findings(judged: Mapping[Cell, Judging]) -> Findings:
-    """What was kept of the cells that are finished."""
+def read_findings(jobs: Mapping[Cell, EvaluationJob]) -> Findings:
+    """Reads the results of the cells whose jobs are done.
+
+    Raises:
+        AspEnvError: cells of one site and horizon were evaluated on different snippets.
+    """
     sums: dict[Key, dict[int, Sums]] = {}
     features: dict[Key, list[dict[str, float]]] = {}
-    for cell, judging in judged.items():
-        if not judging.done:
+    for cell, job in jobs.items():
+        if not job.done:
             continue
         seed = NO_SEED if cell.seed is None else cell.seed
-        for chaining in ("", *judging.chainings):
-            path = errors_path(judging.errors, chaining)
+        for chaining in ("", *job.chainings):
+            path = errors_path(job.errors, chaining)
             if path.exists():
                 sums.setdefault(Key.of(cell, chaining), {})[seed] = Sums.of(Errors.load(path))
-        if judging.run:
-            features.setdefault(Key.of(cell), []).append(best_features(Path(judging.run)))
+        if job.run:
+            features.setdefault(Key.of(cell), []).append(best_features(Path(job.run)))
     return Findings(sums=sums, features=features)
 
 
 def tables(findings: Findings, sites: Sequence[Site], width: int) -> list[Table]:
-    """All tables, in the paper's shape where they fit, and site by site where they do not."""
-    places = {(key.site, key.horizon_s): key for key in findings.sums}
+    """All tables that have results.
+
+    Args:
+        findings: results of the cells.
+        sites: all sites.
+        width: width in characters. If a table with all columns is wider, there is one for each
+            site.
+    """
+    by_column = {(key.site, key.horizon_s): key for key in findings.sums}
     names = [site.name for site in sites]
-    columns = [places[place] for place in sorted(places, key=lambda p: (names.index(p[0]), p[1]))]
+    order = sorted(by_column, key=lambda column: (names.index(column[0]), column[1]))
+    columns = [by_column[column] for column in order]
     if not columns:
         return []
-    if width_for(len(columns)) <= width:
+    if table_width(len(columns)) <= width:
         groups = [columns]
     else:
-        groups = [[c for c in columns if c.site == name] for name in names]
-    found = []
+        groups = [[column for column in columns if column.site == name] for name in names]
+    shown = []
     for choice in CHOICES:
         for group in filter(None, groups):
-            found.append(main_table(findings, names, group, choice))
-            found.append(difference_table(findings, names, group, choice))
+            shown.append(main_table(findings, names, group, choice))
+            shown.append(difference_table(findings, names, group, choice))
     for column in columns:
-        if any(key.variant and key.view and _same_place(key, column) for key in findings.sums):
+        if any(key.variant and key.view and _same_column(key, column) for key in findings.sums):
             moving = (choice for choice in CHOICES if choice.subset == "moving")
-            found += [ablation_table(findings, column, choice) for choice in moving]
-    return found
+            shown += [ablation_table(findings, column, choice) for choice in moving]
+    return shown
 
 
-def _same_place(key: Key, column: Key) -> bool:
-    return (key.site, key.horizon_s) == (column.site, column.horizon_s)
+def rows(findings: Findings, sites: Mapping[str, Site], recipe: str) -> list[Row]:
+    """Lines of `metrics.csv`: means, deviations over seeds, differences, feature statistics.
 
-
-def rows(findings: Findings, sites: Mapping[str, Site], preset: str) -> list[Row]:
-    """The long form: means, deviations over seeds, differences, and what is known of features."""
+    Args:
+        findings: results of the cells.
+        sites: sites by name.
+        recipe: the table's recipe.
+    """
     found: list[Row] = []
     for key in findings.sums:
         site = sites[key.site]
-        who: dict[str, Any] = {
-            "data": site.judged_on,
+        common: dict[str, Any] = {
+            "data": site.evaluated_on,
             "predictor": key.predictor,
             "trained_on": site.data if key.view else "",
             "view": key.view,
-            "recipe": _preset(key, preset),
+            "recipe": _full_recipe(key, recipe),
             "chaining": key.chaining,
             "horizon_s": key.horizon_s,
         }
@@ -369,28 +416,28 @@ def rows(findings: Findings, sites: Mapping[str, Site], preset: str) -> list[Row
         others = [(f" less {each.predictor}", each) for each in findings.references(key)]
         others += [] if base is None else [(" less the recipe", base)]
         for choice in CHOICES:
-            found += _rows(who, choice, findings.numbers(key, choice))
-            for ending, other in others:
-                found += _rows(who, choice, findings.differences(key, other, choice), ending)
-        for name, values in _feature_rows(findings, key).items():
+            found += _rows(common, choice, findings.means(key, choice))
+            for suffix, other in others:
+                found += _rows(common, choice, findings.differences(key, other, choice), suffix)
+        for name, values in _features_by_name(findings, key).items():
             value = sum(values) / len(values)
-            found.append(Row(**who, metric=name, value=value, n=len(values)))
+            found.append(Row(**common, metric=name, value=value, n=len(values)))
     return found
 
 
 def _rows(
-    who: Mapping[str, Any], choice: Choice, numbers: Mapping[str, Number], ending: str = ""
+    common: Mapping[str, Any], choice: Choice, means: Mapping[str, SeedMean], suffix: str = ""
 ) -> Iterator[Row]:
-    for metric, (estimate, spread) in numbers.items():
-        name = metric + ending
-        where = {**who, **choice._asdict(), "n": estimate.n}
+    for metric, (estimate, spread) in means.items():
+        name = metric + suffix
+        fields = {**common, **choice._asdict(), "n": estimate.n}
         low, high = estimate.low, estimate.high
-        yield Row(**where, metric=name, value=estimate.value, low=low, high=high)
+        yield Row(**fields, metric=name, value=estimate.value, low=low, high=high)
         if spread is not None:
-            yield Row(**where, metric=f"{name}, deviation over seeds", value=spread)
+            yield Row(**fields, metric=f"{name}, deviation over seeds", value=spread)
 
 
-def _feature_rows(findings: Findings, key: Key) -> dict[str, list[float]]:
+def _features_by_name(findings: Findings, key: Key) -> dict[str, list[float]]:
     by_name: dict[str, list[float]] = {}
     for seed in findings.features.get(key, ()):
         for name, value in seed.items():
@@ -398,23 +445,30 @@ def _feature_rows(findings: Findings, key: Key) -> dict[str, list[float]]:
     return by_name
 
 
-def _preset(key: Key, preset: str) -> str:
-    """As checkpoints call it: the recipe, and its change."""
+def _full_recipe(key: Key, recipe: str) -> str:
+    """Recipe and variant, as in checkpoints."""
     if not key.view:
         return key.variant
-    return "+".join(part for part in (key.preset or preset, key.variant) if part)
+    return "+".join(part for part in (key.recipe or recipe, key.variant) if part)
 
 
 def export(
-    out: Path, found: Sequence[Row], shown: Sequence[Table], manifest: Mapping[str, Any]
+    out: Path, lines: Sequence[Row], shown: Sequence[Table], manifest: Mapping[str, Any]
 ) -> None:
-    """Replaces the results in the table's folder, each file whole."""
+    """Replaces the result files in the folder of the table, each of them at once.
+
+    Args:
+        out: folder of the table.
+        lines: lines of `metrics.csv`.
+        shown: tables of `report.html` and `table.txt`.
+        manifest: content of `manifest.json`.
+    """
     page = Console(record=True, width=PAGE_WIDTH, file=io.StringIO())
     for table in shown:
         page.print(table, "")
     text = page.export_text(clear=False)
     html = page.export_html(theme=DEFAULT_TERMINAL_THEME, code_format=PAGE)
-    write_metrics(out, found)
+    write_metrics(out, lines)
     write_manifest(out, "table", **manifest)
     for name, content in ((TEXT, text), (REPORT, html)):
         with atomic_file(out / name) as partial:

@@ -1,7 +1,6 @@
 """The command `asp-env train`; importing it needs neither torch nor Lightning."""
 
 import dataclasses
-from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any, Literal
@@ -96,24 +95,6 @@ class Train:
             run = train(config, self.data, self.out, start=self.start, hardware=hardware)
         if is_first_process():
             Console().print(f"wrote {run}: name it as {self.predictor}:{run}")
-
-    @staticmethod
-    def warm_starts_from_3s(predictor: str, variant: str | None = None) -> bool:
-        """Whether a run for more than 3 s starts from a run for 3 s.
-
-        Raises:
-            AspEnvError: The predictor has no such variant.
-        """
-        from predictors.training.variants import warm_starts_from_3s
-
-        return warm_starts_from_3s(predictor, variant)
-
-    @staticmethod
-    def variants(predictor: str) -> Mapping[str, Any]:
-        """The variants of a predictor by name."""
-        from predictors.training.variants import VARIANTS
-
-        return VARIANTS.get(predictor, {})
 
     def config_for(self, horizon_s: float) -> Any:
         """The configuration of a run for a horizon in seconds.

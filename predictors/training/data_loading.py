@@ -5,23 +5,21 @@ pays where a GPU is faster than one thread. Each process opens the recordings it
 the same cache. Batches come in their order and are equal bit for bit, wherever they are made.
 """
 
-import os
-import threading
 from collections import deque
 from collections.abc import Callable, Iterable, Iterator, Sequence
-from concurrent.futures import Future, ProcessPoolExecutor, ThreadPoolExecutor
+from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import contextmanager
 from dataclasses import dataclass
+from functools import partial
 from itertools import islice
-from multiprocessing import connection, parent_process
 from typing import final
 
 import torch
-from torch import multiprocessing
 
 from asp_env.data.recording import Recording
 from asp_env.data.snippets import SnippetIndex, gather_future, gather_scene
 from asp_env.views import SceneView
+from asp_env.workers import WorkerPool
 from predictors.models.batch import Batch, Labels, make_batch, make_labels
 
 PREFETCH = 4
@@ -64,20 +62,17 @@ class BatchWorkers:
     def __init__(self, sources: Sequence[BatchSource], processes: int) -> None:
         """Starts the processes; each of them has all the sources."""
         self.prefetch = PREFETCH * processes
-        self._pool = ProcessPoolExecutor(
-            processes,
-            mp_context=multiprocessing.get_context("spawn"),  # GPUs and threads survive no fork
-            initializer=_begin,
-            initargs=(tuple(sources),),
+        self._pool = WorkerPool(
+            partial(_load, tuple(sources)), processes, initializer=_use_one_thread
         )
 
     def submit(self, source: int, snippets: SnippetIndex) -> Future[Sample]:
         """Starts to make a batch of the snippets from the source of that index."""
-        return self._pool.submit(_load, source, snippets)
+        return self._pool.submit((source, snippets))
 
     def close(self) -> None:
         """Cancels the batches that are not begun, and ends the processes."""
-        self._pool.shutdown(cancel_futures=True)
+        self._pool.close()
 
 
 @contextmanager
@@ -130,24 +125,10 @@ def _in_order(
         yield ready
 
 
-_sources: tuple[BatchSource, ...] = ()
-"""The sources of this process, if it is one of `BatchWorkers`."""
-
-
-def _begin(sources: tuple[BatchSource, ...]) -> None:
-    global _sources
-    _sources = sources
+def _use_one_thread() -> None:
     torch.set_num_threads(1)
-    threading.Thread(target=_end_with_parent, daemon=True).start()
 
 
-def _end_with_parent() -> None:
-    """Ends this process when its parent ends; a parent that is killed cannot shut the pool down."""
-    parent = parent_process()
-    if parent is not None:
-        connection.wait([parent.sentinel])
-        os._exit(1)
-
-
-def _load(source: int, snippets: SnippetIndex) -> Sample:
-    return _sources[source].load(snippets)
+def _load(sources: tuple[BatchSource, ...], request: tuple[int, SnippetIndex]) -> Sample:
+    source, snippets = request
+    return sources[source].load(snippets)

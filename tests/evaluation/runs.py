@@ -1,4 +1,4 @@
-"""A made-up run folder, as the commands leave one behind."""
+"""An artificial run folder like those that the commands write."""
 
 import csv
 import json
@@ -39,27 +39,27 @@ SUBSETS = {
     "manoeuvre:left": 1.2,
     "manoeuvre:right": 1.1,
 }
-"""How hard each is, as a factor on the errors."""
+"""Factor on the errors, by subset."""
 
 
 def metric_rows() -> list[dict[str, object]]:
-    """Long-form rows of four predictors and five drivers."""
+    """Rows of four predictors in open loop and five methods in closed loop."""
     rows: list[dict[str, object]] = []
     for predictor, error in ERRORS_M.items():
-        for subset, hard in SUBSETS.items():
+        for subset, factor in SUBSETS.items():
             for selection, share in (("most-probable", 1.0), ("best-of-3", 0.6)):
-                fde = error * hard * (share if predictor.startswith("ffw") else 1.0)
+                fde = error * factor * (share if predictor.startswith("ffw") else 1.0)
                 values = {"MAE": fde * 0.2, "MSE": fde**2 * 0.1, "FDE": fde, "ADE": fde * 0.4}
                 values["miss"] = min(fde / 5, 1)
-                values["FDE / constant velocity"] = fde / (3.8 * hard)
+                values["FDE / constant velocity"] = fde / (3.8 * factor)
                 values |= {f"L2@{s}s": fde * (s / 3) ** 1.8 for s in (0.6, 1.0, 2.0, 3.0)}
-                head = {"predictor": predictor, "horizon_s": "3", "selection": selection}
+                common = {"predictor": predictor, "horizon_s": "3", "selection": selection}
                 rows += [
-                    {**head, "subset": subset, "metric": name, **interval(value)}
+                    {**common, "subset": subset, "metric": name, **interval(value)}
                     for name, value in values.items()
                 ]
     for (planner, predictor), score in SCORES.items():
-        head = {"planner": planner, "predictor": predictor, "traffic": "idm", "latency_ticks": 0}
+        common = {"planner": planner, "predictor": predictor, "traffic": "idm", "latency_ticks": 0}
         values = {
             "score": score,
             "no collision": score**0.4,
@@ -71,7 +71,7 @@ def metric_rows() -> list[dict[str, object]]:
             "comfort": 0.6 + 0.3 * score,
         }
         rows += [
-            {**head, "subset": subset, "metric": name, **interval(value * share)}
+            {**common, "subset": subset, "metric": name, **interval(value * share)}
             for subset, share in (("all", 1.0), ("left", 0.9))
             for name, value in values.items()
         ]
@@ -79,18 +79,18 @@ def metric_rows() -> list[dict[str, object]]:
 
 
 def interval(value: float) -> dict[str, object]:
-    """A value with an interval of ten percent to each side."""
+    """A value with an interval of ten percent on each side."""
     return {"value": value, "low": value * 0.9, "high": value * 1.1, "n": 240}
 
 
 def write_tables(out: Path, rows: Sequence[dict[str, object]]) -> None:
-    """`metrics.csv` and `manifest.json`."""
+    """Writes `metrics.csv` and `manifest.json`."""
     out.mkdir(parents=True, exist_ok=True)
     with (out / "metrics.csv").open("w", newline="") as file:
         writer = csv.DictWriter(file, list[str](COLUMNS))
         writer.writeheader()
         writer.writerows(rows)
-    told = {
+    manifest = {
         "command": "asp-env demo",
         "data": "sample:intersection",
         "data_hash": "3f2a9c",
@@ -99,17 +99,17 @@ def write_tables(out: Path, rows: Sequence[dict[str, object]]) -> None:
         "configuration": {"view": "chauffeurnet", "dt_s": 0.2, "limits": {"braking_mps2": 5.0}},
         "versions": {"asp-env": "0.1.0", "numpy": "2.4.6"},
     }
-    (out / "manifest.json").write_text(json.dumps(told))
+    (out / "manifest.json").write_text(json.dumps(manifest))
 
 
 def forked(scene: Scene, *, steps: int, bend: float) -> Forecast:
-    """Three modes: straight on, and two that bend away by `bend` times half a metre/s²."""
+    """Three modes: straight on, and accelerated to either side by `bend` times 0.5 m/s²."""
     straight = constant_velocity(scene, steps=steps)[:, None].repeat(3, axis=1)
     time_s = scene.dt_s * np.arange(1, steps + 1)
     heading = scene.target_states[:, 2]
-    aside = np.stack([-np.sin(heading), np.cos(heading)], axis=-1)[:, None, None]
-    lean = np.array([0.0, 1.0, -1.0])[:, None, None] * (bend * 0.25 * time_s**2)[:, None]
-    straight[..., :2] += aside * lean
+    left = np.stack([-np.sin(heading), np.cos(heading)], axis=-1)[:, None, None]
+    offset_m = np.array([0.0, 1.0, -1.0])[:, None, None] * (bend * 0.25 * time_s**2)[:, None]
+    straight[..., :2] += left * offset_m
     log_probs = np.log(np.tile([0.6, 0.25, 0.15], (len(straight), 1)))
     return make_forecast(
         scene,
@@ -121,11 +121,11 @@ def forked(scene: Scene, *, steps: int, bend: float) -> Forecast:
 
 
 def make_examples(recordings: Sequence[Recording], *, count: int) -> ForecastExamples:
-    """Some situations with all their targets, and three made-up predictors' words on them."""
+    """Some situations with all their targets, and forecasts of three artificial predictors."""
     index = index_snippets(recordings, dt_s=0.2, horizon_s=3.0)
     keys = index.recording * 100_000 + index.tick
-    found, sizes = np.unique(keys, return_counts=True)
-    chosen = np.sort(found[np.argsort(-sizes, kind="stable")[: 3 * count]])[::3]
+    situations, sizes = np.unique(keys, return_counts=True)
+    chosen = np.sort(situations[np.argsort(-sizes, kind="stable")[: 3 * count]])[::3]
     index = index.select(np.isin(keys, chosen))
     scene = gather_scene(recordings, index)
     return ForecastExamples(
@@ -146,28 +146,28 @@ def make_rollout(
     """A drive in which the ego follows its track a little behind, with all that is logged."""
     stride = round(0.2 * recording.frame_rate_hz)
     frames = (start_tick + np.arange(length + 1)) * stride
-    seen = recording.tracks_between(int(frames[0]), int(frames[-1]))
-    order = np.concatenate([[track], seen[seen != track]])
+    present = recording.tracks_between(int(frames[0]), int(frames[-1]))
+    order = np.concatenate([[track], present[present != track]])
     rows = frames - recording.first_frames[order][:, None]
     valid = ((rows >= 0) & (frames <= recording.last_frames[order][:, None])).T
     rows = np.clip(rows, 0, np.diff(recording.starts)[order][:, None] - 1)
     log = recording.states[recording.starts[order][:, None] + rows].transpose(1, 0, 2)
     log = np.where(valid[..., None], log, 0).astype(np.float32)
     states = log.copy()
-    late = np.maximum(np.arange(length + 1) * (1 - lag), 0)
+    delayed = np.maximum(np.arange(length + 1) * (1 - lag), 0)
     for axis in range(4):
-        states[:, 0, axis] = np.interp(late, np.arange(length + 1), np.unwrap(log[:, 0, axis]))
+        states[:, 0, axis] = np.interp(delayed, np.arange(length + 1), np.unwrap(log[:, 0, axis]))
     steps = np.arange(1, 16) * 0.2
     slots = np.flatnonzero(valid[:, 1:].any(axis=0))[:12] + 1
-    ticks, who = np.nonzero(valid[:length, slots])
-    now = states[ticks, slots[who]]
-    lean = np.array([0.0, 0.25, -0.25])[:, None] * steps**2
+    ticks, column = np.nonzero(valid[:length, slots])
+    now = states[ticks, slots[column]]
+    offset_m = np.array([0.0, 0.25, -0.25])[:, None] * steps**2
     cos, sin = np.cos(now[:, 2]), np.sin(now[:, 2])
-    ahead = now[:, 3, None, None] * steps + 0 * lean
+    ahead_m = now[:, 3, None, None] * steps + 0 * offset_m
     forecast = np.stack(
         [
-            now[:, 0, None, None] + cos[:, None, None] * ahead - sin[:, None, None] * lean,
-            now[:, 1, None, None] + sin[:, None, None] * ahead + cos[:, None, None] * lean,
+            now[:, 0, None, None] + cos[:, None, None] * ahead_m - sin[:, None, None] * offset_m,
+            now[:, 1, None, None] + sin[:, None, None] * ahead_m + cos[:, None, None] * offset_m,
         ],
         axis=-1,
     )
@@ -178,7 +178,7 @@ def make_rollout(
                                states[:, 0, axis]) for axis in (0, 1)], axis=-1)  # fmt: skip
     return Rollout(
         scenario=Scenario(
-            source="made-up",
+            source="artificial",
             recording=0,
             recording_name=recording.name,
             start_tick=start_tick,
@@ -198,7 +198,7 @@ def make_rollout(
         plans=plan.astype(np.float32),
         forecast_states=forecast.astype(np.float32),
         forecast_log_probs=np.log(np.tile([0.6, 0.25, 0.15], (len(ticks), 1))).astype(np.float32),
-        forecast_slots=slots[who],
+        forecast_slots=slots[column],
         forecast_ticks=ticks,
         events=events,
         event_names=("collision", "off-road"),
@@ -206,17 +206,17 @@ def make_rollout(
 
 
 def write_run(out: Path, recordings: Sequence[Recording]) -> None:
-    """A folder with tables and three drives of each of two drivers."""
+    """Writes a folder with tables and three rollouts of each of two methods."""
     write_tables(out, metric_rows())
-    for driver, lag in (("sampling + constant-velocity", 0.3), ("sampling + ffw-asp", 0.1)):
-        folder = out / "rollouts" / driver
+    for method, lag in (("sampling + constant-velocity", 0.3), ("sampling + ffw-asp", 0.1)):
+        folder = out / "rollouts" / method
         folder.mkdir(parents=True)
         recording = recordings[0]
         long = np.flatnonzero(
             recording.predicted & (recording.last_frames - recording.first_frames > 300)
         )
-        moved = [np.ptp(recording.track(int(t))[:, :2], axis=0).sum() for t in long]
-        for track in long[np.argsort(moved)[-3:]]:
+        extents = [np.ptp(recording.track(int(t))[:, :2], axis=0).sum() for t in long]
+        for track in long[np.argsort(extents)[-3:]]:
             stride = round(0.2 * recording.frame_rate_hz)
             start = -(-int(recording.first_frames[track]) // stride)
             length = min(75, int(recording.last_frames[track]) // stride - start)

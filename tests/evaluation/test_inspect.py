@@ -1,4 +1,4 @@
-"""`asp-env inspect` and the drift of inferred actions."""
+"""`asp-env inspect`: the drift of inferred actions, tables and faults."""
 
 import math
 from pathlib import Path
@@ -20,7 +20,7 @@ RATE_HZ, DT_S = 25.0, 0.2
 
 @pytest.fixture
 def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-    """Three recordings of 10 s with two cars and a pedestrian each, and a cache of its own."""
+    """Three recordings of 10 s with two cars and a pedestrian each, and a new cache."""
     monkeypatch.setenv("ASP_ENV_CACHE", str(tmp_path / "cache"))
     return write_folder(tmp_path / "folder", recordings=3)
 
@@ -53,32 +53,32 @@ def recording(*tracks: np.ndarray) -> Recording:
 
 
 def straight(speed_mps: float, sideways_mps: float = 0.0) -> np.ndarray:
-    """20 s along +x, perhaps sliding to the left."""
+    """20 s along +x, with a speed to the left that heading and speed do not show."""
     time = np.arange(500) / RATE_HZ
     full = np.full_like(time, speed_mps)
     return np.stack([speed_mps * time, sideways_mps * time, np.zeros_like(time), full], axis=-1)
 
 
 def test_straight_tracks_do_not_drift() -> None:
-    """Constant speed, also backwards and zero, is reproduced to a millimetre; zero is no motion."""
+    """Constant speed, also backwards and zero, is reproduced to a millimetre."""
     cars = recording(straight(8.0), straight(-2.0), straight(0.0))
     metres, moves = drift_m(cars, np.arange(3), np.full(3, 15), dt_s=DT_S, horizon=30)
     np.testing.assert_allclose(metres, 0.0, atol=1e-3)
     assert moves.tolist() == [True, True, False]
 
 
-def test_sliding_drifts_by_what_it_slides() -> None:
-    """1 m/s to the side that heading and speed do not show is 3 m after 3 s, 6 m after 6 s."""
+def test_lateral_speed_is_drift() -> None:
+    """1 m/s to the side is 3 m after 3 s and 6 m after 6 s."""
     cars = recording(straight(8.0, sideways_mps=1.0))
     for horizon, expected_m in ((15, 3.0), (30, 6.0)):
         metres, _ = drift_m(cars, np.zeros(1, int), np.full(1, 15), dt_s=DT_S, horizon=horizon)
         assert metres[0] == pytest.approx(expected_m, abs=1e-3)
 
 
-def test_rear_wheels_without_slip_barely_drift() -> None:
-    """A car whose rear axle, 1.35 m behind the centre, rolls a circle of 15 m: under 5 cm in 6 s.
+def test_a_car_without_slip_drifts_by_centimetres() -> None:
+    """The rear axle, 1.35 m behind the centre, follows a circle of 15 m: under 5 cm in 6 s.
 
-    Heading and speed along it are the rear axle's, as they are of any car that does not skid.
+    Heading and speed are those of the rear axle, as for any car that does not skid.
     """
     angle = 5.0 / 15.0 * np.arange(500) / RATE_HZ
     rear = 15.0 * np.stack([np.sin(angle), -np.cos(angle)], axis=-1)
@@ -94,17 +94,16 @@ def test_rear_wheels_without_slip_barely_drift() -> None:
 
 
 def test_no_snippets() -> None:
-    """Nothing in, nothing out."""
-    nobody = np.zeros(0, dtype=np.int64)
-    metres, moves = drift_m(recording(straight(1.0)), nobody, nobody, dt_s=DT_S, horizon=15)
+    none = np.zeros(0, dtype=np.int64)
+    metres, moves = drift_m(recording(straight(1.0)), none, none, dt_s=DT_S, horizon=15)
     assert len(metres) == len(moves) == 0
 
 
 def test_tables(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    """What is counted is there: rows, classes, snippets, lanes, drivable area; and no faults.
+    """Rows, classes, snippets, lanes and drivable area, without faults.
 
-    Of 250 frames (50 ticks) the cars have ticks 0-49 and 1-49, so with every third tick as now:
-    15, 18, … 33 (7) and 18, … 33 (6) for 3+3 s, 15 and 18 alone for 3+6 s: 2 and 1.
+    In 250 frames (50 ticks) the cars have ticks 0-49 and 1-49. Snippets are at every third tick:
+    15, 18, … 33 (7) and 18, … 33 (6) for 3+3 s; 15, 18 and 18 for 3+6 s.
     """
     assert main(["inspect", str(folder)]) == 0
     out = capsys.readouterr().out
@@ -112,16 +111,16 @@ def test_tables(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
     cells = [cell.strip() for cell in row.strip("│").split("│")]
     assert cells[:8] == ["00", "1", "25", "10.0", "747", "3", "2 car, 1 pedestrian", "0"]
     assert cells[8:] == ["100", "13", "3", "no"]
-    place = next(line for line in out.splitlines() if line.startswith("│ location1"))
-    found = [cell.strip() for cell in place.strip("│").split("│")]
-    assert found[:4] == ["location1", "2", "0", "3"]
-    assert float(found[4]) == pytest.approx(120 * 7, rel=0.02)
+    row = next(line for line in out.splitlines() if line.startswith("│ location1"))
+    cells = [cell.strip() for cell in row.strip("│").split("│")]
+    assert cells[:4] == ["location1", "2", "0", "3"]
+    assert float(cells[4]) == pytest.approx(120 * 7, rel=0.02)
     assert "Repairs: none" in out
     assert "Faults: none" in out
 
 
 def test_scenarios_by_tag(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    """Both cars of each recording drive on from 3 s and from 3.2 s to 9.8 s, with two others."""
+    """Both cars of each recording drive from 3 s or 3.2 s to 9.8 s, with two other agents."""
     assert main(["inspect", str(folder)]) == 0
     lines = capsys.readouterr().out.splitlines()
     rows = {line.split("│")[1].strip(): line.split("│")[2:-1] for line in lines if "│" in line}
@@ -132,8 +131,7 @@ def test_scenarios_by_tag(folder: Path, capsys: pytest.CaptureFixture[str]) -> N
     assert cells["standing-start"] == ["0", *"------"]
 
 
-def test_repairs_are_told(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    """What the reader mended is listed by recording."""
+def test_repairs_are_listed(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
     path = folder / "data" / "01_tracks.csv"
     rows = pd.read_csv(path)
     rows[(rows["trackId"] != 1) | (rows["frame"] != 100)].to_csv(path, index=False)
@@ -143,8 +141,8 @@ def test_repairs_are_told(folder: Path, capsys: pytest.CaptureFixture[str]) -> N
     assert "recording 01: 1 gaps in tracks' frames, split there: 1 after frame 99" in out
 
 
-def test_every_fault_is_told(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    """Two bad recordings among three: the good one's row, both faults, then one error line."""
+def test_all_faults_are_listed(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """Two of three recordings are bad: the row of the good one, both faults, one error line."""
     (folder / "data" / "00_tracks.csv").write_text("")
     (folder / "data" / "02_recordingMeta.csv").unlink()
     with pytest.raises(DataError, match=r"2 of 3 recordings cannot be read \(00, 02\)"):
@@ -156,10 +154,12 @@ def test_every_fault_is_told(folder: Path, capsys: pytest.CaptureFixture[str]) -
     assert "02_recordingMeta.csv: no such file" in out
 
 
-def test_nothing_readable(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    """All of one map's recordings fail with it, and the command still ends with status 2."""
+def test_a_bad_map_is_a_fault_of_all_its_recordings(
+    folder: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """The faults are listed, and the command ends with status 2."""
     next(folder.rglob("*.osm")).write_text("<osm/>")
     assert main(["inspect", str(folder)]) == 2
-    told = capsys.readouterr()
-    assert "Faults: 3" in told.out
-    assert told.err.count("\n") == 1
+    printed = capsys.readouterr()
+    assert "Faults: 3" in printed.out
+    assert printed.err.count("\n") == 1

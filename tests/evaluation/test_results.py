@@ -1,4 +1,4 @@
-"""Files of an output folder, in the columns of the contract."""
+"""Files of an output folder: columns of `metrics.csv`, content of `manifest.json`."""
 
 import csv
 import json
@@ -11,8 +11,8 @@ COLUMNS = (
 )
 
 
-def test_metrics_are_in_the_contracts_columns(tmp_path):
-    """The header letter by letter; unused columns empty; six digits."""
+def test_columns_of_the_metrics(tmp_path):
+    """The exact header; empty cells where a column does not apply; six digits."""
     rows = [
         Row(data="x,y", predictor="oracle", metric="FDE", value=1 / 3, n=7, horizon_s=3.0),
         Row(
@@ -41,13 +41,13 @@ def test_metrics_are_in_the_contracts_columns(tmp_path):
 
 
 def test_a_manifest_repeats_byte_for_byte(tmp_path):
-    """Command, configuration and versions; no time and no machine, so twice the same."""
+    """It contains command, configuration and versions, but no time and no machine."""
     texts = []
     for name in ("a", "b"):
         (tmp_path / name).mkdir()
         write_manifest(tmp_path / name, "drive", data="d", seeds=[0, 1])
         texts.append((tmp_path / name / "manifest.json").read_text())
     assert texts[0] == texts[1]
-    told = json.loads(texts[0])
-    assert (told["command"], told["data"], told["seeds"]) == ("drive", "d", [0, 1])
-    assert {"python", "numpy", "gymnasium", "asp-env"} <= set(told["versions"])
+    manifest = json.loads(texts[0])
+    assert (manifest["command"], manifest["data"], manifest["seeds"]) == ("drive", "d", [0, 1])
+    assert {"python", "numpy", "gymnasium", "asp-env"} <= set(manifest["versions"])

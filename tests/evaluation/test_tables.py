@@ -1,4 +1,4 @@
-"""Tables for terminals, and the short names in them."""
+"""Result tables for terminals, and the short names in them."""
 
 import io
 
@@ -26,7 +26,7 @@ def _row(metric: str, value: float, **fields) -> Row:
 
 
 def _open_loop(*names: str, subsets: tuple[str, ...] = ("all", "moving")) -> list[Row]:
-    """Rows of every metric that is printed; moving targets have twice the errors of all."""
+    """Rows of every metric in the tables; moving targets have twice the errors of all targets."""
     metrics = {
         "": {"NLL": 5.0, "ECE": 0.05, "off-road": 0.01, "overlap": 0.02, "infeasible": 0.03},
         "most-probable": {"FDE": 1.0, "ADE": 0.5, "miss": 0.2, "MAE": 0.3, "MSE": 12.25},
@@ -42,8 +42,8 @@ def _open_loop(*names: str, subsets: tuple[str, ...] = ("all", "moving")) -> lis
     ]  # fmt: skip
 
 
-def test_open_loop_is_told_of_moving_targets():
-    """A table for either selection and one for all else, a line for each predictor."""
+def test_open_loop_tables_are_of_moving_targets():
+    """A table for each selection and one for all else, a line for each predictor."""
     tables = open_loop_tables(_open_loop("constant-velocity", "ffw-asp:runs/a"))
     assert len(tables) == 3
     lines = _printed(tables[0])
@@ -54,39 +54,38 @@ def test_open_loop_is_told_of_moving_targets():
 
 
 def test_the_other_metrics_fit_80_columns():
-    """MAE and MSE of both selections, then what all modes have in common."""
+    """MAE and MSE of both selections, then the metrics of all modes."""
     names = ("constant-turn-rate", "constant-velocity")
     lines = _printed(open_loop_tables(_open_loop(*names), names)[2])
     assert max(len(line) for line in lines) <= 80
-    told = next(line for line in lines if line.startswith("constant-turn-rate *"))
-    assert told.split()[2:] == [
+    line = next(line for line in lines if line.startswith("constant-turn-rate *"))
+    assert line.split()[2:] == [
         "0.60", "24.50", "0.40", "21.00", "10.00", "0.10", "0.02", "0.04", "0.06",
     ]  # fmt: skip
 
 
-def test_where_nobody_moves_all_are_shown():
-    """Data of waiting vehicles have tables too."""
+def test_tables_are_of_all_targets_if_none_moves():
     lines = _printed(open_loop_tables(_open_loop("oracle", subsets=("all",)))[0])
     assert "all targets, most-probable" in lines[0]
     assert "1.00 [0.90, 1.10]" in lines[-1]
 
 
-@pytest.mark.parametrize("preset", RULES.values(), ids=RULES)
-def test_every_preset_fits(preset):
-    """80 columns, with a score where it has one, and its name and version above."""
-    names = [*(["score"] if preset.weights else []), *preset.shown]
+@pytest.mark.parametrize("rules", RULES.values(), ids=RULES)
+def test_driving_tables_of_all_rules_fit_80_columns(rules):
+    """With a score if the rules have one; the title states their name and version."""
+    names = [*(["score"] if rules.weights else []), *rules.shown]
     rows = [
-        _row(name, 0.5, planner="sampling", predictor="constant-velocity", rules=preset.label)
+        _row(name, 0.5, planner="sampling", predictor="constant-velocity", rules=rules.label)
         for name in names
     ]
-    lines = _printed(driving_table(rows, (), preset.shown))
+    lines = _printed(driving_table(rows, (), rules.shown))
     assert max(len(line) for line in lines) <= 80
-    assert f"driving by {preset.label}" in lines[0]
+    assert f"driving by {rules.label}" in lines[0]
     assert sum(line.count("0.50") for line in lines) == len(names)
 
 
-def test_driving_table_keeps_the_order_and_80_columns():
-    """A line for each driver as they came, empty where a metric is missing."""
+def test_methods_are_in_the_order_of_the_rows():
+    """A line for each method; the cell of a missing metric is empty."""
     rows = [
         _row("score", 0.9, planner="expert"),
         _row("score", 0.5, planner="sampling", predictor="oracle"),
@@ -102,7 +101,7 @@ def test_driving_table_keeps_the_order_and_80_columns():
 
 
 def test_two_runs_of_one_predictor_are_two_lines():
-    """They are told apart by their folders, and neither hides the other."""
+    """They are labelled with their folders."""
     rows = [
         _row("score", value, planner="sampling", predictor=f"ffw-asp:runs/{name}")
         for name, value in (("a", 0.25), ("b", 0.75))
@@ -114,24 +113,23 @@ def test_two_runs_of_one_predictor_are_two_lines():
     assert "0.75" in lines[-1]
 
 
-def test_no_interval_without_bounds():
-    """One recording: the value alone."""
+def test_a_value_without_bounds_has_no_interval():
     rows = [_row("score", 0.9, planner="expert", low=None, high=None)]
     assert "[" not in _printed(driving_table(rows, (), SHOWN))[-1]
 
 
 def test_short_names_are_as_short_as_they_can_be():
-    """The name alone, with its folder, or with the whole way to it."""
+    """The name alone, with its folder, or with the whole path."""
     assert short_names(["oracle", "mtp:runs/1"]) == {"oracle": "oracle", "mtp:runs/1": "mtp"}
     assert short_names(["mtp:a/1", "mtp:a/2/"]) == {"mtp:a/1": "mtp 1", "mtp:a/2/": "mtp 2"}
     assert short_names(["mtp:a/1", "mtp:/b/1"]) == {"mtp:a/1": "mtp a-1", "mtp:/b/1": "mtp b-1"}
     assert short_names(["oracle", "oracle"]) == {"oracle": "oracle"}
 
 
-def test_who_knows_the_future_is_marked():
-    """A star behind the name and a caption that explains it, whatever the plug is called."""
+def test_privileged_planners_are_marked():
+    """With a star after the name and a caption that explains it."""
     rows = [_row("score", 0.9, planner="prophet"), _row("score", 0.5, planner="sampling")]
     lines = _printed(driving_table(rows, ["prophet"], SHOWN))
     assert any(line.startswith("prophet *") for line in lines)
-    assert "* knows the recorded future" in lines[-1]
+    assert "* uses the recorded future" in lines[-1]
     assert not any(line.startswith("sampling *") for line in lines)

@@ -1,9 +1,15 @@
-"""The drives of a comparison in units that do not depend on each other, in any process."""
+"""Methods that drive the same scenarios, in work units that any process can run.
+
+A work unit is a set of scenarios that one method drives side by side. Units do not depend on each
+other or on the number of processes, and networks run on one thread, so results are the same bit
+for bit however the units are distributed.
+"""
 
 import sys
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
+from functools import partial
 from typing import Any, final
 
 import numpy as np
@@ -15,7 +21,7 @@ from asp_env.data.rollout import Rollout
 from asp_env.data.scenarios.scenario import Scenario, ScenarioSet
 from asp_env.data.snippets import HISTORY_S
 from asp_env.data.source import Recordings
-from asp_env.evaluation.closed_loop.episodes import drive_episodes
+from asp_env.evaluation.closed_loop.episodes import EpisodeSettings, drive_episodes
 from asp_env.evaluation.selection import load_predictors
 from asp_env.metrics.driving.rules import Rules, find_rules
 from asp_env.metrics.driving.scores import driving_metrics
@@ -25,110 +31,137 @@ from asp_env.sim.traffic.assignment import make_traffic
 from asp_env.sim.world import Ending, world_class
 
 EPISODES_AT_ONCE = 16
-"""A second or a few of work, so that processes end together; more at once saves no time."""
+"""Number of scenarios in a work unit at most. Chosen by hand: units of one to a few seconds let
+processes finish at about the same time, and larger ones are no faster."""
 
 SAVED_ROLLOUTS = 6
-"""So many scenarios' rollouts are kept to look at, of every driver."""
+"""Number of scenarios whose rollouts are saved, for every method."""
 
 EXPERT = "expert"
+"""Name of the planner that replays the logged ego; the reference of every comparison."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Method:
-    """Who drives the ego, and whom it asks what the others will do."""
+    """A planner with a predictor."""
 
     planner: Planner
-    name: str
-    """Of the predictor; empty where none takes part."""
     predictor: Predictor
+    predictor_name: str
+    """Name of the predictor as given; empty if the planner uses no forecasts."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class WorkUnit:
-    """Scenarios that one entrant drives side by side."""
+    """Scenarios that one method drives side by side."""
 
-    entrant: int
+    method: int
+    """Index of the method."""
     numbers: Int[np.ndarray, " b"]
-    """Of the scenarios, among all."""
+    """Indices of the scenarios among all."""
     scenarios: tuple[Scenario, ...]
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class EpisodeScores:
-    """What came of a unit."""
+    """Driving metrics, endings and rollouts of B episodes of one method."""
 
     metrics: Mapping[str, Masked]
+    """Values (b,) by name."""
     endings: tuple[Ending, ...]
     rollouts: tuple[Rollout, ...]
 
 
 @final
 class Methods:
-    """The expert, and the planner with each predictor or, if it asks none, alone.
+    """The methods of a comparison.
 
-    All are made by their names, and so are copies in other processes.
+    These are the expert, and the planner with each predictor, or alone if it uses no forecasts.
+    Pickled methods are loaded again by their names.
+
+    Attributes:
+        all: the methods; the expert is the first.
+        predictors: the predictors by name.
+        settings: settings of all episodes.
     """
 
     def __init__(
         self,
+        *,
         data: str,
         planner: str,
         predictors: tuple[str, ...],
         traffic: str | None,
-        metrics: str,
+        rules: str,
         horizon_s: float,
         dt_s: float,
     ) -> None:
-        """Loads them, as the fields of `Drive` name them; opens no data.
+        """Loads the planner and the predictors, but opens no data.
+
+        Args:
+            data: DATA, which determines the world.
+            planner: name of the planner.
+            predictors: names of the predictors.
+            traffic: drivers of the other agents; None for the default of the world.
+            rules: name of the driving rules.
+            horizon_s: horizon of forecasts and plans in seconds.
+            dt_s: duration of a tick in seconds.
 
         Raises:
-            AspEnvError: something is unknown, cannot be loaded, or does not fit.
+            AspEnvError: a name is unknown, something cannot be loaded, or the options do not fit.
         """
-        self._names = (data, planner, predictors, traffic, metrics, horizon_s, dt_s)
-        self._kind = world_class(data)
-        self._traffic = make_traffic(traffic, dt_s=dt_s, default=self._kind.traffic)
-        self.preset: Rules = find_rules(metrics)
-        self.dt_s = dt_s
-        self._horizon, self.history = ticks(horizon_s, dt_s), ticks(HISTORY_S, dt_s)
-        driver = load_planner(planner)
-        loaded = load_predictors(predictors, horizon=self._horizon, dt_s=dt_s)
+        self._options = {
+            "data": data,
+            "planner": planner,
+            "predictors": predictors,
+            "traffic": traffic,
+            "rules": rules,
+            "horizon_s": horizon_s,
+            "dt_s": dt_s,
+        }
+        world = world_class(data)
+        self.settings = EpisodeSettings(
+            traffic=make_traffic(traffic, dt_s=dt_s, default=world.traffic),
+            rules=find_rules(rules),
+            world=world,
+            horizon=ticks(horizon_s, dt_s),
+            history=ticks(HISTORY_S, dt_s),
+            dt_s=dt_s,
+        )
+        chosen = load_planner(planner)
+        loaded = load_predictors(predictors, horizon=self.settings.horizon, dt_s=dt_s)
         self.predictors: Mapping[str, Predictor] = dict(zip(predictors, loaded, strict=True))
-        found = [Method(planner=load_planner(EXPERT), name="", predictor=loaded[0])]
-        if driver.uses_forecasts:
-            found += [
-                Method(planner=driver, name=name, predictor=predictor)
+        methods = [Method(planner=load_planner(EXPERT), predictor=loaded[0], predictor_name="")]
+        if chosen.uses_forecasts:
+            methods += [
+                Method(planner=chosen, predictor=predictor, predictor_name=name)
                 for name, predictor in self.predictors.items()
             ]
-        elif not driver.privileged:
-            found.append(Method(planner=driver, name="", predictor=loaded[0]))
-        self.all: tuple[Method, ...] = tuple(found)
+        elif not chosen.privileged:
+            methods.append(Method(planner=chosen, predictor=loaded[0], predictor_name=""))
+        self.all: tuple[Method, ...] = tuple(methods)
 
     def __reduce__(self) -> tuple[Any, ...]:
-        """Loads everything anew."""
-        return Methods, self._names
+        return partial(Methods, **self._options), ()
 
     def drive(self, recordings: Recordings, unit: WorkUnit) -> EpisodeScores:
-        """Drives the scenarios of a unit, and judges it.
+        """Drives the scenarios of a work unit and computes the metrics.
+
+        Args:
+            recordings: DATA.
+            unit: the work unit.
 
         Raises:
             AspEnvError: the data do not suit a predictor or a driver.
         """
-        entrant = self.all[unit.entrant]
+        method = self.all[unit.method]
         with _one_thread():
             driven = drive_episodes(
-                recordings,
-                unit.scenarios,
-                entrant.planner,
-                entrant.predictor,
-                preset=self.preset,
-                traffic=self._traffic,
-                kind=self._kind,
-                horizon=self._horizon,
-                history=self.history,
-                dt_s=self.dt_s,
+                recordings, unit.scenarios, method.planner, method.predictor, self.settings
             )
+        metrics = driving_metrics(driven.drives, self.settings.rules)
         return EpisodeScores(
-            metrics={**driving_metrics(driven.drives, self.preset), **driven.realism},
+            metrics={**metrics, **driven.realism},
             endings=tuple(Ending(kind) for kind in driven.endings.tolist()),
             rollouts=driven.rollouts,
         )
@@ -136,7 +169,7 @@ class Methods:
 
 @contextmanager
 def _one_thread() -> Iterator[None]:
-    """Networks run on one thread, whose sums are the same whatever the number of cores."""
+    """Limits torch to one thread, so that sums do not depend on the number of cores."""
     torch = sys.modules.get("torch")
     if torch is None:
         yield
@@ -149,80 +182,90 @@ def _one_thread() -> Iterator[None]:
         torch.set_num_threads(before)
 
 
-def work_units(scenarios: ScenarioSet, entrants: int) -> list[WorkUnit]:
-    """All scenarios for every entrant: the longest together and first, the expert's last of each.
+def work_units(scenarios: ScenarioSet, methods: int) -> list[WorkUnit]:
+    """All scenarios for every method, the longest first.
 
-    Episodes side by side all go on until the last has ended, and short units at the end let
-    processes end together. They depend on nothing else, and so neither do the results.
+    Scenarios of similar length are in the same unit, because a unit takes as long as its longest
+    episode. For each set of scenarios the unit of the expert, which is the fastest, is the last:
+    short units at the end let processes finish at about the same time.
+
+    Args:
+        scenarios: all scenarios.
+        methods: number of methods.
     """
     order = np.argsort(-scenarios.length, kind="stable")
     chunks = np.array_split(order, -(-len(order) // EPISODES_AT_ONCE))
     return [
         WorkUnit(
-            entrant=entrant, numbers=chunk, scenarios=tuple(scenarios[i] for i in chunk.tolist())
+            method=method, numbers=chunk, scenarios=tuple(scenarios[i] for i in chunk.tolist())
         )
         for chunk in chunks
-        for entrant in reversed(range(entrants))
+        for method in reversed(range(methods))
     ]
 
 
 @final
 class ComparisonScores:
-    """What came of all units; of the rollouts, those of the worst scenarios."""
+    """Scores of all methods in all scenarios, and the rollouts of the worst scenarios.
 
-    def __init__(self, entrants: int, preset: Rules) -> None:
-        """Of none yet.
+    The worst scenarios have the lowest mean score over the methods. The expert counts only if it
+    is the only method. Rules without a score use the product of three metrics instead: no
+    collision, on road and progress.
+    """
+
+    def __init__(self, methods: int, rules: Rules) -> None:
+        """Contains no scores yet.
 
         Args:
-            entrants: how many.
-            preset: its score tells the worst scenarios, those with the lowest mean over entrants;
-                the expert's counts only where it is alone. A preset without a score has the product
-                of progress, on the road and no collision instead.
+            methods: number of methods.
+            rules: the driving rules.
         """
-        self._entrants = entrants
-        self._judged_by = ("score",) if preset.weights else ("no collision", "on road", "progress")
-        self._open: dict[int, dict[int, EpisodeScores]] = {}
+        self._methods = methods
+        self._ranked_by = ("score",) if rules.weights else ("no collision", "on road", "progress")
+        self._incomplete: dict[int, dict[int, EpisodeScores]] = {}
         self._numbers: list[Int[np.ndarray, " b"]] = []
-        self._closed: list[Sequence[EpisodeScores]] = []
+        self._complete: list[Sequence[EpisodeScores]] = []
         self._worst: list[tuple[float, int, tuple[Rollout, ...]]] = []
 
-    def add(self, unit: WorkUnit, outcome: EpisodeScores) -> None:
-        """Takes what came of a unit, in any order."""
+    def add(self, unit: WorkUnit, scores: EpisodeScores) -> None:
+        """Adds the scores of a work unit; units may come in any order."""
         first = int(unit.numbers[0])
-        found = self._open.setdefault(first, {})
-        found[unit.entrant] = outcome
-        if len(found) == self._entrants:
-            del self._open[first]
-            self._close(unit.numbers, [found[entrant] for entrant in range(self._entrants)])
+        by_method = self._incomplete.setdefault(first, {})
+        by_method[unit.method] = scores
+        if len(by_method) == self._methods:
+            del self._incomplete[first]
+            self._complete_unit(unit.numbers, [by_method[i] for i in range(self._methods)])
 
-    def _close(self, numbers: Int[np.ndarray, " b"], found: Sequence[EpisodeScores]) -> None:
-        """Keeps what is needed of the same scenarios driven by all."""
+    def _complete_unit(
+        self, numbers: Int[np.ndarray, " b"], by_method: Sequence[EpisodeScores]
+    ) -> None:
+        """Stores the scores of all methods in the same scenarios, and the worst rollouts."""
         products = [
-            np.prod([outcome.metrics[name].value for name in self._judged_by], axis=0)
-            for outcome in found[1:] or found
+            np.prod([scores.metrics[name].value for name in self._ranked_by], axis=0)
+            for scores in by_method[1:] or by_method
         ]
-        scores = np.mean(products, axis=0).tolist()
-        rollouts = zip(*(outcome.rollouts for outcome in found), strict=True)
-        these = zip(scores, numbers.tolist(), rollouts, strict=True)
-        worst = sorted([*self._worst, *these], key=lambda each: each[:2])
+        means = np.mean(products, axis=0).tolist()
+        rollouts = zip(*(scores.rollouts for scores in by_method), strict=True)
+        ranked = zip(means, numbers.tolist(), rollouts, strict=True)
+        worst = sorted([*self._worst, *ranked], key=lambda each: each[:2])
         self._worst = worst[:SAVED_ROLLOUTS]
         self._numbers.append(numbers)
-        self._closed.append(
+        self._complete.append(
             [
-                EpisodeScores(metrics=each.metrics, endings=each.endings, rollouts=())
-                for each in found
+                EpisodeScores(metrics=scores.metrics, endings=scores.endings, rollouts=())
+                for scores in by_method
             ]
         )
 
     @property
     def worst(self) -> list[int]:
-        """Numbers of the scenarios whose rollouts are kept, the worst first."""
+        """Indices of the scenarios whose rollouts are stored, the worst first."""
         return [number for _, number, _ in self._worst]
 
-    def of(self, entrant: int) -> EpisodeScores:
-        """Of all scenarios in their order, with the rollouts of the worst."""
+    def of(self, method: int) -> EpisodeScores:
+        """Scores of a method in all scenarios, in their order, with the rollouts of the worst."""
         order = np.argsort(np.concatenate(self._numbers))
-        parts = [found[entrant] for found in self._closed]
+        parts = [by_method[method] for by_method in self._complete]
         endings = [ending for part in parts for ending in part.endings]
         return EpisodeScores(
             metrics={
@@ -233,5 +276,5 @@ class ComparisonScores:
                 for name in parts[0].metrics
             },
             endings=tuple(endings[i] for i in order.tolist()),
-            rollouts=tuple(rollouts[entrant] for _, _, rollouts in self._worst),
+            rollouts=tuple(rollouts[method] for _, _, rollouts in self._worst),
         )

@@ -1,7 +1,8 @@
-"""`asp-env drive`: a planner drives by what a predictor says, in many episodes at once."""
+"""`asp-env drive`: a planner drives the ego with the forecasts of each predictor in turn."""
 
 from collections import Counter
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
+from contextlib import nullcontext
 from dataclasses import dataclass, replace
 from functools import partial
 from itertools import product
@@ -28,58 +29,64 @@ from asp_env.evaluation.closed_loop.comparison import (
     EpisodeScores,
     Method,
     Methods,
+    WorkUnit,
     work_units,
 )
 from asp_env.evaluation.report import check_report_possible, write_report
 from asp_env.evaluation.results import Row, write_manifest, write_metrics
-from asp_env.evaluation.selection import PartChoice, no_data_error, short_names, ticks_to_judge
+from asp_env.evaluation.selection import PartChoice, no_data_error, short_names, ticks_to_evaluate
 from asp_env.evaluation.tables import driving_table
 from asp_env.files import atomic_folder
 from asp_env.metrics.driving.rules import DEFAULT_RULES, RULES, Rules
 from asp_env.metrics.masked import Masked
 from asp_env.sim.world import world_class
-from asp_env.workers import WorkerPool, worker_pool
+from asp_env.workers import WorkerPool
 
 REFERENCE = "constant-velocity"
-"""Scores are also given as differences to those with this predictor, paired by scenario."""
+"""If this predictor takes part, the scores of all other methods are also stated as differences to
+the score with it, paired by scenario."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Drive:
-    """Drive in closed loop: does the predictor make the planner drive better?"""
+    """Drive in closed loop: compare how well a planner drives with each predictor."""
 
     data: Annotated[tyro.conf.Positional[str], tyro.conf.arg(metavar="DATA")]
-    """A folder in the inD/rounD or INTERACTION layout, `sample:…`, `synthetic:…` or
-    `highway:…`."""
+    """Folder in the inD/rounD or INTERACTION layout, or sample:…, synthetic:… or highway:…."""
     out: Path
-    """Folder to write; must not exist."""
+    """Folder to write; it must not exist, or be empty."""
     planner: str = "sampling"
-    """Who drives the ego."""
+    """Planner that drives the ego."""
     predictors: Annotated[tuple[str, ...], tyro.conf.arg(metavar="NAME[:RUN] …")] = (
         "constant-velocity",
     )
-    """Predictors by name, each in a run of its own."""
+    """Predictors by name; trained ones with their run folder. Each is compared."""
     traffic: str | None = None
-    """Who drives everybody else: a driver such as log, log-actions, idm, hybrid or predictor:NAME,
-    or a table such as default=idm,truck=log,17=predictor:constant-velocity. By default as the
-    world has it: log for recordings, own for highway:…"""
+    """Driver of all other agents: log, log-actions, idm, hybrid,
+    predictor:NAME, or a table such as default=idm,truck=log.
+    The default is log for recordings and own for highway:…."""
     scenarios: Annotated[str, tyro.conf.arg(metavar="FILTER|FILE")] = ""
-    """Which: tags and comparisons, such as 'left,!stopping,length>=8', or a scenarios.json."""
+    """Tags and comparisons, such as 'left,!stopping,length>=8',
+    or the scenarios.json of another run. The default is all."""
     max_scenarios: int | None = None
-    """At most so many, spread evenly over those there are."""
+    """Largest number of scenarios; evenly spaced ones are chosen."""
     horizon: float = 3.0
-    """Seconds to forecast and to plan."""
+    """Horizon of forecasts and plans in seconds."""
     dt: float = DEFAULT_DT_S
-    """Seconds per tick."""
+    """Duration of a tick in seconds."""
     part: PartChoice = "auto"
-    """Which part of DATA; auto takes what no named predictor has seen."""
+    """Part of DATA; auto is all that no predictor was trained or selected on."""
     rules: str = DEFAULT_RULES
-    """Whose definitions judge the drives: nuplan, pdms, waymax or strict."""
+    """Driving rules that define the metrics: nuplan, pdms, waymax or strict."""
     jobs: int = 1
-    """Processes that drive, of one thread each; the results are the same whatever their number."""
+    """Number of processes that drive. The results do not depend on it."""
 
     def run(self) -> None:
-        """Drives, writes the folder, prints the table; the expert stands first."""
+        """Drives, writes the folder and prints the table.
+
+        Raises:
+            AspEnvError: an option or the data are bad, or a package is missing.
+        """
         check_report_possible()
         with atomic_folder(self.out) as folder:
             result = drive(self)
@@ -95,47 +102,56 @@ class Drive:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class ClosedLoop:
-    """What the drives came to."""
+class ClosedLoopResult:
+    """Result of `drive`."""
 
     rows: list[Row]
+    """Lines of `metrics.csv`."""
     manifest: dict[str, Any]
     rollouts: Mapping[str, tuple[Rollout, ...]]
-    """By driver, of the same scenarios."""
+    """Rollouts of the worst scenarios, by method; the scenarios are the same for all methods."""
     maps: dict[str, RoadMap]
-    """By the names of the rollouts' recordings."""
+    """Maps of the rollouts by recording name."""
     scenarios: ScenarioSet
-    """All that were driven."""
+    """All scenarios that were driven."""
     recordings: Recordings
 
 
-def drive(config: Drive) -> ClosedLoop:
-    """Drives with every predictor, the expert first.
+def drive(config: Drive) -> ClosedLoopResult:
+    """Drives all scenarios with the expert and with every other method; writes nothing.
 
     Raises:
-        AspEnvError: an option or the data are bad.
+        AspEnvError: an option or the data are bad, or a worker process ended.
     """
     if config.jobs < 1:
         raise AspEnvError(f"--jobs {config.jobs}: expected at least 1 process")
     config = replace(config, traffic=config.traffic or world_class(config.data).traffic)
-    entrants = Methods(  # refused before anything is computed
-        config.data, config.planner, config.predictors, config.traffic, config.rules,
-        config.horizon, config.dt,
-    )  # fmt: skip
+    methods = Methods(  # raises errors before anything is computed
+        data=config.data,
+        planner=config.planner,
+        predictors=config.predictors,
+        traffic=config.traffic,
+        rules=config.rules,
+        horizon_s=config.horizon,
+        dt_s=config.dt,
+    )
     recordings = open_data(config.data)
-    with worker_pool(config.jobs) as crew:
-        chosen, part = _choose(config, recordings, entrants)
-        outcomes = _drive_all(crew, recordings, chosen, entrants)
-    runs = [(entrant, outcomes.of(number)) for number, entrant in enumerate(entrants.all)]
+    run_unit = partial(methods.drive, recordings)
+    with WorkerPool(run_unit, config.jobs) if config.jobs > 1 else nullcontext() as pool:
+        chosen, part = _choose_scenarios(config, recordings, methods)
+        scores = _drive_all(pool, run_unit, chosen, methods)
+    by_method = [(method, scores.of(number)) for number, method in enumerate(methods.all)]
     short = short_names(config.predictors)
-    drivers = {
-        f"{each.planner.name} + {short[each.name]}" if each.name else each.planner.name: outcome
-        for each, outcome in runs
-    }
-    preset, predictors = entrants.preset, entrants.predictors
-    worst = [chosen[number] for number in outcomes.worst]
-    return ClosedLoop(
-        rows=_rows(config, preset, runs, chosen),
+    labels = [
+        f"{method.planner.name} + {short[method.predictor_name]}"
+        if method.predictor_name
+        else method.planner.name
+        for method in methods.all
+    ]
+    rules, predictors = methods.settings.rules, methods.predictors
+    worst = [chosen[number] for number in scores.worst]
+    return ClosedLoopResult(
+        rows=_rows(config, rules, by_method, chosen),
         manifest={
             "data": config.data,
             "data_hash": recordings.data_hash(),
@@ -146,103 +162,113 @@ def drive(config: Drive) -> ClosedLoop:
                 *(name for name, p in predictors.items() if p.privileged),
             ],
             "traffic": config.traffic,
-            "metrics": {
-                "preset": preset.name,
-                "version": preset.version,
-                "about": preset.description,
-            },
+            "metrics": {"preset": rules.name, "version": rules.version, "about": rules.description},
             "horizon_s": config.horizon,
             "dt_s": config.dt,
             "part": part,
             "asked for": {"scenarios": config.scenarios, "max_scenarios": config.max_scenarios},
             "scenarios": {scenario.name: {"seed": scenario.seed} for scenario in chosen},
             "endings": {
-                driver: dict(Counter(kind.name for kind in outcome.endings))
-                for driver, outcome in drivers.items()
+                label: dict(Counter(kind.name for kind in each.endings))
+                for label, (_, each) in zip(labels, by_method, strict=True)
             },
             "intervals": "95 %, bootstrap over recordings",
         },
-        rollouts={driver: outcome.rollouts for driver, outcome in drivers.items()},
+        rollouts={label: each.rollouts for label, (_, each) in zip(labels, by_method, strict=True)},
         maps={each.recording_name: recordings[each.recording].road_map for each in worst},
         scenarios=chosen,
         recordings=recordings,
     )
 
 
-def _choose(config: Drive, recordings: Recordings, entrants: Methods) -> tuple[ScenarioSet, str]:
-    """The scenarios to drive, and in words which part of the data they are of."""
-    allowed, part = ticks_to_judge(
-        recordings, [*entrants.predictors.values()], config.part, dt_s=config.dt
+def _choose_scenarios(
+    config: Drive, recordings: Recordings, methods: Methods
+) -> tuple[ScenarioSet, str]:
+    """The scenarios to drive, and a description of the part of the data that they are from."""
+    allowed, part = ticks_to_evaluate(
+        recordings, [*methods.predictors.values()], config.part, dt_s=config.dt
     )
-    found = choose_scenarios(
-        recordings, config.scenarios, dt_s=config.dt, history=entrants.history, allowed=allowed
+    chosen = choose_scenarios(
+        recordings,
+        config.scenarios,
+        dt_s=config.dt,
+        history=methods.settings.history,
+        allowed=allowed,
     )
-    if not len(found):
+    if not len(chosen):
         raise no_data_error("scenario")
-    return found if config.max_scenarios is None else found.evenly_spaced(
-        config.max_scenarios
-    ), part
+    if config.max_scenarios is not None:
+        chosen = chosen.evenly_spaced(config.max_scenarios)
+    return chosen, part
 
 
 def _drive_all(
-    crew: WorkerPool, recordings: Recordings, scenarios: ScenarioSet, entrants: Methods
+    pool: WorkerPool[WorkUnit, EpisodeScores] | None,
+    run_unit: Callable[[WorkUnit], EpisodeScores],
+    scenarios: ScenarioSet,
+    methods: Methods,
 ) -> ComparisonScores:
-    units = work_units(scenarios, len(entrants.all))
-    outcomes = ComparisonScores(len(entrants.all), entrants.preset)
+    """Drives all work units in the processes of the pool, or without one in this process."""
+    units = work_units(scenarios, len(methods.all))
+    scores = ComparisonScores(len(methods.all), methods.settings.rules)
     with Progress(transient=True) as progress:
-        task = progress.add_task("driving", total=len(entrants.all) * len(scenarios))
-        for number, outcome in crew.do(partial(entrants.drive, recordings), units):
-            outcomes.add(units[number], outcome)
-            progress.advance(task, len(units[number].numbers))
-    return outcomes
+        task = progress.add_task("driving", total=len(methods.all) * len(scenarios))
+        found = pool.map(units) if pool is not None else map(run_unit, units)
+        for unit, unit_scores in zip(units, found, strict=True):
+            scores.add(unit, unit_scores)
+            progress.advance(task, len(unit.numbers))
+    return scores
 
 
 def _rows(
     config: Drive,
-    preset: Rules,
-    runs: Sequence[tuple[Method, EpisodeScores]],
+    rules: Rules,
+    by_method: Sequence[tuple[Method, EpisodeScores]],
     scenarios: ScenarioSet,
 ) -> list[Row]:
-    """Of every driver, of all scenarios and of those with each tag."""
-    reference = next((run for each, run in runs if each.name == REFERENCE), None)
+    """Rows of every method, for all scenarios and for those with each tag."""
+    reference = next(
+        (scores for method, scores in by_method if method.predictor_name == REFERENCE), None
+    )
     rows = []
-    for entrant, run in runs:
-        values = dict(run.metrics)
-        if preset.weights and reference is not None and run is not reference:
-            gain = run.metrics["score"].value - reference.metrics["score"].value
-            values[f"score - {REFERENCE}"] = Masked(value=gain, valid=run.metrics["score"].valid)
-        rows += _rows_of(config, preset, entrant, values, scenarios)
+    for method, scores in by_method:
+        values = dict(scores.metrics)
+        if rules.weights and reference is not None and scores is not reference:
+            score = scores.metrics["score"]
+            gain = score.value - reference.metrics["score"].value
+            values[f"score - {REFERENCE}"] = Masked(value=gain, valid=score.valid)
+        rows += _method_rows(config, rules, method, values, scenarios)
     return rows
 
 
-def _rows_of(
+def _method_rows(
     config: Drive,
-    preset: Rules,
-    entrant: Method,
+    rules: Rules,
+    method: Method,
     values: Mapping[str, Masked],
     scenarios: ScenarioSet,
 ) -> list[Row]:
-    about = entrant.predictor.metadata if entrant.name else {}
+    metadata = method.predictor.metadata if method.predictor_name else {}
     subsets = {"all": np.ones(len(scenarios), dtype=bool)}
     subsets |= {tag: scenarios.has(tag) for tag in TAGS}
     rows = []
-    for (subset, member), (metric, found) in product(subsets.items(), values.items()):
-        counts = found.valid & member
-        if not counts.any():
+    for (subset, member), (metric, masked) in product(subsets.items(), values.items()):
+        counted = masked.valid & member
+        if not counted.any():
             continue
-        estimate = statistics.mean(found.value[counts], scenarios.recording[counts])
+        estimate = statistics.mean(masked.value[counted], scenarios.recording[counted])
         rows.append(
             Row(
                 data=config.data,
-                predictor=entrant.name,
-                trained_on=about.get("trained_on", ""),
-                view=about.get("view", ""),
-                recipe=about.get("preset", ""),
-                planner=entrant.planner.name,
+                predictor=method.predictor_name,
+                trained_on=metadata.get("trained_on", ""),
+                view=metadata.get("view", ""),
+                recipe=metadata.get("preset", ""),
+                planner=method.planner.name,
                 traffic=config.traffic or "",
                 latency_ticks=0,
                 horizon_s=config.horizon,
-                rules=preset.label,
+                rules=rules.label,
                 subset=subset,
                 metric=metric,
                 value=estimate.value,
@@ -254,10 +280,10 @@ def _rows_of(
     return rows
 
 
-def save_rollouts(folder: Path, result: ClosedLoop) -> None:
-    """`rollouts/DRIVER/SCENARIO.npz`."""
-    for driver, rollouts in result.rollouts.items():
-        into = folder / "rollouts" / driver
+def save_rollouts(folder: Path, result: ClosedLoopResult) -> None:
+    """Writes `rollouts/METHOD/SCENARIO.npz` into a folder."""
+    for method, rollouts in result.rollouts.items():
+        into = folder / "rollouts" / method
         into.mkdir(parents=True)
         for rollout in rollouts:
             rollout.save(into / f"{rollout.scenario.name}.npz")

@@ -1,7 +1,4 @@
-"""How much like the recording the simulated traffic of some drives was.
-
-MERGED: Driving many episodes at once, and what is kept of them.
-"""
+"""Episodes driven side by side by one method, and what is measured of them."""
 
 import dataclasses
 from collections.abc import Mapping, Sequence
@@ -33,65 +30,49 @@ from asp_env.sim.simulation import Simulation, ending
 from asp_env.sim.traffic.assignment import TrafficSpec, make_traffic
 from asp_env.sim.world import Ending, Events, ReplayWorld, World, recorded_future
 
-
-def traffic_realism(world: World, active: Bool[np.ndarray, "b t"]) -> dict[str, Masked]:
-    """`realism` (b,) of each episode's traffic, simulated once; missing where all was replayed.
-
-    Of the agents present at the first tick, but the ego, those count that ever were elsewhere than
-    in their log.
-    """
-    episodes = world.episodes
-    found: dict[str, list[Masked]] = {}
-    for b, count in enumerate(active.sum(axis=1).tolist()):
-        ticks = slice(world.history, world.history + count)
-        states, valid = episodes.states[b, ticks], episodes.valid[b, ticks]
-        logged, there = episodes.log_states[b, ticks], episodes.log_valid[b, ticks]
-        differs = ((states != logged).any(axis=-1) | (valid != there)).any(axis=0)
-        asked = differs & valid[0]
-        asked[EGO] = False
-        about = (
-            episodes.sizes[b],
-            world.recordings[int(episodes.recording[b])].road_map,
-            asked,
-            world.dt_s,
-        )
-        simulated = realism_features(states, valid, *about)
-        for name, each in realism(realism_features(logged, there, *about), [simulated]).items():
-            found.setdefault(name, []).append(each)
-    return {
-        name: Masked(
-            value=np.concatenate([each.value for each in parts]),
-            valid=np.concatenate([each.valid for each in parts]),
-        )
-        for name, parts in found.items()
-    }
-
-
 FORECAST_WITHIN_M = 60.0
-"""Agents further from the ego than this are not forecast."""
+"""Agents farther from the ego than this are not forecast. Chosen by hand."""
 
 EVENTS = ("collision", "at-fault collision", "off-road", "short TTC", "wrong way", "speeding")
-"""What rollouts mark. An at-fault collision where it begins, the wrong way where over 2 m of it are
-driven within 1 s, speeding where the limit is exceeded by over 2.23 m/s."""
+"""Events that rollouts mark at every tick. An at-fault collision is marked at its first tick, the
+wrong way where the ego drives over 2 m against the traffic within 1 s, and speeding where it
+exceeds the limit by over 2.23 m/s."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class EpisodeSettings:
+    """Settings that all episodes of a comparison share."""
+
+    rules: Rules
+    traffic: TrafficSpec | None
+    """Drivers of the other agents; None for the default of the world."""
+    world: type[World] = ReplayWorld
+    horizon: int
+    """Number of ticks of every forecast and plan."""
+    history: int
+    """Number of ticks of history."""
+    dt_s: float
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Decision:
-    """What was forecast and planned at one tick of all episodes."""
+    """Forecast and plan at one tick of B episodes."""
 
     running: Bool[np.ndarray, " b"]
+    """Mask of the episodes that have not ended."""
     forecast: Forecast
     plan: Plan
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class DrivenEpisodes:
-    """Episodes that have been driven, side by side, with everything that was said on the way."""
+    """B episodes that have ended."""
 
     drives: EpisodeRecord
     realism: Mapping[str, Masked]
-    """Of the traffic; missing where it was replayed."""
+    """Realism of the traffic (b,); missing where it was replayed."""
     endings: Int[np.ndarray, " b"]
+    """`Ending` of each episode."""
     rollouts: tuple[Rollout, ...]
 
 
@@ -100,46 +81,57 @@ def drive_episodes(
     scenarios: Sequence[Scenario],
     planner: Planner,
     predictor: Predictor,
-    *,
-    preset: Rules,
-    traffic: TrafficSpec | None,
-    kind: type[World] = ReplayWorld,
-    horizon: int,
-    history: int,
-    dt_s: float,
+    settings: EpisodeSettings,
 ) -> DrivenEpisodes:
-    """Drives every scenario to its end, all at once: one forecast and one plan call per tick.
+    """Drives all scenarios to their ends, side by side: one forecast and one plan per tick.
 
-    A planner that is privileged is the logged driver: the world replays its ego. What costs more
-    than contacts and the road is measured at the end, of all ticks at once, as `preset` has it.
+    If the planner is privileged, the world replays the logged egos instead. Contacts and the
+    drivable area end episodes, so they are measured at every tick; all else is measured at the
+    end, for all ticks at once.
+
+    Args:
+        recordings: DATA.
+        scenarios: B scenarios.
+        planner: drives the egos.
+        predictor: forecasts the agents near running egos.
+        settings: settings of the episodes.
     """
     simulation = Simulation(
         recordings,
-        make_traffic(traffic, dt_s=dt_s, default=kind.traffic),
+        make_traffic(settings.traffic, dt_s=settings.dt_s, default=settings.world.traffic),
         num_episodes=len(scenarios),
-        dt_s=dt_s,
-        history=history,
-        world_class=kind,
+        dt_s=settings.dt_s,
+        history=settings.history,
+        world_class=settings.world,
     )
     world = simulation.world
     generators = [np.random.default_rng(scenario.seed) for scenario in scenarios]
     simulation.reset(scenarios, generators)
     events = [world.events()]
-    said: list[Decision] = []
+    decisions: list[Decision] = []
     endings = np.zeros(len(scenarios), dtype=np.int64)
     active = [np.ones(len(scenarios), dtype=bool)]
     while (endings == Ending.RUNNING).any():
         running = endings == Ending.RUNNING
         actions = np.zeros((len(scenarios), 2), dtype=np.float32)
         if not planner.privileged:
-            said.append(_decide(world, running, planner, predictor, horizon))
-            actions = said[-1].plan.actions[:, 0].astype(np.float32)
+            decisions.append(_decide(world, running, planner, predictor, settings.horizon))
+            actions = decisions[-1].plan.actions[:, 0].astype(np.float32)
         simulation.step(actions, running & (not planner.privileged))
         events.append(world.events())
         active.append(running)
         endings = np.where(running, ending(events[-1]), endings)
-    drives = _measure(world, events, np.stack(active, axis=1), preset)
-    return _collect(world, scenarios, drives, preset, said, endings)
+    drives = _measure(world, events, np.stack(active, axis=1), settings.rules)
+    flags = _event_flags(drives, settings.rules)
+    return DrivenEpisodes(
+        drives=drives,
+        realism=traffic_realism(world, drives.active),
+        endings=endings,
+        rollouts=tuple(
+            _rollout(world, scenario, b, int(drives.active[b].sum()), flags[b], decisions)
+            for b, scenario in enumerate(scenarios)
+        ),
+    )
 
 
 def _decide(
@@ -150,10 +142,10 @@ def _decide(
     horizon: int,
 ) -> Decision:
     scene = world.scene()
-    scene = scene.with_targets(_near(scene, running))
+    scene = scene.with_targets(_targets_near_running_egos(scene, running))
     future = recorded_future(world, scene, horizon) if predictor.privileged else None
     forecast = predictor.predict(scene, future)
-    forecast = dataclasses.replace(  # all plan equally far, whatever their predictor can
+    forecast = dataclasses.replace(  # cut, so that plans are equally long with every predictor
         forecast,
         states=forecast.states[:, :, :horizon],
         actions=forecast.actions[:, :, :horizon],
@@ -162,18 +154,20 @@ def _decide(
     return Decision(running=running, forecast=forecast, plan=planner.plan(scene, forecast))
 
 
-def _near(scene: Scene, running: Bool[np.ndarray, " b"]) -> Int[np.ndarray, "t 2"]:
+def _targets_near_running_egos(
+    scene: Scene, running: Bool[np.ndarray, " b"]
+) -> Int[np.ndarray, "t 2"]:
     situation, slot = scene.targets[:, 0], scene.targets[:, 1]
     egos = scene.states[situation, EGO, -1, :2]
-    away = np.linalg.norm(scene.states[situation, slot, -1, :2] - egos, axis=-1)
-    return scene.targets[(away <= FORECAST_WITHIN_M) & running[situation]]
+    distance_m = np.linalg.norm(scene.states[situation, slot, -1, :2] - egos, axis=-1)
+    return scene.targets[(distance_m <= FORECAST_WITHIN_M) & running[situation]]
 
 
 def _measure(
     world: World,
     events: Sequence[Events],
     active: Bool[np.ndarray, "b t"],
-    preset: Rules,
+    rules: Rules,
 ) -> EpisodeRecord:
     episodes = world.episodes
     ticks = slice(world.history, world.history + len(events))
@@ -181,11 +175,11 @@ def _measure(
     contacts = np.stack([each.contacts for each in events], axis=1)
     off_road_m = np.stack([each.off_road_m for each in events], axis=1)
     limits = [world.recordings[int(i)].speed_limit_mps for i in episodes.recording]
-    found = map_context(
+    on_map = map_context(
         *world.maps(),
         states[:, :, EGO],
         episodes.sizes[:, EGO],
-        [route[there] for route, there in zip(episodes.route, episodes.route_valid, strict=True)],
+        [route[mask] for route, mask in zip(episodes.route, episodes.route_valid, strict=True)],
         Masked(
             value=np.array([limit or 0.0 for limit in limits]),
             valid=np.array([limit is not None for limit in limits]),
@@ -202,49 +196,75 @@ def _measure(
             episodes.sizes,
             contacts=contacts,
             ignored=episodes.own_trailer,
-            wide_sector=found.several_lanes | found.at_crossing | (off_road_m > preset.off_road_m),
+            wide_sector=on_map.several_lanes | on_map.at_crossing | (off_road_m > rules.off_road_m),
             num_ticks=active.sum(axis=1),
-            rule=preset.ttc,
+            rule=rules.ttc,
             dt_s=world.dt_s,
         ),
         route_m=np.stack([each.route_m for each in events], axis=1),
         route_offset_m=np.stack([each.route_offset_m for each in events], axis=1),
         goal_m=events[0].goal_m,
-        map_context=found,
+        map_context=on_map,
         active=active,
         dt_s=world.dt_s,
     )
 
 
-def _collect(
-    world: World,
-    scenarios: Sequence[Scenario],
-    drives: EpisodeRecord,
-    preset: Rules,
-    said: Sequence[Decision],
-    endings: Int[np.ndarray, " b"],
-) -> DrivenEpisodes:
+def traffic_realism(world: World, active: Bool[np.ndarray, "b t"]) -> dict[str, Masked]:
+    """Realism of the simulated traffic of each episode; missing where all agents were replayed.
+
+    It is computed over the agents, except the ego, that are present at the first tick and differ
+    from their logs at any later one.
+
+    Args:
+        world: B episodes that have ended.
+        active: mask of the ticks before each episode's end.
+
+    Returns:
+        Values (b,) by name, see `asp_env.metrics.driving.realism`.
+    """
+    episodes = world.episodes
+    by_name: dict[str, list[Masked]] = {}
+    for b, count in enumerate(active.sum(axis=1).tolist()):
+        ticks = slice(world.history, world.history + count)
+        states, valid = episodes.states[b, ticks], episodes.valid[b, ticks]
+        log_states, log_valid = episodes.log_states[b, ticks], episodes.log_valid[b, ticks]
+        differs = ((states != log_states).any(axis=-1) | (valid != log_valid)).any(axis=0)
+        simulated = differs & valid[0]
+        simulated[EGO] = False
+        shared = (
+            episodes.sizes[b],
+            world.recordings[int(episodes.recording[b])].road_map,
+            simulated,
+            world.dt_s,
+        )
+        sample = realism_features(states, valid, *shared)
+        for name, each in realism(
+            realism_features(log_states, log_valid, *shared), [sample]
+        ).items():
+            by_name.setdefault(name, []).append(each)
+    return {
+        name: Masked(
+            value=np.concatenate([each.value for each in parts]),
+            valid=np.concatenate([each.valid for each in parts]),
+        )
+        for name, parts in by_name.items()
+    }
+
+
+def _event_flags(drives: EpisodeRecord, rules: Rules) -> Bool[np.ndarray, "b t kinds"]:
+    """Mask of the ticks of each of `EVENTS`."""
     over = overspeed_mps(drives)
-    flags = np.stack(
+    return np.stack(
         [
             (drives.contacts > 0).any(axis=2),
-            at_fault(drives, preset),
-            drives.off_road_m > preset.off_road_m,
-            drives.ttc_s <= preset.ttc.min_ttc_s,
+            at_fault(drives, rules),
+            drives.off_road_m > rules.off_road_m,
+            drives.ttc_s <= rules.ttc.min_ttc_s,
             against_traffic_in_window_m(drives) > COMPLIANT_M,
             over.valid & (over.value > OVERSPEED_MPS),
         ],
         axis=-1,
-    )
-    rollouts = tuple(
-        _rollout(world, scenario, b, int(drives.active[b].sum()), flags[b], said)
-        for b, scenario in enumerate(scenarios)
-    )
-    return DrivenEpisodes(
-        drives=drives,
-        realism=traffic_realism(world, drives.active),
-        endings=endings,
-        rollouts=rollouts,
     )
 
 
@@ -254,16 +274,18 @@ def _rollout(
     b: int,
     count: int,
     flags: Bool[np.ndarray, "t kinds"],
-    said: Sequence[Decision],
+    decisions: Sequence[Decision],
 ) -> Rollout:
+    """The rollout of episode b, which has `count` ticks."""
     episodes = world.episodes
     ticks = slice(world.history, world.history + count)
     agents = int((episodes.ids[b] >= 0).sum())
-    told = [(k, each) for k, each in enumerate(said) if each.running[b]]
-    rows = [
-        (k, each.forecast, np.flatnonzero(each.forecast.targets[:, 0] == b)) for k, each in told
+    made = [(k, decision) for k, decision in enumerate(decisions) if decision.running[b]]
+    forecasts = [
+        (k, decision.forecast, np.flatnonzero(decision.forecast.targets[:, 0] == b))
+        for k, decision in made
     ]
-    modes, steps = said[0].forecast.states.shape[1:3] if said else (1, 1)
+    modes, steps = decisions[0].forecast.states.shape[1:3] if decisions else (1, 1)
     return Rollout(
         scenario=scenario,
         dt_s=world.dt_s,
@@ -275,22 +297,23 @@ def _rollout(
         classes=episodes.classes[b, :agents],
         ids=episodes.ids[b, :agents],
         route=episodes.route[b, episodes.route_valid[b]],
-        plans=np.stack([each.plan.states[b, :, :2] for _, each in told])
-        if told
+        plans=np.stack([decision.plan.states[b, :, :2] for _, decision in made])
+        if made
         else np.zeros((0, 1, 2), dtype=np.float32),
         forecast_states=np.concatenate(
             [np.zeros((0, modes, steps, 2), dtype=np.float32)]
-            + [forecast.states[at, ..., :2] for _, forecast, at in rows]
+            + [forecast.states[rows, ..., :2] for _, forecast, rows in forecasts]
         ),
         forecast_log_probs=np.concatenate(
             [np.zeros((0, modes), dtype=np.float32)]
-            + [forecast.log_probs[at] for _, forecast, at in rows]
+            + [forecast.log_probs[rows] for _, forecast, rows in forecasts]
         ),
         forecast_slots=np.concatenate(
-            [np.zeros(0, dtype=np.int64)] + [forecast.targets[at, 1] for _, forecast, at in rows]
+            [np.zeros(0, dtype=np.int64)]
+            + [forecast.targets[rows, 1] for _, forecast, rows in forecasts]
         ),
         forecast_ticks=np.concatenate(
-            [np.zeros(0, dtype=np.int64)] + [np.full(len(at), k) for k, _, at in rows]
+            [np.zeros(0, dtype=np.int64)] + [np.full(len(rows), k) for k, _, rows in forecasts]
         ),
         events=flags[:count],
         event_names=EVENTS,

@@ -1,4 +1,4 @@
-"""`asp-env watch`: rollouts that were driven, in a window or as a video."""
+"""`asp-env watch`: saved rollouts in a window or as a video."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -20,38 +20,40 @@ from asp_env.render.film import MAX_SIDE_PX, Film, check_video_possible, frames_
 from asp_env.render.window import PlayerState, play
 
 SAME_PLACE_M = 1.0
+"""Largest distance between the first position of a logged ego in its rollout and in DATA. Chosen by
+hand: it tells recordings of the same name apart."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Watch:
-    """Show rollouts that `asp-env drive` left: in a window, or as a video for browsers."""
+    """Show rollouts of `asp-env drive` in a window, or write them as a video."""
 
     rollout: Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="ROLLOUT")]
-    """An `.npz` of a drive, or a folder: all of them below it, one after the other."""
+    """File of a rollout (.npz), or a folder: all rollouts below it, one after the other."""
     video: Path | None = None
-    """Write a video instead: FILE.mp4 (H.264) or FILE.webm (VP9); must not exist."""
+    """Write this video instead: FILE.mp4 (H.264) or FILE.webm (VP9). It must not exist."""
     list: tyro.conf.FlagCreatePairsOff[bool] = False
-    """Only list what there is."""
+    """Only list the rollouts."""
     map: tyro.conf.FlagCreatePairsOff[bool] = False
     """Show the whole map instead of following the ego."""
     follow: float = 110.0
-    """Width in metres of what is shown about the ego."""
+    """Width of the shown area around the ego in metres."""
     size: tuple[int, int] = (1280, 720)
     """Width and height in pixels."""
     fps: float = 25.0
-    """Pictures a second in a video; positions between ticks are interpolated."""
+    """Frames per second of a video; positions between ticks are interpolated."""
     speed: float = 1.0
-    """Seconds of the drive per second."""
+    """Playback speed: seconds of the episode per second."""
     data: str | None = None
-    """DATA of the drive, where its name has changed since."""
+    """DATA that was driven on, if it has been moved since."""
 
     def run(self) -> None:
-        """Plays, writes the video, or lists.
+        """Plays the rollouts, writes the video, or prints the list.
 
         Raises:
-            AspEnvError: an option is out of range, there is nothing to watch or no screen, or
-                the video cannot be written.
-            DataError: a rollout or its DATA cannot be read.
+            AspEnvError: an option is out of range, there is no screen, or the video cannot be
+                written.
+            DataError: there is no rollout, or a rollout or its DATA cannot be read.
         """
         self._check()
         rollouts = load_rollouts(self.rollout)
@@ -89,36 +91,36 @@ class Watch:
 
 
 def load_rollouts(path: Path) -> dict[Path, Rollout]:
-    """The rollout of a file, or those below a folder in the order of their paths.
+    """The rollout of a file, or all rollouts below a folder, by path in alphabetical order.
 
     Raises:
         DataError: there is none, or one cannot be read.
     """
     if not path.is_dir():
         return {path: Rollout.load(path)}
-    found = sorted(each for each in path.rglob("*.npz") if not each.name.startswith("."))
-    if not found:
+    files = sorted(each for each in path.rglob("*.npz") if not each.name.startswith("."))
+    if not files:
         raise DataError(f"{path}: no rollouts (.npz) below it; asp-env drive writes them")
-    return {each: Rollout.load(each) for each in found}
+    return {each: Rollout.load(each) for each in files}
 
 
 def make_films(rollouts: Mapping[Path, Rollout], data: str | None) -> list[Film]:
-    """Rollouts with the places where they were driven.
+    """Rollouts with the maps and background images of their recordings.
 
     Args:
-        rollouts: by their paths.
-        data: DATA, where it is not what the rollouts say.
+        rollouts: rollouts by path.
+        data: DATA that all of them were driven on; None for the DATA that each rollout names.
 
     Raises:
-        DataError: DATA cannot be opened, or they are not those that were driven on.
+        DataError: DATA cannot be opened, or is not what a rollout was driven on.
     """
     sources: dict[str, Recordings] = {}
     films = []
     for path, rollout in rollouts.items():
         source = rollout.scenario.source if data is None else data
         if source not in sources:
-            sources[source] = _open(path, source)
-        recording = _recording(path, rollout, sources[source])
+            sources[source] = _open_source(path, source)
+        recording = _find_recording(path, rollout, sources[source])
         try:
             films.append(
                 Film(
@@ -133,7 +135,7 @@ def make_films(rollouts: Mapping[Path, Rollout], data: str | None) -> list[Film]
     return films
 
 
-def _open(path: Path, source: str) -> Recordings:
+def _open_source(path: Path, source: str) -> Recordings:
     try:
         return open_data(source)
     except AspEnvError as error:
@@ -142,17 +144,17 @@ def _open(path: Path, source: str) -> Recordings:
         ) from error
 
 
-def _recording(path: Path, rollout: Rollout, recordings: Recordings) -> Recording:
+def _find_recording(path: Path, rollout: Rollout, recordings: Recordings) -> Recording:
     """The recording that a rollout was driven on.
 
     Raises:
-        DataError: DATA have none of its name, or its ego is not where the rollout says.
+        DataError: no recording has its name, or the ego starts at another position there.
     """
     scenario = rollout.scenario
-    what = f"{path}: was driven on other DATA than {recordings.source!r}"
+    problem = f"{path}: was driven on other DATA than {recordings.source!r}"
     if scenario.recording_name not in recordings.names:
         raise DataError(
-            f"{what}, which have no recording {scenario.recording_name!r}; name the "
+            f"{problem}, which has no recording {scenario.recording_name!r}; name the "
             "right one with --data"
         )
     recording = recordings[recordings.names.index(scenario.recording_name)]
@@ -164,33 +166,33 @@ def _recording(path: Path, rollout: Rollout, recordings: Recordings) -> Recordin
         num_ticks=1,
         stride=frames_per_tick(recording.frame_rate_hz, rollout.dt_s),
     )
-    away_m = np.hypot(*(states[valid] - rollout.log_states[:1, 0])[:, :2].T)
-    if not (len(away_m) and away_m[0] < SAME_PLACE_M):
+    distance_m = np.hypot(*(states[valid] - rollout.log_states[:1, 0])[:, :2].T)
+    if not (len(distance_m) and distance_m[0] < SAME_PLACE_M):
         raise DataError(
-            f"{what}, whose track {scenario.ego_id} of recording {recording.name} is not there at "
-            f"tick {scenario.start_tick}; name the right one with --data"
+            f"{problem}, where track {scenario.ego_id} of recording {recording.name} is at another "
+            f"position at tick {scenario.start_tick}; name the right one with --data"
         )
     return recording
 
 
 def _title(path: Path, rollout: Rollout) -> str:
-    """Who drove, as far as the folder tells, and what."""
+    """Scenario and tags, after the name of the method if the folder is named after it."""
     tags = f" ({', '.join(rollout.scenario.tags)})" if rollout.scenario.tags else ""
     scenario = rollout.scenario.name + tags
-    driver = path.absolute().parent
-    return f"{driver.name}: {scenario}" if driver.parent.name == "rollouts" else scenario
+    folder = path.absolute().parent
+    return f"{folder.name}: {scenario}" if folder.parent.name == "rollouts" else scenario
 
 
 def _table(folder: Path, rollouts: Mapping[Path, Rollout]) -> Table:
     table = Table(box=None)
-    for name in ("rollout", "seconds", "tags", "what went wrong"):
+    for name in ("rollout", "seconds", "tags", "events"):
         table.add_column(name, overflow="fold")
     for path, rollout in rollouts.items():
-        happened = np.flatnonzero(rollout.events.any(axis=0)).tolist()
+        events = np.flatnonzero(rollout.events.any(axis=0)).tolist()
         table.add_row(
             str(path.relative_to(folder) if path != folder else path),
             f"{(len(rollout.states) - 1) * rollout.dt_s:.1f}",
             ", ".join(rollout.scenario.tags),
-            ", ".join(rollout.event_names[kind] for kind in happened),
+            ", ".join(rollout.event_names[kind] for kind in events),
         )
     return table

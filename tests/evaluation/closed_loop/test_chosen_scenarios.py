@@ -1,4 +1,4 @@
-"""`asp-env drive` on chosen scenarios: by words, from a file, and what is said of each tag."""
+"""`asp-env drive` on scenarios chosen by a filter or from a file, and its rows by tag."""
 
 import csv
 from pathlib import Path
@@ -8,43 +8,40 @@ import pytest
 
 from asp_env.cli import main
 from asp_env.data.scenarios.tags import TAGS
-from asp_env.evaluation.closed_loop.drive import ClosedLoop, Drive, drive
+from asp_env.evaluation.closed_loop.drive import ClosedLoopResult, Drive, drive
 
 NOWHERE = Path("not-written")
 
 
-def driven(crossings: Path, **options: Any) -> ClosedLoop:
-    """The expert's drives alone, which need no planning."""
+def drive_expert(crossings: Path, **options: Any) -> ClosedLoopResult:
     return drive(Drive(data=str(crossings), out=NOWHERE, planner="expert", **options))
 
 
-def test_words_choose(crossings: Path) -> None:
-    """All that fit are driven, with the seeds that they have among all; then at most so many."""
-    every, left = driven(crossings), driven(crossings, scenarios="left")
-    wanted = [each for each in every.scenarios if "left" in each.tags]
-    assert 0 < len(wanted) < len(every.scenarios)
-    assert [*left.scenarios] == wanted
-    assert list(left.manifest["scenarios"]) == [each.name for each in wanted]
+def test_a_filter_chooses_scenarios(crossings: Path) -> None:
+    """The chosen scenarios have the same seeds as among all; then their number can be limited."""
+    every, left = drive_expert(crossings), drive_expert(crossings, scenarios="left")
+    expected = [each for each in every.scenarios if "left" in each.tags]
+    assert 0 < len(expected) < len(every.scenarios)
+    assert [*left.scenarios] == expected
+    assert list(left.manifest["scenarios"]) == [each.name for each in expected]
     assert left.manifest["asked for"] == {"scenarios": "left", "max_scenarios": None}
-    assert [*driven(crossings, scenarios="left", max_scenarios=1).scenarios] == wanted[:1]
+    assert [*drive_expert(crossings, scenarios="left", max_scenarios=1).scenarios] == expected[:1]
 
 
-def test_rows_by_tag(crossings: Path) -> None:
-    """One of each metric for all and for every tag that occurs: the mean over its scenarios."""
-    every = driven(crossings)
+def test_rows_by_tag_are_means_over_its_scenarios(crossings: Path) -> None:
+    every = drive_expert(crossings)
     counts = {tag: count for tag, count in every.scenarios.counts().items() if count}
     scores = {row.subset: row for row in every.rows if row.metric == "score"}
     assert list(scores) == ["all", *counts]
     assert {tag: row.n for tag, row in scores.items()} == {"all": len(every.scenarios), **counts}
     for tag in counts:
-        alone = driven(crossings, scenarios=tag)
+        alone = drive_expert(crossings, scenarios=tag)
         (row,) = (row for row in alone.rows if row.metric == "score" and row.subset == "all")
         assert row.value == scores[tag].value
         assert (row.low, row.high) == (scores[tag].low, scores[tag].high)
 
 
-def test_a_run_can_be_driven_again(crossings: Path, tmp_path: Path) -> None:
-    """By the file in its folder: the same rows for the same scenarios."""
+def test_a_run_repeats_from_its_scenarios_file(crossings: Path, tmp_path: Path) -> None:
     first, second = tmp_path / "first", tmp_path / "second"
     args = ["drive", str(crossings), "--planner", "idm", "--out"]
     assert (
@@ -59,7 +56,7 @@ def test_a_run_can_be_driven_again(crossings: Path, tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    ("words", "what"),
+    ("scenarios", "message"),
     [
         ("lft", "unknown scenario tag 'lft'"),
         ("speed>3", "unknown scenario column 'speed'"),
@@ -67,13 +64,16 @@ def test_a_run_can_be_driven_again(crossings: Path, tmp_path: Path) -> None:
         ("nothing.json", "nothing.json: cannot be read"),
     ],
 )
-def test_refused(
-    crossings: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], words: str, what: str
+def test_wrong_scenarios_are_errors_of_one_line(
+    crossings: Path,
+    tmp_path: Path,
+    capsys: pytest.CaptureFixture[str],
+    scenarios: str,
+    message: str,
 ) -> None:
-    """Status 2, one line, and no folder."""
     out = tmp_path / "out"
-    assert main(["drive", str(crossings), "--out", str(out), "--scenarios", words]) == 2
-    told = capsys.readouterr().err
-    assert what in told
-    assert told.count("\n") == 1
+    assert main(["drive", str(crossings), "--out", str(out), "--scenarios", scenarios]) == 2
+    error = capsys.readouterr().err
+    assert message in error
+    assert error.count("\n") == 1
     assert not list(tmp_path.iterdir())

@@ -1,4 +1,4 @@
-"""Planners driven through scenarios, and what is told of it."""
+"""`asp-env drive`: planners drive scenarios; metrics, rollouts and files."""
 
 import csv
 import dataclasses
@@ -17,10 +17,11 @@ from asp_env.data.snippets import Future
 from asp_env.data.source import Recordings, open_data
 from asp_env.data.split import TrainedOn
 from asp_env.errors import AspEnvError
-from asp_env.evaluation.closed_loop.drive import ClosedLoop, Drive, drive
+from asp_env.evaluation.closed_loop.drive import ClosedLoopResult, Drive, drive
 from asp_env.evaluation.closed_loop.episodes import (
     FORECAST_WITHIN_M,
     DrivenEpisodes,
+    EpisodeSettings,
     drive_episodes,
 )
 from asp_env.metrics.driving.rules import PDMS
@@ -36,7 +37,7 @@ NOWHERE = Path("not-written")
 
 @dataclass
 class Spy:
-    """Constant velocity that remembers what it was asked."""
+    """Constant velocity that stores its inputs."""
 
     horizon: int = 15
     privileged: bool = False
@@ -45,11 +46,10 @@ class Spy:
     history: int = 0
     trained_on: TrainedOn | None = None
     metadata: dict[str, str] = field(default_factory=dict)
-    asked: list[tuple[Scene, Future | None]] = field(default_factory=list)
+    inputs: list[tuple[Scene, Future | None]] = field(default_factory=list)
 
     def predict(self, scene: Scene, future: Future | None = None) -> Forecast:
-        """Keeps the question, answers with constant velocity."""
-        self.asked.append((scene, future))
+        self.inputs.append((scene, future))
         return ConstantVelocity(horizon=self.horizon, dt_s=self.dt_s).predict(scene)
 
 
@@ -65,22 +65,18 @@ def _drive(
         scenarios,
         load_planner(planner),
         predictor,
-        preset=PDMS,
-        traffic=traffic,
-        horizon=15,
-        history=HISTORY,
-        dt_s=DT_S,
+        EpisodeSettings(rules=PDMS, traffic=traffic, horizon=15, history=HISTORY, dt_s=DT_S),
     )
 
 
-def _values(result: ClosedLoop, planner: str, predictor: str = "") -> dict[str, float]:
-    who = (planner, predictor, "all")
-    mine = [r for r in result.rows if (r.planner, r.predictor, r.subset) == who]
-    return {row.metric: row.value for row in mine}
+def _values(result: ClosedLoopResult, planner: str, predictor: str = "") -> dict[str, float]:
+    line = (planner, predictor, "all")
+    rows = [r for r in result.rows if (r.planner, r.predictor, r.subset) == line]
+    return {row.metric: row.value for row in rows}
 
 
-def test_the_expert_keeps_to_its_log(tmp_path):
-    """On a log without collisions: zero divergence, all of the way to the goal; it comes first."""
+def test_the_expert_replays_its_log(tmp_path):
+    """Without collisions in the log: no divergence, all of the route to the goal; it is first."""
     write_crossing(tmp_path, drives=((ON_ROAD[1], car(-95, 8)),))
     result = drive(Drive(data=str(tmp_path), out=NOWHERE, predictors=("oracle",)))
     assert result.rows[0].planner == "expert"
@@ -93,26 +89,26 @@ def test_the_expert_keeps_to_its_log(tmp_path):
     assert result.manifest["endings"]["expert"] == {"GOAL": 2}
 
 
-def test_every_predictor_has_its_run(crossings):
-    """An expert and two runs of the same scenarios, each with rows, endings and rollouts."""
+def test_every_method_drives_the_same_scenarios(crossings):
+    """The expert and the planner with two predictors, each with rows, endings and rollouts."""
     names = ("oracle", "constant-velocity")
     result = drive(Drive(data=str(crossings), out=NOWHERE, predictors=names, max_scenarios=5))
     assert len(result.manifest["scenarios"]) == 5
-    drivers = ["expert", "sampling + oracle", "sampling + constant-velocity"]
-    assert list(result.rollouts) == drivers
-    for driver in drivers:
-        assert sum(result.manifest["endings"][driver].values()) == 5
-        names_of = [rollout.scenario.name for rollout in result.rollouts[driver]]
-        assert names_of == [rollout.scenario.name for rollout in result.rollouts["expert"]]
+    methods = ["expert", "sampling + oracle", "sampling + constant-velocity"]
+    assert list(result.rollouts) == methods
+    for method in methods:
+        assert sum(result.manifest["endings"][method].values()) == 5
+        driven = [rollout.scenario.name for rollout in result.rollouts[method]]
+        assert driven == [rollout.scenario.name for rollout in result.rollouts["expert"]]
     for name in names:
         assert _values(result, "sampling", name)["score"] > 0
     row = result.rows[-1]
     assert (row.traffic, row.latency_ticks, row.horizon_s) == ("log", 0, 3.0)
 
 
-def test_a_planner_without_forecasts_runs_once(crossings):
-    """`idm` is driven once, without a predictor's name; `expert` not a second time."""
-    for planner, drivers in (("idm", ["expert", "idm"]), ("expert", ["expert"])):
+def test_a_planner_without_forecasts_drives_once(crossings):
+    """`idm` drives once, without a predictor's name; `expert` does not drive a second time."""
+    for planner, methods in (("idm", ["expert", "idm"]), ("expert", ["expert"])):
         config = Drive(
             data=str(crossings),
             out=NOWHERE,
@@ -120,23 +116,22 @@ def test_a_planner_without_forecasts_runs_once(crossings):
             predictors=("oracle", "constant-velocity"),
             max_scenarios=2,
         )
-        assert list(drive(config).rollouts) == drivers
+        assert list(drive(config).rollouts) == methods
 
 
 @pytest.mark.parametrize("traffic", ["log", "idm"])
 def test_running_twice_gives_the_same_bits(crossings, traffic):
-    """Rows and rollouts are equal, bit for bit."""
     config = Drive(data=str(crossings), out=NOWHERE, traffic=traffic, max_scenarios=4)
     first, second = drive(config), drive(config)
     assert first.rows == second.rows
-    for driver, rollouts in first.rollouts.items():
-        for one, other in zip(rollouts, second.rollouts[driver], strict=True):
+    for method, rollouts in first.rollouts.items():
+        for one, other in zip(rollouts, second.rollouts[method], strict=True):
             assert one.states.tobytes() == other.states.tobytes()
             assert one.forecast_states.tobytes() == other.forecast_states.tobytes()
 
 
 def test_episodes_side_by_side_equal_episodes_alone(recordings):
-    """Endings, scores and rollouts of all scenarios at once are those of each on its own."""
+    """The same endings, scores and rollouts."""
     predictor = ConstantVelocity(horizon=15, dt_s=DT_S)
     scenarios = _scenarios(recordings)[:6]
     together = _drive(recordings, scenarios, predictor, traffic="idm")
@@ -151,7 +146,7 @@ def test_episodes_side_by_side_equal_episodes_alone(recordings):
 
 
 def test_simulated_traffic_has_a_realism(recordings):
-    """From 0 to 1 where somebody was simulated; of replayed traffic there is none to speak of."""
+    """From 0 to 1 where agents are simulated; not valid for replayed traffic."""
     scenarios = _scenarios(recordings)[:4]
     predictor = ConstantVelocity(horizon=15, dt_s=DT_S)
     simulated = _drive(recordings, scenarios, predictor, planner="expert", traffic="idm").realism
@@ -162,42 +157,42 @@ def test_simulated_traffic_has_a_realism(recordings):
     assert not any(each.valid.any() for each in replayed.values())
 
 
-def test_only_those_near_a_running_ego_are_forecast(recordings):
-    """Targets are present, not egos, within 60 m, and in episodes that are not over."""
+def test_only_agents_near_a_running_ego_are_forecast(recordings):
+    """Targets are present, not egos, within 60 m, and in episodes that have not ended."""
     spy = Spy()
     driven = _drive(recordings, _scenarios(recordings), spy)
     active = driven.drives.active
-    assert len(spy.asked) == active.shape[1] - 1
-    for k, (scene, future) in enumerate(spy.asked):
+    assert len(spy.inputs) == active.shape[1] - 1
+    for k, (scene, future) in enumerate(spy.inputs):
         situation, slot = scene.targets.T
         assert future is None
         assert (slot > 0).all()
         assert scene.valid[situation, slot, -1].all()
         egos = scene.states[situation, 0, -1, :2]
-        away = np.linalg.norm(scene.states[situation, slot, -1, :2] - egos, axis=-1)
-        assert (away <= FORECAST_WITHIN_M).all()
-        # an episode that lasts through tick k + 1 is running at tick k
+        distance = np.linalg.norm(scene.states[situation, slot, -1, :2] - egos, axis=-1)
+        assert (distance <= FORECAST_WITHIN_M).all()
+        # an episode that is active at tick k + 1 is running at tick k
         assert active[situation, k + 1].all()
 
 
-def test_only_the_privileged_are_handed_the_future(recordings):
-    """It holds what the recording holds at the 15 ticks to come, and presence as a mask."""
+def test_only_privileged_predictors_receive_the_future(recordings):
+    """It contains the recorded states of the next 15 ticks and a mask of presence."""
     spy = Spy(privileged=True)
     scenario = _scenarios(recordings)[0]
     _drive(recordings, [scenario], spy)
     recording = recordings[scenario.recording]
-    scene, future = spy.asked[3]
+    scene, future = spy.inputs[3]
     assert future is not None
     for row, (b, a) in enumerate(scene.targets.tolist()):
         track = int(np.flatnonzero(recording.track_ids == scene.ids[b, a])[0])
         frames = 5 * (int(scene.tick[b]) + 1 + np.arange(15)) - recording.first_frames[track]
-        there = frames < len(recording.track(track))
-        assert future.valid[row].tolist() == there.tolist()
-        assert np.array_equal(future.states[row][there], recording.track(track)[frames[there]])
+        present = frames < len(recording.track(track))
+        assert future.valid[row].tolist() == present.tolist()
+        assert np.array_equal(future.states[row][present], recording.track(track)[frames[present]])
 
 
-def test_all_plan_equally_far(recordings):
-    """A predictor of 6 s is cut to the 3 s that are planned, and so changes nothing."""
+def test_forecasts_are_cut_to_the_horizon(recordings):
+    """A predictor of 6 s gives the same drive as one of 3 s."""
     scenarios = _scenarios(recordings)[:2]
     near, far = (
         _drive(recordings, scenarios, ConstantVelocity(horizon=steps, dt_s=DT_S))
@@ -207,8 +202,8 @@ def test_all_plan_equally_far(recordings):
     assert near.rollouts[0].states.tobytes() == far.rollouts[0].states.tobytes()
 
 
-def test_a_rollout_tells_the_episode(recordings):
-    """Ticks, plans, forecasts and events of one drive fit together."""
+def test_a_rollout_is_consistent(recordings):
+    """Ticks, plans, forecasts and events of one episode fit together."""
     scenario = _scenarios(recordings)[1]
     driven = _drive(recordings, [scenario], Oracle(horizon=15, dt_s=DT_S))
     rollout = driven.rollouts[0]
@@ -220,13 +215,13 @@ def test_a_rollout_tells_the_episode(recordings):
     assert (rollout.ids >= 0).all()
     assert set(rollout.forecast_ticks.tolist()) <= set(range(count - 1))
     assert (rollout.forecast_slots > 0).all()
-    # planned is what is done: the first planned position is the next one
+    # the first action is executed: the first planned position is the next one
     assert rollout.plans[:, 0] == pytest.approx(rollout.states[1:, 0, :2], abs=1e-3)
     assert rollout.states[0].tobytes() == rollout.log_states[0].tobytes()
 
 
-def test_a_blocked_way_is_no_collision(tmp_path):
-    """Behind a car that waits for ever the planner stops: out of data, and no fault."""
+def test_planners_stop_behind_a_waiting_car(tmp_path):
+    """The car waits all the time: the episode ends without data, and without collision."""
     waiting = car(-20, 0, appears_s=0.2)
     lane = car(-90, 8, (4.0, 0, 0), (4.0, -2.0, 0.0))  # the log stops 2 m behind it
     write_crossing(tmp_path, drives=((lane, waiting),), seconds=20.0)
@@ -241,19 +236,19 @@ def test_a_blocked_way_is_no_collision(tmp_path):
 
 
 def test_a_run_writes_its_folder(crossings, tmp_path):
-    """Metrics, manifest, report, and rollouts by driver that can be read again."""
+    """Metrics, manifest, report, and rollouts by method that can be read again."""
     out = tmp_path / "out"
     Drive(data=str(crossings), out=out, max_scenarios=2).run()
     names = {"scenarios.json", "metrics.csv", "manifest.json", "report.html", "rollouts"}
     assert {path.name for path in out.iterdir()} == names
-    drivers = sorted(path.name for path in (out / "rollouts").iterdir())
-    assert drivers == ["expert", "sampling + constant-velocity"]
-    told = json.loads((out / "manifest.json").read_text())
-    for driver in drivers:
-        for path in (out / "rollouts" / driver).iterdir():
+    methods = sorted(path.name for path in (out / "rollouts").iterdir())
+    assert methods == ["expert", "sampling + constant-velocity"]
+    manifest = json.loads((out / "manifest.json").read_text())
+    for method in methods:
+        for path in (out / "rollouts" / method).iterdir():
             rollout = Rollout.load(path)
             assert path.stem == rollout.scenario.name
-            assert path.stem in told["scenarios"]
+            assert path.stem in manifest["scenarios"]
     with (out / "metrics.csv").open(newline="") as file:
         first = next(csv.DictReader(file))
     assert (first["planner"], first["predictor"], first["subset"]) == ("expert", "", "all")
@@ -274,15 +269,13 @@ def test_a_run_writes_its_folder(crossings, tmp_path):
     ],
     ids=lambda value: next(iter(value)) if isinstance(value, dict) else None,
 )
-def test_wrong_options_are_refused(crossings, options, what):
-    """One line that says what was expected."""
+def test_wrong_options_are_errors_of_one_line(crossings, options, what):
     with pytest.raises(AspEnvError, match=what) as caught:
         drive(Drive(data=str(crossings), out=NOWHERE, **options))
     assert "\n" not in str(caught.value)
 
 
-def test_the_fields_of_a_config_are_the_commands_options():
-    """A configuration is what the command line makes: frozen, and equal by value."""
+def test_configurations_are_frozen_and_equal_by_value():
     config = Drive(data="d", out=NOWHERE)
     assert config == dataclasses.replace(config)
     with pytest.raises(dataclasses.FrozenInstanceError):

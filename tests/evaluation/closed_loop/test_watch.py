@@ -1,4 +1,4 @@
-"""`asp-env watch`: what it writes, lists and refuses."""
+"""`asp-env watch`: videos, windows, the list, and errors."""
 
 import dataclasses
 import shutil
@@ -22,12 +22,12 @@ SMALL = ("--size", "96", "64", "--fps", "5")
 
 @pytest.fixture(scope="module")
 def drives(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A folder as `asp-env drive` leaves it: two drivers, two drives of 20 ticks each."""
+    """A folder like that of `asp-env drive`: two methods with two rollouts of 20 ticks each."""
     data = write_crossing(tmp_path_factory.mktemp("crossing"))
     recording = open_data(data)[0]
     out = tmp_path_factory.mktemp("drives")
-    for driver, lag in (("expert", 0.0), ("sampling + constant-velocity", 0.3)):
-        folder = out / "rollouts" / driver
+    for method, lag in (("expert", 0.0), ("sampling + constant-velocity", 0.3)):
+        folder = out / "rollouts" / method
         folder.mkdir(parents=True)
         for track in (0, 1):
             rollout = make_rollout(recording, track=track, start_tick=15, length=20, lag=lag)
@@ -42,36 +42,36 @@ def one(drives: Path) -> Path:
 
 
 def frames(path: Path) -> list[np.ndarray]:
-    """The pictures of a video."""
+    """The frames of a video."""
     with av.open(str(path)) as container:
         return [frame.to_ndarray(format="rgb24") for frame in container.decode(video=0)]
 
 
-def refused(capsys: pytest.CaptureFixture[str], *args: object) -> str:
-    """The one line that the command refuses its input with."""
+def error(capsys: pytest.CaptureFixture[str], *args: object) -> str:
+    """The error of the command, which is one line."""
     assert main(["watch", *map(str, args)]) == 2
-    told = capsys.readouterr()
-    assert told.err.count("\n") == 1
-    return told.err.strip()
+    text = capsys.readouterr().err
+    assert text.count("\n") == 1
+    return text.strip()
 
 
 def test_a_video_of_one_rollout(drives, tmp_path, capsys):
-    """Four seconds at 5 pictures a second: 20, the last one, and a second of it; twice the same."""
+    """Four seconds at 5 frames per second, and the last frame for another second; it repeats."""
     path = tmp_path / "film.mp4"
     assert main(["watch", str(one(drives)), "--video", str(path), *SMALL]) == 0
     assert capsys.readouterr().out.splitlines()[-1] == f"wrote {path}: 5.2 s"
-    pictures = frames(path)
-    assert len(pictures) == 20 + 1 + 5
-    assert {picture.shape for picture in pictures} == {(64, 96, 3)}
+    images = frames(path)
+    assert len(images) == 20 + 1 + 5
+    assert {image.shape for image in images} == {(64, 96, 3)}
     (film,) = make_films(load_rollouts(one(drives)), None)
     drawn = film.frame(2.0, size_px=(96, 64), extent_m=110.0)
-    assert np.abs(pictures[10].astype(int) - drawn).mean() < 8
+    assert np.abs(images[10].astype(int) - drawn).mean() < 8
     assert main(["watch", str(one(drives)), "--video", str(tmp_path / "b.mp4"), *SMALL]) == 0
     assert (tmp_path / "b.mp4").read_bytes() == path.read_bytes()
 
 
 def test_a_video_of_a_folder(drives, tmp_path):
-    """All four drives, one after the other, at twice the speed; `--map` shows another part."""
+    """All four rollouts, one after the other, at twice the speed; `--map` shows another area."""
     for name, more in (("follow", ()), ("map", ("--map",))):
         path = tmp_path / f"{name}.webm"
         args = [str(drives), "--video", str(path), "--speed", "2", *SMALL, *more]
@@ -81,8 +81,7 @@ def test_a_video_of_a_folder(drives, tmp_path):
     assert np.abs(follow[0].astype(int) - whole[0]).mean() > 2
 
 
-def test_titles_name_the_driver(drives):
-    """As far as the folders tell."""
+def test_titles_name_the_method(drives):
     titles = [film.title for film in make_films(load_rollouts(drives), None)]
     assert titles[::2] == [
         "expert: 00-1-15 (left)",
@@ -91,51 +90,51 @@ def test_titles_name_the_driver(drives):
 
 
 def test_the_list(drives, capsys):
-    """A line for each rollout: length, tags, and what went wrong."""
+    """A line for each rollout: length, tags and events."""
     assert main(["watch", str(drives), "--list"]) == 0
-    told = " ".join(capsys.readouterr().out.split())
-    assert told.count("4.0 left collision, off-road") == 4
+    words = " ".join(capsys.readouterr().out.split())
+    assert words.count("4.0 left collision, off-road") == 4
     assert main(["watch", str(one(drives)), "--list"]) == 0
 
 
 def test_a_window_plays_and_closes(drives):
-    """On a display that nobody sees, until q."""
+    """On a dummy display, until the key q."""
     pygame.display.init()
     pygame.event.post(pygame.Event(pygame.KEYDOWN, key=pygame.K_q))
     assert main(["watch", str(drives), "--size", "320", "240"]) == 0
 
 
-def test_data_that_have_moved_are_named(drives, tmp_path, capsys):
-    """One line without `--data`, a video with it; other data are not taken for them."""
+def test_data_that_have_been_moved_need_an_option(drives, tmp_path, capsys):
+    """An error without `--data`, a video with it; other data are an error too."""
     rollout = Rollout.load(one(drives))
     lost = dataclasses.replace(rollout.scenario, source=str(tmp_path / "gone"))
     path, video = tmp_path / "00.npz", tmp_path / "film.mp4"
     dataclasses.replace(rollout, scenario=lost).save(path)
-    line = refused(capsys, path, "--video", video, *SMALL)
+    line = error(capsys, path, "--video", video, *SMALL)
     assert "00.npz: was driven on DATA that cannot be opened" in line
     assert line.endswith("; name it with --data")
-    line = refused(capsys, path, "--video", video, "--data", "sample:roundabout", *SMALL)
+    line = error(capsys, path, "--video", video, "--data", "sample:roundabout", *SMALL)
     assert "was driven on other DATA than 'sample:roundabout'" in line
     other = dataclasses.replace(lost, recording_name="77")
     dataclasses.replace(rollout, scenario=other).save(path)
-    line = refused(capsys, path, "--video", video, "--data", rollout.scenario.source, *SMALL)
-    assert "have no recording '77'" in line
+    line = error(capsys, path, "--video", video, "--data", rollout.scenario.source, *SMALL)
+    assert "has no recording '77'" in line
     assert not video.exists()
     dataclasses.replace(rollout, scenario=lost).save(path)
     right = ["--data", rollout.scenario.source]
     assert main(["watch", str(path), "--video", str(video), *right, *SMALL]) == 0
 
 
-def test_what_is_no_rollout_is_refused(drives, tmp_path, capsys):
-    """A missing file, another file, one cut short among good ones, a folder without any."""
-    assert "No such file" in refused(capsys, tmp_path / "none.npz")
+def test_files_that_are_no_rollouts_are_errors(drives, tmp_path, capsys):
+    """A missing file, another file, a truncated one among good ones, a folder without any."""
+    assert "No such file" in error(capsys, tmp_path / "none.npz")
     (tmp_path / "words.txt").write_text("words")
-    assert "not a rollout" in refused(capsys, tmp_path / "words.txt")
-    assert "no rollouts (.npz) below it" in refused(capsys, tmp_path)
+    assert "not a rollout" in error(capsys, tmp_path / "words.txt")
+    assert "no rollouts (.npz) below it" in error(capsys, tmp_path)
     shutil.copytree(drives, tmp_path / "copy")
     damaged = one(tmp_path / "copy")
     damaged.write_bytes(damaged.read_bytes()[:5000])
-    assert str(damaged) in refused(capsys, tmp_path / "copy", "--list")
+    assert str(damaged) in error(capsys, tmp_path / "copy", "--list")
     rollout = Rollout.load(one(drives))
     states = rollout.states.copy()
     states[3, 0, 0] = np.nan
@@ -159,27 +158,26 @@ def test_what_is_no_rollout_is_refused(drives, tmp_path, capsys):
     ],
     ids=lambda value: "-".join(value) if isinstance(value, tuple) else None,
 )
-def test_wrong_options_are_refused(drives, tmp_path, monkeypatch, capsys, args, what):
-    """Each in one line; nothing is written."""
+def test_wrong_options_are_errors_of_one_line(drives, tmp_path, monkeypatch, capsys, args, what):
+    """Nothing is written."""
     monkeypatch.chdir(tmp_path)
-    assert what in refused(capsys, one(drives), *args)
+    assert what in error(capsys, one(drives), *args)
     assert list(tmp_path.iterdir()) == []
 
 
-def test_an_unwritable_video_is_refused(drives, tmp_path, capsys):
-    """Where there is something already, and below a file."""
+def test_a_video_that_cannot_be_written_is_an_error(drives, tmp_path, capsys):
+    """A file that exists, and a path below a file."""
     (tmp_path / "film.mp4").write_text("words")
-    line = refused(capsys, one(drives), "--video", tmp_path / "film.mp4", *SMALL)
+    line = error(capsys, one(drives), "--video", tmp_path / "film.mp4", *SMALL)
     assert "exists already" in line
-    line = refused(capsys, one(drives), "--video", tmp_path / "film.mp4" / "b.mp4", *SMALL)
+    line = error(capsys, one(drives), "--video", tmp_path / "film.mp4" / "b.mp4", *SMALL)
     assert "cannot be written" in line
     assert [path.name for path in tmp_path.iterdir()] == ["film.mp4"]
 
 
-def test_without_a_screen_there_is_one_line(drives, monkeypatch, capsys):
-    """And what can be done instead."""
+def test_a_missing_screen_is_an_error(drives, monkeypatch, capsys):
     for name in ("SDL_VIDEODRIVER", "DISPLAY", "WAYLAND_DISPLAY"):
         monkeypatch.delenv(name, raising=False)
     pygame.display.quit()
-    line = refused(capsys, one(drives))
+    line = error(capsys, one(drives))
     assert "no screen to open a window on" in line

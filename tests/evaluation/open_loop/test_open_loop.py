@@ -1,4 +1,4 @@
-"""Forecasts judged against what happened, on data whose answers are known."""
+"""`asp-env evaluate` on data whose metrics are known."""
 
 import csv
 from pathlib import Path
@@ -8,7 +8,6 @@ import pytest
 
 from asp_env.data.classes import AgentClass
 from asp_env.errors import AspEnvError
-from asp_env.evaluation import selection as choosing
 from asp_env.evaluation.open_loop.evaluate import Evaluate, evaluate
 from asp_env.evaluation.results import Row
 from asp_env.evaluation.selection import load_predictors
@@ -25,8 +24,8 @@ def _evaluate(data: Path, *predictors: str, **options) -> dict[tuple[str, ...], 
     return {(r.predictor, r.selection, r.subset, r.metric): r for r in result.rows}
 
 
-def test_constant_velocity_is_right_about_constant_velocity(tmp_path):
-    """Two cars that go straight on at 8 and 11 m/s: every error is zero to 2 mm.
+def test_constant_velocity_has_no_error_at_constant_velocity(tmp_path):
+    """Two cars drive straight on at 8 and 11 m/s: every error is zero to 2 mm.
 
     The NLL is that of a Gaussian of 1 m at its centre, log 2π. One recording gives no interval.
     """
@@ -43,10 +42,10 @@ def test_constant_velocity_is_right_about_constant_velocity(tmp_path):
 
 
 def test_constant_acceleration_by_hand(tmp_path):
-    """0.5 m/s² unseen: after t seconds ¼t² metres short, so FDE 2.25 m after 3 s.
+    """At 0.5 m/s² the forecast is ¼t² metres short after t seconds: FDE is 2.25 m after 3 s.
 
-    ADE is ¼ · 0.04 · (1² + … + 15²)/15 = 0.8267 m, MAE half of it (nothing happens in y), MSE
-    1/2 · (¼ · 0.04)² · (1⁴ + … + 15⁴)/15 = 0.5941 m², every target misses by over 2 m.
+    ADE is ¼ · 0.04 · (1² + … + 15²)/15 = 0.8267 m, MAE half of it (y has no error), MSE
+    1/2 · (¼ · 0.04)² · (1⁴ + … + 15⁴)/15 = 0.5941 m², and every target is missed by over 2 m.
     """
     recording = (car(-90, 5, (20.0, 0.5, 0.0)),)
     write_crossing(tmp_path, drives=(recording, recording), seconds=12.0)
@@ -56,13 +55,13 @@ def test_constant_acceleration_by_hand(tmp_path):
         for metric, value in expected.items():
             row = rows["constant-velocity", selection, "all", metric]
             assert row.value == pytest.approx(value, abs=2e-3), metric
-            # ticks 15, 18, …, 45 of two recordings that say the same
+            # ticks 15, 18, …, 45 of two equal recordings
             assert row.n == 2 * 11
             assert row.low == pytest.approx(value, abs=2e-3)
 
 
-def test_the_oracle_makes_no_error(crossings):
-    """All errors are zero, and so is the ratio to constant velocity, which has some."""
+def test_the_oracle_has_no_error(crossings):
+    """All errors are zero, and so is the ratio to constant velocity, whose errors are not."""
     rows = _evaluate(crossings, "constant-velocity", "oracle")
     for selection in ("most-probable", "best-of-3"):
         for metric in ("MAE", "MSE", "ADE", "FDE", "miss"):
@@ -72,39 +71,38 @@ def test_the_oracle_makes_no_error(crossings):
         assert rows["constant-velocity", selection, "all", "FDE"].value > 0.1
 
 
-def test_the_standing_are_not_among_the_moving(tmp_path):
-    """Of a driving car and one that waits for ever the subset has one."""
+def test_standing_targets_are_not_in_the_moving_subset(tmp_path):
+    """One car drives, the other one waits all the time."""
     waiting = car(30, 0, y_m=1.75, appears_s=0.2)
     write_crossing(tmp_path, drives=((car(-95, 8), waiting),), seconds=14.0)
     rows = _evaluate(tmp_path, "constant-velocity")
     both = rows["constant-velocity", "best-of-3", "all", "FDE"].n
     moving = rows["constant-velocity", "best-of-3", "moving", "FDE"].n
-    # ticks 15, 18, …, 54 against 18, 21, …, 54 for the one that comes a tick later
+    # ticks 15, 18, …, 54, but 18, 21, …, 54 for the car that appears a tick later
     assert (both, moving) == (14 + 13, 14)
 
 
-def test_the_manifest_says_what_was_judged(crossings, recordings):
-    """Counts, the hash of the data, and in words which part it was."""
-    told = evaluate(Evaluate(data=str(crossings), out=NOWHERE)).manifest
-    assert told["data_hash"] == recordings.data_hash()
-    assert told["recordings"] == 3
-    assert told["part"] == "all, of which no predictor saw any"
-    assert told["snippets"] > told["moving snippets"] > 50
-    assert told["predictors"] == {"constant-velocity": {}, "constant-turn-rate": {}}
-    assert told["privileged"] == []
-    assert told["best_by"] == "fde"
+def test_the_manifest_states_the_data_and_the_rule(crossings, recordings):
+    manifest = evaluate(Evaluate(data=str(crossings), out=NOWHERE)).manifest
+    assert manifest["data_hash"] == recordings.data_hash()
+    assert manifest["recordings"] == 3
+    assert manifest["part"] == "all, of which no predictor saw any"
+    assert manifest["snippets"] > manifest["moving snippets"] > 50
+    assert manifest["predictors"] == {"constant-velocity": {}, "constant-turn-rate": {}}
+    assert manifest["privileged"] == []
+    assert manifest["best_by"] == "fde"
     other = evaluate(Evaluate(data=str(crossings), out=NOWHERE, best_by="paper")).manifest
     assert other["best_by"] == "paper"
     assert "within 5°" in other["best-of-3"]
 
 
 def test_running_twice_gives_the_same_bits(crossings):
-    """Rows, intervals included, are equal."""
+    """Also the intervals are equal."""
     assert _evaluate(crossings, "constant-turn-rate") == _evaluate(crossings, "constant-turn-rate")
 
 
 def test_a_run_writes_its_folder(crossings, tmp_path, capsys):
-    """`metrics.csv`, `manifest.json` and the report, and a table for people."""
+    """It contains three files, and a table is printed."""
     out = tmp_path / "out"
     Evaluate(data=str(crossings), out=out, predictors=("constant-velocity",)).run()
     assert {path.name for path in out.iterdir()} == {"metrics.csv", "manifest.json", "report.html"}
@@ -122,29 +120,27 @@ def test_a_run_writes_its_folder(crossings, tmp_path, capsys):
         (("oracle:run",), "takes no argument"),
     ],
 )
-def test_wrong_predictors_are_refused(names, what):
-    """One line for none, doubled, unknown and wrongly named ones."""
+def test_wrong_predictor_names_are_errors_of_one_line(names, what):
     with pytest.raises(AspEnvError, match=what) as caught:
         load_predictors(names, horizon=15, dt_s=0.2)
     assert "\n" not in str(caught.value)
 
 
-def test_a_predictor_with_a_shorter_horizon_is_refused(monkeypatch):
-    """2 s cannot be compared at 3 s."""
+def test_a_predictor_with_a_shorter_horizon_is_an_error(monkeypatch):
     short = ConstantVelocity(horizon=10, dt_s=0.2)
-    monkeypatch.setattr(choosing, "load_predictor", lambda *_, **__: short)
+    loader = "asp_env.evaluation.selection.load_predictor"
+    monkeypatch.setattr(loader, lambda *_, **__: short)
     with pytest.raises(AspEnvError, match="forecasts 2 s, less than --horizon 3"):
         load_predictors(["short"], horizon=15, dt_s=0.2)
 
 
-def test_an_odd_horizon_is_refused(crossings):
-    """3.1 s are no whole number of ticks of 0.2 s."""
+def test_a_horizon_that_is_no_whole_number_of_ticks_is_an_error(crossings):
     with pytest.raises(AspEnvError, match="no whole number of ticks"):
         _evaluate(crossings, "oracle", horizon=3.1)
 
 
-def test_data_without_snippets_are_refused(tmp_path):
-    """Five seconds are less than 3 s and 3 s."""
+def test_data_without_snippets_are_an_error(tmp_path):
+    """Five seconds are shorter than a history and a horizon of 3 s each."""
     write_crossing(tmp_path, drives=((car(-90, 5),),), seconds=5.0)
-    with pytest.raises(AspEnvError, match="no snippet is left to judge on"):
+    with pytest.raises(AspEnvError, match="no snippet is left to evaluate on"):
         _evaluate(tmp_path, "oracle")

@@ -1,4 +1,4 @@
-"""`asp-env table`: a whole small one, its numbers by hand, and what it refuses."""
+"""`asp-env table`: a small table, its numbers by hand, and errors."""
 
 import csv
 import fcntl
@@ -24,22 +24,22 @@ from predictors.experiments.results import (
     Sums,
     excludes_zero,
 )
-from predictors.experiments.tables import PAPER, difference_table, main_table, paper_numbers
+from predictors.experiments.tables import PAPER, difference_table, main_table, paper_errors
 from tests.predictors.tiny import write_data
 
-SURE = Choice("most-probable", "all")
+MOST_PROBABLE = Choice("most-probable", "all")
 MOVING = Choice("most-probable", "moving")
 BEST = Choice("best-of-3", "all")
 
 
 def errors(fde: Sequence[float], *, shift: int = 0) -> Errors:
-    """Of four snippets: three of one recording, the last of which stands, and one of another.
+    """Errors of four snippets: three of one recording, the third of which stands, one of another.
 
-    MAE, MSE and ADE are 1, 2 and 3 tenths of FDE; the best mode's errors are half.
+    MAE, MSE and ADE are 0.1, 0.2 and 0.3 times FDE; the errors of the best mode are half as large.
     """
-    sure = np.array(fde) * np.array([0.1, 0.2, 0.3, 1.0])[:, None]
+    most_probable = np.array(fde) * np.array([0.1, 0.2, 0.3, 1.0])[:, None]
     return Errors(
-        values=np.stack([sure, sure / 2]).astype(np.float32),
+        values=np.stack([most_probable, most_probable / 2]).astype(np.float32),
         moving=np.array([True, True, False, True]),
         recording=np.array([0, 0, 0, 4]),
         track=np.array([1, 2, 3, 1]),
@@ -49,13 +49,13 @@ def errors(fde: Sequence[float], *, shift: int = 0) -> Errors:
 
 
 def key(predictor: str, *, view: str = "vectors", variant: str = "", chaining: str = "") -> Key:
-    """A line at the first site, for 3 s."""
+    """A line at one site for 3 s."""
     return Key("here", view, predictor, "", variant, chaining, 3.0)
 
 
 def findings() -> Findings:
-    """DKM with two seeds, SSP-ASP with those and a third, and one that learns nothing."""
-    found = {
+    """DKM with two seeds, SSP-ASP with these and a third, and a predictor without training."""
+    fdes = {
         key("constant-turn-rate", view=""): {NO_SEED: [4.0, 4.0, 4.0, 4.0]},
         key("dkm"): {0: [1.0, 3.0, 2.0, 4.0], 1: [3.0, 5.0, 2.0, 8.0]},
         key("ssp-asp"): {
@@ -68,66 +68,70 @@ def findings() -> Findings:
     return Findings(
         sums={
             line: {seed: Sums.of(errors(fde)) for seed, fde in seeds.items()}
-            for line, seeds in found.items()
+            for line, seeds in fdes.items()
         }
     )
 
 
 def test_means_by_hand() -> None:
-    """DKM: seeds of mean 2.5 and 4.5, so 3.5 ± √2; moving alone (1, 3, 4; 3, 5, 8) 4 ± 4/3·√2."""
-    found = findings().numbers(key("dkm"), SURE)
+    """DKM: the means of the seeds are 2.5 and 4.5, so 3.5 ± √2.
+
+    Of the moving targets (1, 3, 4 and 3, 5, 8) they are 8/3 and 16/3, so 4 ± 4/3·√2.
+    """
+    found = findings().means(key("dkm"), MOST_PROBABLE)
     assert found["FDE"].estimate.value == pytest.approx(3.5)
     assert found["FDE"].estimate.n == 4
     assert found["FDE"].spread == pytest.approx(math.sqrt(2))
     assert found["MAE"].estimate.value == pytest.approx(0.35)
     assert found["MSE"].estimate.value == pytest.approx(0.70)
-    moving = findings().numbers(key("dkm"), MOVING)["FDE"]
+    moving = findings().means(key("dkm"), MOVING)["FDE"]
     assert (moving.estimate.value, moving.estimate.n) == (pytest.approx(4.0), 3)
     assert moving.spread == pytest.approx(8 / 3 / math.sqrt(2))
-    assert findings().numbers(key("dkm"), BEST)["FDE"].estimate.value == pytest.approx(1.75)
+    assert findings().means(key("dkm"), BEST)["FDE"].estimate.value == pytest.approx(1.75)
 
 
-def test_interval_is_the_bootstrap_over_recordings() -> None:
-    """Of sums by recording as of the snippets themselves, averaged over seeds: (2, 4, 2 | 6)."""
-    found = findings().numbers(key("dkm"), SURE)["FDE"].estimate
-    wanted = statistics.mean(np.array([2.0, 4.0, 2.0, 6.0]), np.array([0, 0, 0, 4]))
-    assert (found.low, found.high) == (pytest.approx(wanted.low), pytest.approx(wanted.high))
-    # Two recordings: drawn twice each, 8/3 m in one and 6 m in the other.
+def test_intervals_are_bootstrapped_over_recordings() -> None:
+    """Sums by recording give the interval of the snippets, averaged over seeds: (2, 4, 2 | 6)."""
+    found = findings().means(key("dkm"), MOST_PROBABLE)["FDE"].estimate
+    expected = statistics.mean(np.array([2.0, 4.0, 2.0, 6.0]), np.array([0, 0, 0, 4]))
+    assert (found.low, found.high) == (pytest.approx(expected.low), pytest.approx(expected.high))
+    # The bounds are resamples with one recording twice: 8/3 m in one and 6 m in the other.
     assert found.low == pytest.approx(8 / 3)
     assert found.high == pytest.approx(6.0)
 
 
 def test_differences_are_over_common_seeds() -> None:
-    """SSP-ASP less DKM over seeds 0 and 1: (-0.5, -2, 0, -1.5), mean -1; seeds -0.5 and -1.5."""
-    found = findings().differences(key("ssp-asp"), key("dkm"), SURE)["FDE"]
+    """SSP-ASP less DKM over seeds 0 and 1: (-0.5, -2, 0, -1.5), so -1; by seed -0.5 and -1.5."""
+    found = findings().differences(key("ssp-asp"), key("dkm"), MOST_PROBABLE)["FDE"]
     assert found.estimate.value == pytest.approx(-1.0)
     assert found.spread == pytest.approx(math.sqrt(0.5))
-    # Recordings: -2.5/3 and -1.5, so zero is in no resample.
+    # By recording -2.5/3 and -1.5, so no resample is zero.
     assert found.estimate.low == pytest.approx(-1.5)
     assert found.estimate.high == pytest.approx(-2.5 / 3)
     assert excludes_zero(found.estimate)
-    rate = findings().differences(key("dkm"), key("constant-turn-rate", view=""), SURE)["FDE"]
+    physical = key("constant-turn-rate", view="")
+    rate = findings().differences(key("dkm"), physical, MOST_PROBABLE)["FDE"]
     assert rate.estimate.value == pytest.approx(-0.5)
     assert not excludes_zero(rate.estimate)
 
 
-def test_who_is_compared_with_whom() -> None:
-    """The same change if there is one, else the recipe; what all are given is never mixed."""
+def test_references() -> None:
+    """The same variant if there is one, else the recipe; variants of the input are not mixed."""
     lines = findings()
     assert list(lines.references(key("ssp-asp"))) == [
         key("constant-turn-rate", view=""),
         key("dkm"),
     ]
-    changed = key("ssp-asp", variant="ema")
-    assert list(lines.references(changed)) == list(lines.references(key("ssp-asp")))
-    assert lines.base(changed) == key("ssp-asp")
+    variant = key("ssp-asp", variant="ema")
+    assert list(lines.references(variant)) == list(lines.references(key("ssp-asp")))
+    assert lines.base(variant) == key("ssp-asp")
     assert lines.base(key("ssp-asp")) is None
     assert list(lines.references(key("ssp-asp", variant="causal"))) == []
-    assert lines.differences(changed, key("ssp-asp"), SURE)["FDE"].estimate.value == -0.75
+    assert lines.differences(variant, key("ssp-asp"), MOST_PROBABLE)["FDE"].estimate.value == -0.75
 
 
-def test_other_snippets_are_refused() -> None:
-    """Errors at other ticks make no pairs with these."""
+def test_errors_of_different_snippets_are_refused() -> None:
+    """They cannot be compared in pairs."""
     sums = {
         key("dkm"): {0: Sums.of(errors([1, 1, 1, 1]))},
         key("mtp"): {0: Sums.of(errors([1, 1, 1, 1], shift=3))},
@@ -136,8 +140,8 @@ def test_other_snippets_are_refused() -> None:
         Findings(sums=sums)
 
 
-def test_errors_survive_the_disk(tmp_path: Path) -> None:
-    """Every array, and the stamp; of a file that is cut short there is none."""
+def test_errors_can_be_saved_and_loaded(tmp_path: Path) -> None:
+    """A truncated file has no stamp."""
     path = tmp_path / "deep" / "errors.npz"
     errors([1, 2, 3, 4]).save(path)
     again = Errors.load(path)
@@ -149,34 +153,34 @@ def test_errors_survive_the_disk(tmp_path: Path) -> None:
     assert stamp_of(tmp_path / "none.npz") is None
 
 
-def test_paper_numbers() -> None:
+def test_paper_errors() -> None:
     """SSP-ASP on inD, 3 s: FDE 0.98; DKM on rounD, 6 s, MTP view: 1.25 / 6.13 / 5.51."""
     assert len(PAPER) == 6
-    numbers = paper_numbers("chauffeurnet", "ssp-asp", 0, 3.0)
+    numbers = paper_errors("chauffeurnet", "ssp-asp", 0, 3.0)
     assert numbers is not None
     assert numbers.fde == 0.98
-    assert paper_numbers("mtp", "dkm", 1, 6.0) == (1.25, 6.13, 5.51)
-    assert paper_numbers("vectors", "dkm", 0, 3.0) is None
-    assert paper_numbers("mtp", "dkm", 2, 3.0) is None
-    assert paper_numbers("mtp", "dkm", 0, 4.0) is None
+    assert paper_errors("mtp", "dkm", 1, 6.0) == (1.25, 6.13, 5.51)
+    assert paper_errors("vectors", "dkm", 0, 3.0) is None
+    assert paper_errors("mtp", "dkm", 2, 3.0) is None
+    assert paper_errors("mtp", "dkm", 0, 4.0) is None
 
 
 def printed(table: object) -> str:
-    """As on a terminal."""
+    """Text of a table on a terminal."""
     out = io.StringIO()
     Console(file=out, width=120).print(table)
     return out.getvalue()
 
 
-def test_tables_say_the_numbers() -> None:
-    """Ours and the paper's in the paper's shape; differences with a mark where they are sure."""
+def test_tables_show_the_numbers() -> None:
+    """Measured ones and those of the paper; significant differences are marked."""
     column = key("dkm")
-    text = printed(main_table(findings(), ["here"], [column], SURE))
+    text = printed(main_table(findings(), ["here"], [column], MOST_PROBABLE))
     assert "0.35 / 0.70 / 3.50" in text
     assert "[2.67, 6.00] ±1.41" in text
     assert "paper 0.48 / 0.86 / 2.01" in text
     assert "other data, not comparable in size" in text
-    text = printed(difference_table(findings(), ["here"], [column], SURE))
+    text = printed(difference_table(findings(), ["here"], [column], MOST_PROBABLE))
     assert "less DKM" in text
     assert "-0.10* / -0.20* / -1.00*" in text
     assert "-0.05 / -0.10 / -0.50 " in text
@@ -190,34 +194,34 @@ OPTIONS = [
 
 @pytest.fixture(scope="module")
 def data(tmp_path_factory: pytest.TempPathFactory) -> str:
-    """Three recordings: one to learn from, one to select on, one to judge on."""
+    """Three recordings: one each for training, validation and test."""
     return write_data(tmp_path_factory.mktemp("data"))
 
 
 @pytest.fixture(scope="module")
 def table(data: str, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """The folder of a table of one trained cell."""
+    """The folder of a table with one trained cell."""
     out = tmp_path_factory.mktemp("tables") / "table"
     assert main(["table", data, "--out", str(out), *OPTIONS]) == 0
     return out
 
 
 def content(folder: Path) -> dict[str, bytes]:
-    """All files."""
+    """All files of a folder."""
     return {str(f.relative_to(folder)): f.read_bytes() for f in folder.rglob("*") if f.is_file()}
 
 
 def test_a_whole_table(table: Path) -> None:
-    """Rows of trained and physical predictors for every metric, and of their differences."""
+    """Rows of trained and physical predictors for every metric, and their differences."""
     with (table / "metrics.csv").open(newline="") as file:
         rows = list(csv.DictReader(file))
     predictors = {row["predictor"] for row in rows}
     assert predictors == {"constant-velocity", "constant-turn-rate", "dkm"}
-    mine = [row for row in rows if row["predictor"] == "dkm"]
+    dkm = [row for row in rows if row["predictor"] == "dkm"]
     metrics = {f"{m}{less}" for m in METRICS for less in ("", " less constant-turn-rate")}
-    assert {row["metric"] for row in mine} == metrics
-    assert {row["selection"] for row in mine} == {"most-probable", "best-of-3"}
-    assert {(row["recipe"], row["view"]) for row in mine} == {("cpu", "vectors")}
+    assert {row["metric"] for row in dkm} == metrics
+    assert {row["selection"] for row in dkm} == {"most-probable", "best-of-3"}
+    assert {(row["recipe"], row["view"]) for row in dkm} == {("cpu", "vectors")}
     assert "report.html" in content(table)
     assert "paper 0.48 / 0.86 / 2.01" in (table / "table.txt").read_text()
     manifest = json.loads((table / "manifest.json").read_text())
@@ -225,51 +229,51 @@ def test_a_whole_table(table: Path) -> None:
     assert manifest["options"]["seeds"] == [0]
 
 
-def test_again_does_nothing(data: str, table: Path) -> None:
-    """Nothing is trained or judged again, and every file is as it was."""
+def test_a_finished_table_is_not_repeated(data: str, table: Path) -> None:
+    """Every file stays the same."""
     before = content(table)
     assert main(["table", data, "--out", str(table), *OPTIONS]) == 0
     assert content(table) == before
 
 
 def test_one_command_at_a_time(data: str, table: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    """While one is at a folder another is refused, but may print what is there."""
+    """While one command uses a folder, another one may only print the finished cells."""
     with (table / ".lock").open("w") as lock:
         fcntl.flock(lock, fcntl.LOCK_EX)
         assert main(["table", data, "--out", str(table), *OPTIONS]) == 2
-        assert "another asp-env table is at it" in capsys.readouterr().err
+        assert "another asp-env table uses it" in capsys.readouterr().err
         assert main(["table", data, "--out", str(table), *OPTIONS, "--jobs", "0"]) == 0
     assert "DKM" in capsys.readouterr().out
 
 
-def test_what_is_missing_is_done_again(data: str, table: Path) -> None:
-    """Errors that were deleted come back the same, from the run that is there."""
+def test_missing_errors_are_computed_again(data: str, table: Path) -> None:
+    """They are the same, and nothing is trained again."""
     path = next(table.glob("errors/*/vectors/dkm/3s/seed0.npz"))
-    kept = Errors.load(path)
+    before = Errors.load(path)
     run = next(table.glob("runs/*/vectors/dkm/3s/seed0/weights.safetensors"))
     trained = run.stat().st_mtime_ns
     path.unlink()
     assert main(["table", data, "--out", str(table), *OPTIONS]) == 0
-    np.testing.assert_array_equal(Errors.load(path).values, kept.values)
+    np.testing.assert_array_equal(Errors.load(path).values, before.values)
     assert run.stat().st_mtime_ns == trained
 
 
 def test_failed_cells_end_with_status_1(
     data: str, table: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    """A run that another recipe trained is told and left out; all else is printed."""
+    """A run of another recipe is reported and left out; all else is printed."""
     config = next(table.glob("runs/*/vectors/dkm/3s/seed0/config.json"))
-    kept = config.read_text()
-    changed = json.loads(kept)
+    before = config.read_text()
+    changed = json.loads(before)
     changed["provenance"]["config"]["batch_size"] = 1
     config.write_text(json.dumps(changed))
     with pytest.raises(SystemExit) as stopped:
         main(["table", data, "--out", str(table), *OPTIONS])
-    config.write_text(kept)
+    config.write_text(before)
     assert stopped.value.code == 1
-    said = capsys.readouterr().out
-    assert "seed0 was trained with other batch_size than the recipe has now" in said
-    assert "constant-velocity" in said
+    printed = capsys.readouterr().out
+    assert "seed0 was trained with other batch_size than the recipe has now" in printed
+    assert "constant-velocity" in printed
     assert main(["table", data, "--out", str(table), *OPTIONS]) == 0
 
 
@@ -283,41 +287,41 @@ def test_failed_cells_end_with_status_1(
         (["--horizons", "0.3"], "0.3"),
         (["--jobs", "-1"], "jobs is -1"),
         (["--epochs", "0"], "epochs is 0"),
-        (["--validation", "DATA"], "nothing is left to judge on; give --test too"),
+        (["--validation", "DATA"], "nothing is left to evaluate on; give --test too"),
         (["--test", "DATA", "DATA"], "--test: 2 given, expected one for each of the 1 DATA"),
-        (["--test", "DATA"], "judge on recordings that are neither learned from nor selected on"),
+        (["--test", "DATA"], "evaluate on recordings that are neither trained nor selected on"),
         (["--test", "nowhere"], "nowhere does not exist"),
     ],
 )
 def test_bad_options_are_one_line(
     given: list[str], what: str, data: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    """Refused with status 2 before anything is written."""
+    """Status 2, before anything is written."""
     out = tmp_path / "table"
     given = [data if each == "DATA" else each for each in given]
     assert main(["table", data, "--out", str(out), *OPTIONS, *given]) == 2
-    said = capsys.readouterr().err
-    assert what in said
-    assert said.count("\n") == 1
+    error = capsys.readouterr().err
+    assert what in error
+    assert error.count("\n") == 1
     assert not out.exists()
 
 
-def test_other_tables_folders_are_refused(
+def test_folders_of_other_tables_are_refused(
     data: str, table: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    """One of other options, and one with something else in it."""
+    """A table with other options, and a folder with something else."""
     assert main(["table", data, "--out", str(table), *OPTIONS, "--epochs", "2"]) == 2
-    assert "holds a table of other epochs" in capsys.readouterr().err
+    assert "contains a table with other epochs" in capsys.readouterr().err
     (tmp_path / "letter.txt").write_text("dear")
     assert main(["table", data, "--out", str(tmp_path), *OPTIONS]) == 2
-    assert "holds something that is no table" in capsys.readouterr().err
+    assert "contains something that is no table" in capsys.readouterr().err
     assert [path.name for path in tmp_path.iterdir()] == ["letter.txt"]
 
 
 def test_folders_of_commands_that_were_killed(
     data: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    """One that was killed before it said what it is may begin again; half a plan is told."""
+    """A folder without plan can be used again; a truncated plan is an error."""
     begun = tmp_path / "begun"
     begun.mkdir()
     (begun / ".lock").touch()
@@ -325,6 +329,6 @@ def test_folders_of_commands_that_were_killed(
     (begun / "plan.json").write_text('{"sites":')
     capsys.readouterr()
     assert main(["table", data, "--out", str(begun), *OPTIONS, "--jobs", "0"]) == 2
-    said = capsys.readouterr().err
-    assert "plan.json: cannot be read" in said
-    assert said.count("\n") == 1
+    error = capsys.readouterr().err
+    assert "plan.json: cannot be read" in error
+    assert error.count("\n") == 1

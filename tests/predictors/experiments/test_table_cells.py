@@ -1,4 +1,4 @@
-"""Which cells a table has, what comes before what, and what a cell's process does."""
+"""Cells of a table: which there are, their order, and how their processes run and end."""
 
 import dataclasses
 import hashlib
@@ -9,13 +9,13 @@ import subprocess
 import sys
 import time
 from pathlib import Path
+from threading import Thread
 from typing import Any, NamedTuple
 
 import pytest
 from rich.console import Console
 
 from asp_env.errors import AspEnvError
-from asp_env.workers import ABANDONED
 from predictors.experiments.campaign import Campaign
 from predictors.experiments.cells import (
     Ablation,
@@ -25,20 +25,19 @@ from predictors.experiments.cells import (
     plan_cells,
     site_names,
 )
-from predictors.experiments.worker import Job, Judging
+from predictors.experiments.job import EvaluationJob, Job
 from tests.predictors.tiny import write_data
 
 CHAINED = ("ssp-asp",)
-"""Whose runs for more than 3 s go on from others."""
+"""Predictors whose runs for more than 3 s start from runs for 3 s."""
 
 DKM, SSP = (
-    ModelSpec(predictor=name, preset="", warm_starts_from_3s=name in CHAINED)
-    for name in ("dkm", "ssp-asp")
+    ModelSpec(predictor=name, warm_starts_from_3s=name in CHAINED) for name in ("dkm", "ssp-asp")
 )
 
 
 class Known(NamedTuple):
-    """What a table needs to know of a variant."""
+    """The part of a variant that a table uses."""
 
     horizons_s: tuple[float, ...] = (3.0,)
 
@@ -50,14 +49,14 @@ VARIANTS = {
 
 
 def names(cells: list[Cell]) -> list[str]:
-    """Of the cells that learn."""
+    """Names of the cells with training."""
     return [cell.name for cell in cells if cell.seed is not None]
 
 
-def test_a_whole_table_for_one_seed_comes_first() -> None:
-    """Seeds in turn; within one, 3 s before 6 s, and what chains starts from its own seed's 3 s."""
+def test_the_whole_table_for_one_seed_comes_first() -> None:
+    """For each seed 3 s comes before 6 s, and chained cells start from 3 s of the same seed."""
     cells = plan_cells(
-        sites=["a"], entrants=[DKM, SSP], views=["vectors"], horizons_s=[6.0, 3.0], seeds=[0, 7]
+        sites=["a"], models=[DKM, SSP], views=["vectors"], horizons_s=[6.0, 3.0], seeds=[0, 7]
     )
     assert names(cells)[:4] == [
         "a/vectors/dkm/3s/seed0",
@@ -78,11 +77,10 @@ def test_a_whole_table_for_one_seed_comes_first() -> None:
     }
 
 
-def test_what_6_s_start_from_is_trained_without_being_asked_for() -> None:
-    """A table of 6 s alone has the 3 s runs of what chains too, in front."""
-    entrants = [DKM, SSP]
+def test_cells_that_others_start_from_are_added() -> None:
+    """A table of 6 s alone also has the 3 s cells of chained predictors, in front."""
     cells = plan_cells(
-        sites=["a"], entrants=entrants, views=["vectors"], horizons_s=[6.0], seeds=[0]
+        sites=["a"], models=[DKM, SSP], views=["vectors"], horizons_s=[6.0], seeds=[0]
     )
     assert names(cells) == [
         "a/vectors/dkm/6s/seed0",
@@ -91,8 +89,8 @@ def test_what_6_s_start_from_is_trained_without_being_asked_for() -> None:
     ]
 
 
-def test_ablations_are_of_the_first_site_and_their_horizons() -> None:
-    """One from the 3 s weights goes on from the recipe's where it says nothing at 3 s itself."""
+def test_ablations_run_at_the_first_site_for_their_horizons() -> None:
+    """A variant without a 3 s cell of its own starts from the 3 s weights of the recipe."""
     ablations = [
         Ablation(predictor="ssp-asp", name="ema", horizons_s=(3.0,), warm_starts_from_3s=True),
         Ablation(
@@ -107,15 +105,15 @@ def test_ablations_are_of_the_first_site_and_their_horizons() -> None:
     ]
     cells = plan_cells(
         sites=["a", "b"],
-        entrants=[SSP],
+        models=[SSP],
         views=["vectors"],
         horizons_s=[3.0, 6.0],
         seeds=[0],
         ablations=ablations,
         ablation_view="vectors",
     )
-    changed = {cell.name: cell.start for cell in cells if cell.variant and cell.seed is not None}
-    starts = {name: None if start is None else start.name for name, start in changed.items()}
+    variants = [cell for cell in cells if cell.variant and cell.seed is not None]
+    starts = {cell.name: None if cell.start is None else cell.start.name for cell in variants}
     place = "a/vectors/ssp-asp"
     assert starts == {
         f"{place}-ema/3s/seed0": None,
@@ -128,7 +126,7 @@ def test_ablations_are_of_the_first_site_and_their_horizons() -> None:
 
 
 def test_ablations_by_name() -> None:
-    """All, none, of everybody that has it, or of one predictor."""
+    """All, none, a variant of every predictor that has it, or of one predictor."""
 
     def warm_starts_from_3s(predictor: str, name: str) -> bool:
         return predictor in CHAINED and name != "from-scratch"
@@ -136,22 +134,22 @@ def test_ablations_by_name() -> None:
     def chosen(*given: str) -> list[Ablation]:
         return choose_ablations(given, VARIANTS, warm_starts_from_3s)
 
-    def found(*given: str) -> list[str]:
+    def labels(*given: str) -> list[str]:
         return [f"{each.predictor}:{each.name}" for each in chosen(*given)]
 
-    assert found("none") == []
-    assert found("long") == ["dkm:long", "ssp-asp:long"]
-    assert found("ssp-asp:long", "ema") == ["ssp-asp:long", "ssp-asp:ema"]
-    assert len(found("all")) == 4
+    assert labels("none") == []
+    assert labels("long") == ["dkm:long", "ssp-asp:long"]
+    assert labels("ssp-asp:long", "ema") == ["ssp-asp:long", "ssp-asp:ema"]
+    assert len(labels("all")) == 4
     assert [each.warm_starts_from_3s for each in chosen("all")] == [False, True, True, False]
     with pytest.raises(AspEnvError, match="did you mean 'ema'"):
-        found("ema2")
+        labels("ema2")
     with pytest.raises(AspEnvError, match="unknown ablation 'dkm:ema'"):
-        found("dkm:ema")
+        labels("dkm:ema")
 
 
-def test_sites_are_named_after_folders() -> None:
-    """The last part of a path, and a sample without its colon; two of one name are refused."""
+def test_site_names() -> None:
+    """The last part of a path, a sample without its colon; equal names are an error."""
     assert site_names(["/x/inD/", "sample:roundabout"]) == ["inD", "sample-roundabout"]
     with pytest.raises(AspEnvError, match="'x' names 2 sites"):
         site_names(["a/x", "b/x"])
@@ -159,43 +157,20 @@ def test_sites_are_named_after_folders() -> None:
 
 @pytest.fixture(scope="module")
 def data(tmp_path_factory: pytest.TempPathFactory) -> str:
-    """Three recordings."""
     return write_data(tmp_path_factory.mktemp("data"))
 
 
 def training(data: str, out: Path, *, epochs: int) -> Job:
-    """DKM on vectors."""
+    """Training of DKM on vectors."""
     recipe = {"predictor": "dkm", "view": "vectors", "max_snippets": 16, "epochs": epochs}
-    return Job(train={**recipe, "data": data, "out": str(out)}, judging=None)
+    return Job(train={**recipe, "data": data, "out": str(out)}, evaluation=None)
 
 
-def test_job_survives_json(data: str, tmp_path: Path) -> None:
-    """What a process is told is what was meant."""
-    job = training(data, tmp_path, epochs=2)
-    assert Job.load(job.dump()) == job
-
-
-def test_worker_ends_with_whoever_started_it(data: str, tmp_path: Path) -> None:
-    """With its standard input closed, a training of a million epochs ends by itself."""
-    process = subprocess.Popen(
-        [
-            *(sys.executable, "-m", "predictors.experiments.worker"),
-            training(data, tmp_path / "run", epochs=10**6).dump(),
-        ],
-        stdin=subprocess.PIPE,
-        stdout=subprocess.DEVNULL,
-        stderr=subprocess.DEVNULL,
-    )
-    assert process.stdin is not None
-    process.stdin.close()
-    assert process.wait(timeout=60) == ABANDONED
-
-
-def judging(data: str, errors: Path) -> Job:
-    """Constant velocity, which needs no training."""
+def evaluation(data: str, errors: Path) -> Job:
+    """Evaluation of constant velocity, which needs no training."""
     return Job(
         train=None,
-        judging=Judging(
+        evaluation=EvaluationJob(
             predictor="constant-velocity",
             run="",
             data=data,
@@ -207,15 +182,15 @@ def judging(data: str, errors: Path) -> Job:
     )
 
 
-def test_failures_are_told_and_the_rest_goes_on(data: str, tmp_path: Path) -> None:
-    """Data that are missing fail a cell with one line, and the cell that starts from it."""
+def test_a_failed_cell_affects_only_cells_that_start_from_it(data: str, tmp_path: Path) -> None:
+    """Missing data fail a cell with one line; all processes have costs."""
     first = Cell(site="a", predictor="dkm", horizon_s=3.0, view="vectors", seed=0)
     second = Cell(site="a", predictor="dkm", horizon_s=6.0, view="vectors", seed=0, start=first)
     third = Cell(site="b", predictor="dkm", horizon_s=3.0, view="vectors", seed=0)
     jobs = {
-        first: judging(str(tmp_path / "nowhere"), tmp_path / "1"),
-        second: judging(data, tmp_path / "2"),
-        third: judging(data, tmp_path / "3"),
+        first: evaluation(str(tmp_path / "nowhere"), tmp_path / "1"),
+        second: evaluation(data, tmp_path / "2"),
+        third: evaluation(data, tmp_path / "3"),
     }
     campaign = Campaign(jobs, tmp_path, Console(quiet=True))
     campaign.run(1)
@@ -226,35 +201,39 @@ def test_failures_are_told_and_the_rest_goes_on(data: str, tmp_path: Path) -> No
     assert not jobs[second].done
     costs = json.loads((tmp_path / "cost.json").read_text())
     assert costs["cells"].keys() == {first.name, third.name}
-    spent = [cell["cpu_s"] for cell in costs["cells"].values()]
-    assert costs["total_cpu_s"] == pytest.approx(sum(spent), abs=0.2)
-    assert min(spent) > 0.1
+    cpu_s = [cell["cpu_s"] for cell in costs["cells"].values()]
+    assert costs["total_cpu_s"] == pytest.approx(sum(cpu_s), abs=0.2)
+    assert min(cpu_s) > 0.1
 
 
-def test_killed_cell_is_gone_on_with(
+def wait_for_an_epoch(run: Path) -> None:
+    """Waits until a training has stored the state after an epoch."""
+    while not (run / "unfinished" / "state.safetensors").exists():
+        time.sleep(0.05)
+
+
+def test_a_killed_cell_is_resumed(
     data: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """A process killed after an epoch fails its cell; the next start begins behind that epoch."""
+    """A process killed after an epoch fails its cell; the next run starts after that epoch."""
     cell = Cell(site="a", predictor="dkm", horizon_s=3.0, view="vectors", seed=0)
     run = tmp_path / "run"
-    started: list[subprocess.Popen[bytes]] = []
+    started: list[subprocess.Popen[Any]] = []
+    popen = subprocess.Popen
 
-    real_popen, real_sleep = subprocess.Popen, time.sleep
-
-    def watched(*args: Any, **kwargs: Any) -> subprocess.Popen[bytes]:
-        started.append(real_popen(*args, **kwargs))
+    def spy(*args: Any, **kwargs: Any) -> subprocess.Popen[Any]:
+        started.append(popen(*args, **kwargs))
         return started[-1]
 
-    def kill_after_an_epoch(seconds: float) -> None:
-        real_sleep(seconds)
-        if started and (run / "unfinished" / "state.safetensors").exists():
-            os.kill(started.pop().pid, signal.SIGKILL)
+    def kill_after_an_epoch() -> None:
+        wait_for_an_epoch(run)
+        os.kill(started[0].pid, signal.SIGKILL)
 
     jobs = {cell: training(data, run, epochs=40)}
     with monkeypatch.context() as patched:
-        patched.setattr(subprocess, "Popen", watched)
-        patched.setattr(time, "sleep", kill_after_an_epoch)
+        patched.setattr(subprocess, "Popen", spy)
         campaign = Campaign(jobs, tmp_path, Console(quiet=True))
+        Thread(target=kill_after_an_epoch, daemon=True).start()
         campaign.run(1)
     assert "killed by signal 9" in campaign.failed[cell]
     assert not (run / "config.json").exists()
@@ -268,24 +247,68 @@ def test_killed_cell_is_gone_on_with(
     assert json.loads((tmp_path / "cost.json").read_text())["cells"][cell.name]["processes"] == 2
 
 
+def test_an_interrupt_terminates_running_cells(
+    data: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A training of a million epochs; its cost is recorded."""
+    cell = Cell(site="a", predictor="dkm", horizon_s=3.0, view="vectors", seed=0)
+    run = tmp_path / "run"
+
+    def interrupt(*args: Any, **kwargs: Any) -> None:
+        del args, kwargs
+        wait_for_an_epoch(run)
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr("predictors.experiments.campaign.wait", interrupt)
+    campaign = Campaign({cell: training(data, run, epochs=10**6)}, tmp_path, Console(quiet=True))
+    with pytest.raises(KeyboardInterrupt):
+        campaign.run(1)
+    assert json.loads((tmp_path / "cost.json").read_text())["cells"][cell.name]["cpu_s"] > 0.1
+
+
+SCRIPT = """
+import os, signal, sys
+from pathlib import Path
+from asp_env.workers import WorkerPool
+from predictors.experiments.job import run_job
+from tests.predictors.experiments.test_table_cells import training, wait_for_an_epoch
+
+data, run = sys.argv[1], Path(sys.argv[2])
+WorkerPool(run_job, 1).submit(training(data, run, epochs=10**6))
+wait_for_an_epoch(run)
+os.kill(os.getpid(), signal.SIGKILL)
+"""
+
+
+def test_a_training_ends_when_the_command_is_killed(data: str, tmp_path: Path) -> None:
+    """A training of a million epochs; the output ends with the last process that shares it."""
+    env = {**os.environ, "PYTHONPATH": os.pathsep.join(path for path in sys.path if path)}
+    done = subprocess.run(
+        [sys.executable, "-c", SCRIPT, data, str(tmp_path / "run")],
+        stdout=subprocess.PIPE,
+        stderr=subprocess.STDOUT,
+        env=env,
+        timeout=300,
+        check=False,
+    )
+    assert done.returncode == -signal.SIGKILL, done.stdout.decode()
+
+
 def finished_run(run: Path, **provenance: Any) -> None:
-    """A folder as far as `check` looks into it."""
+    """Writes the part of a run folder that `check` reads."""
     run.mkdir()
     (run / "config.json").write_text(json.dumps({"provenance": provenance}))
 
 
-def test_run_of_another_recipe_is_told(data: str, tmp_path: Path) -> None:
-    """A finished run whose configuration differs is named with the fields that do.
-
-    One that is older than a field has its default.
-    """
+def test_a_run_of_another_recipe_is_an_error(data: str, tmp_path: Path) -> None:
+    """The message names the fields that differ; a run that lacks a field has its default."""
     run = tmp_path / "run"
     config = {"epochs": 8, "network": {"hidden": 4, "modes": 3}, "validation": "elsewhere"}
     finished_run(run, config=config)
     recipe = {"epochs": 8, "network": {"hidden": 4, "modes": 3, "kept": 0}, "validation": None}
     job = Job(
         train={"out": str(run), "data": data},
-        judging=None,
+        evaluation=None,
         recipe=recipe,
         defaults={"epochs": 10, "network": {"hidden": 9, "kept": 0}},
     )
@@ -298,11 +321,8 @@ def test_run_of_another_recipe_is_told(data: str, tmp_path: Path) -> None:
             other.check()
 
 
-def test_run_from_other_weights_is_told(data: str, tmp_path: Path) -> None:
-    """A run that started from weights which were trained again since is no result any more.
-
-    Nor is one whose start was trained by another recipe, finished as it may be.
-    """
+def test_a_run_from_other_weights_is_an_error(data: str, tmp_path: Path) -> None:
+    """The run that it started from was trained again, or with another recipe."""
     first = Cell(site="a", predictor="dkm", horizon_s=3.0, view="vectors", seed=0)
     second = Cell(site="a", predictor="dkm", horizon_s=6.0, view="vectors", seed=0, start=first)
     begin, run = tmp_path / "3s", tmp_path / "6s"
@@ -312,21 +332,21 @@ def test_run_from_other_weights_is_told(data: str, tmp_path: Path) -> None:
 
     def failed(epochs: int) -> dict[Cell, str]:
         start = {"out": str(begin), "data": data}
-        warm_starts_from_3s = {"out": str(run), "data": data, "start": str(begin)}
+        warm_start = {"out": str(run), "data": data, "start": str(begin)}
         jobs = {
-            first: Job(train=start, judging=None, recipe={"epochs": epochs}),
-            second: Job(train=warm_starts_from_3s, judging=None, recipe={"epochs": 4}),
+            first: Job(train=start, evaluation=None, recipe={"epochs": epochs}),
+            second: Job(train=warm_start, evaluation=None, recipe={"epochs": 4}),
         }
         campaign = Campaign(jobs, tmp_path, Console(quiet=True))
         campaign.run(0)
         return dict(campaign.failed)
 
     assert failed(8) == {}
-    told = failed(9)
-    assert "other epochs" in told[first]
-    assert "starts from, failed" in told[second]
+    reasons = failed(9)
+    assert "other epochs" in reasons[first]
+    assert "starts from, failed" in reasons[second]
     (begin / "weights.safetensors").write_bytes(b"others")
     assert "started from other weights" in failed(8)[second]
-    at_once = Job(train={"out": str(run), "data": data}, judging=None, recipe={"epochs": 4})
-    with pytest.raises(AspEnvError, match="went on from another run"):
-        at_once.check()
+    scratch = Job(train={"out": str(run), "data": data}, evaluation=None, recipe={"epochs": 4})
+    with pytest.raises(AspEnvError, match="started from another run"):
+        scratch.check()

@@ -1,4 +1,4 @@
-"""Drives in units: how they are dealt, and what is kept of them."""
+"""Work units of a comparison, their scores, and drives in several processes."""
 
 import dataclasses
 import pickle
@@ -34,61 +34,64 @@ from tests.sim.worlds import DT_S, HISTORY
 
 @pytest.fixture(scope="module")
 def scenarios(recordings: Recordings) -> ScenarioSet:
-    """All of the three crossings."""
+    """All scenarios of the three recordings."""
     return find_scenarios(recordings, source="", dt_s=DT_S, history=HISTORY)
 
 
 @pytest.fixture(scope="module")
 def network(tmp_path_factory: pytest.TempPathFactory) -> str:
-    """DKM with random weights, by name."""
+    """Name of a DKM with random weights."""
     return f"dkm:{save_random(tmp_path_factory.mktemp('runs') / 'dkm', 'dkm', 'vectors')}"
 
 
-def entrants(*predictors: str, planner: str = "sampling", traffic: str = "log") -> Methods:
-    """As the command makes them."""
-    return Methods("", planner, predictors, traffic, "pdms", 3.0, DT_S)
+def methods(*predictors: str, planner: str = "sampling", traffic: str = "log") -> Methods:
+    return Methods(
+        data="",
+        planner=planner,
+        predictors=predictors,
+        traffic=traffic,
+        rules="pdms",
+        horizon_s=3.0,
+        dt_s=DT_S,
+    )
 
 
-def unit(scenarios: ScenarioSet, *numbers: int, entrant: int = 1) -> WorkUnit:
-    """Some scenarios for one entrant."""
+def unit(scenarios: ScenarioSet, *numbers: int, method: int = 1) -> WorkUnit:
     return WorkUnit(
-        entrant=entrant,
+        method=method,
         numbers=np.array(numbers),
         scenarios=tuple(scenarios[number] for number in numbers),
     )
 
 
-def outcome(*scores: float, **metrics: tuple[float, ...]) -> EpisodeScores:
-    """One whose rollouts tell the scores again, as their time steps."""
-    found = {"score": scores, **{name.replace("_", " "): each for name, each in metrics.items()}}
-    everywhere = np.ones(len(scores), dtype=bool)
+def episodes(*scores: float, **metrics: tuple[float, ...]) -> EpisodeScores:
+    """Episodes whose rollouts have their scores as time steps, by which they can be identified."""
+    values = {"score": scores, **{name.replace("_", " "): each for name, each in metrics.items()}}
+    valid = np.ones(len(scores), dtype=bool)
     return EpisodeScores(
-        metrics={
-            name: Masked(value=np.array(each), valid=everywhere) for name, each in found.items()
-        },
+        metrics={name: Masked(value=np.array(each), valid=valid) for name, each in values.items()},
         endings=(Ending.GOAL,) * len(scores),
         rollouts=tuple(dataclasses.replace(make_rollout(), dt_s=score) for score in scores),
     )
 
 
-def told(found: ComparisonScores, entrant: int) -> list[float]:
-    """The scores of the rollouts that were kept."""
-    return [rollout.dt_s for rollout in found.of(entrant).rollouts]
+def scores_of_rollouts(comparison_scores: ComparisonScores, method: int) -> list[float]:
+    return [rollout.dt_s for rollout in comparison_scores.of(method).rollouts]
 
 
-def test_units_hold_every_scenario_once_for_everybody(
+def test_units_contain_every_scenario_once_for_every_method(
     scenarios: ScenarioSet, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """The longest first, the expert's (0) behind the others', of nearly the same size."""
+    """The longest scenarios first, the expert (0) after the others, units of similar size."""
     monkeypatch.setattr(comparison, "EPISODES_AT_ONCE", 4)
     units = work_units(scenarios, 3)
-    assert [each.entrant for each in units[:4]] == [2, 1, 0, 2]
-    for entrant in range(3):
-        mine = [each for each in units if each.entrant == entrant]
-        numbers = np.concatenate([each.numbers for each in mine])
+    assert [each.method for each in units[:4]] == [2, 1, 0, 2]
+    for method in range(3):
+        of_method = [each for each in units if each.method == method]
+        numbers = np.concatenate([each.numbers for each in of_method])
         assert sorted(numbers.tolist()) == list(range(len(scenarios)))
         assert (np.diff(scenarios.length[numbers]) <= 0).all()
-        sizes = {len(each.numbers) for each in mine}
+        sizes = {len(each.numbers) for each in of_method}
         assert max(sizes) <= 4
         assert max(sizes) - min(sizes) <= 1
     for each in units:
@@ -96,52 +99,54 @@ def test_units_hold_every_scenario_once_for_everybody(
 
 
 @pytest.mark.parametrize("order", [(0, 1, 2, 3), (3, 1, 2, 0)])
-def test_outcomes_stand_in_the_scenarios_order(
+def test_scores_are_in_the_order_of_the_scenarios(
     scenarios: ScenarioSet, order: tuple[int, ...]
 ) -> None:
-    """Whichever comes first; the worst are the others' lowest, the expert's do not count."""
+    """For any order of the units; the scores of the expert do not affect which are the worst."""
     parts = [
-        (unit(scenarios, 3, 0, entrant=0), outcome(0.0, 0.1)),
-        (unit(scenarios, 3, 0, entrant=1), outcome(0.3, 0.9)),
-        (unit(scenarios, 1, 2, entrant=0), outcome(0.2, 0.3)),
-        (unit(scenarios, 1, 2, entrant=1), outcome(0.3, 0.2)),
+        (unit(scenarios, 3, 0, method=0), episodes(0.0, 0.1)),
+        (unit(scenarios, 3, 0, method=1), episodes(0.3, 0.9)),
+        (unit(scenarios, 1, 2, method=0), episodes(0.2, 0.3)),
+        (unit(scenarios, 1, 2, method=1), episodes(0.3, 0.2)),
     ]
-    found = ComparisonScores(2, PDMS)
+    scores = ComparisonScores(2, PDMS)
     for number in order:
-        found.add(*parts[number])
-    assert found.of(0).metrics["score"].value.tolist() == [0.1, 0.2, 0.3, 0.0]
-    assert found.of(1).metrics["score"].value.tolist() == [0.9, 0.3, 0.2, 0.3]
-    assert found.worst == [2, 1, 3, 0]
-    assert told(found, 1) == [0.2, 0.3, 0.3, 0.9]
-    assert told(found, 0) == [0.3, 0.2, 0.0, 0.1]
-    assert len(found.of(1).endings) == 4
+        scores.add(*parts[number])
+    assert scores.of(0).metrics["score"].value.tolist() == [0.1, 0.2, 0.3, 0.0]
+    assert scores.of(1).metrics["score"].value.tolist() == [0.9, 0.3, 0.2, 0.3]
+    assert scores.worst == [2, 1, 3, 0]
+    assert scores_of_rollouts(scores, 1) == [0.2, 0.3, 0.3, 0.9]
+    assert scores_of_rollouts(scores, 0) == [0.3, 0.2, 0.0, 0.1]
+    assert len(scores.of(1).endings) == 4
 
 
-def test_only_the_worst_are_kept(scenarios: ScenarioSet, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Of an expert alone, by its own score; by the product of three metrics without a score."""
+def test_only_the_worst_rollouts_are_stored(
+    scenarios: ScenarioSet, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The expert alone is ranked by its own score; without a score three metrics count."""
     monkeypatch.setattr(comparison, "SAVED_ROLLOUTS", 1)
     alone = ComparisonScores(1, PDMS)
-    alone.add(unit(scenarios, 0, 1, entrant=0), outcome(0.5, 0.4))
-    alone.add(unit(scenarios, 2, entrant=0), outcome(0.6))
-    assert (alone.worst, told(alone, 0)) == ([1], [0.4])
+    alone.add(unit(scenarios, 0, 1, method=0), episodes(0.5, 0.4))
+    alone.add(unit(scenarios, 2, method=0), episodes(0.6))
+    assert (alone.worst, scores_of_rollouts(alone, 0)) == ([1], [0.4])
     unscored = ComparisonScores(1, WAYMAX)
     metrics = {"no_collision": (1.0, 1.0), "on_road": (1.0, 0.0), "progress": (0.1, 0.9)}
-    unscored.add(unit(scenarios, 0, 1, entrant=0), outcome(0.5, 0.6, **metrics))
-    assert (unscored.worst, told(unscored, 0)) == ([1], [0.6])
+    unscored.add(unit(scenarios, 0, 1, method=0), episodes(0.5, 0.6, **metrics))
+    assert (unscored.worst, scores_of_rollouts(unscored, 0)) == ([1], [0.6])
 
 
 def same(one: Rollout, other: Rollout, folder: Path) -> bool:
-    """Whether they are the same bytes in a file."""
+    """Whether two rollouts have the same bytes in a file."""
     for name, rollout in (("one", one), ("other", other)):
         rollout.save(folder / f"{name}.npz")
     return (folder / "one.npz").read_bytes() == (folder / "other.npz").read_bytes()
 
 
-def test_a_copy_drives_the_same(
+def test_pickled_methods_drive_the_same(
     recordings: Recordings, scenarios: ScenarioSet, network: str, tmp_path: Path
 ) -> None:
-    """It is made by names; and so does one that has driven other scenarios before."""
-    first = entrants(network, traffic="idm")
+    """Also after other scenarios."""
+    first = methods(network, traffic="idm")
     second = pickle.loads(pickle.dumps(first))
     task = unit(scenarios, 4, 5)
     alone = first.drive(recordings, task)
@@ -154,18 +159,18 @@ def test_a_copy_drives_the_same(
 def test_networks_run_on_one_thread(
     recordings: Recordings, scenarios: ScenarioSet, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Of however many there are, which are given back."""
+    """The number of threads is restored afterwards."""
     seen: list[int] = []
 
-    def watched(*args: Any, **kwargs: Any) -> Any:
+    def spy(*args: Any, **kwargs: Any) -> Any:
         seen.append(torch.get_num_threads())
         return drive_episodes(*args, **kwargs)
 
-    monkeypatch.setattr(comparison, "drive_episodes", watched)
+    monkeypatch.setattr(comparison, "drive_episodes", spy)
     before = torch.get_num_threads()
     torch.set_num_threads(3)
     try:
-        entrants("oracle").drive(recordings, unit(scenarios, 0, entrant=0))
+        methods("oracle").drive(recordings, unit(scenarios, 0, method=0))
         assert (seen, torch.get_num_threads()) == ([1], 3)
     finally:
         torch.set_num_threads(before)
@@ -174,7 +179,7 @@ def test_networks_run_on_one_thread(
 def test_the_number_of_processes_changes_nothing(
     crossings: Path, network: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Every file of a run is the same, with a network and traffic that draws."""
+    """Every file of a run is the same, with a network and with traffic that draws samples."""
     monkeypatch.setattr(comparison, "EPISODES_AT_ONCE", 2)
     runs = {1: tmp_path / "one", 2: tmp_path / "two"}
     for jobs, out in runs.items():
@@ -191,22 +196,22 @@ def test_the_number_of_processes_changes_nothing(
     assert one == two
 
 
-def test_bad_input_in_a_process_is_one_line(
+def test_an_error_in_a_process_is_one_line(
     crossings: Path,
     network: str,
     tmp_path: Path,
     monkeypatch: pytest.MonkeyPatch,
     capfd: pytest.CaptureFixture[str],
 ) -> None:
-    """A network that is gone by the time that the others load it; nothing is written."""
+    """The network is deleted before the other processes load it; nothing is written."""
     run = tmp_path / "run"
     shutil.copytree(network.partition(":")[2], run)
 
-    def dealt(scenarios: ScenarioSet, entrants: int) -> list[WorkUnit]:
+    def delete_network(scenarios: ScenarioSet, count: int) -> list[WorkUnit]:
         shutil.rmtree(run)
-        return work_units(scenarios, entrants)
+        return work_units(scenarios, count)
 
-    monkeypatch.setattr(drive, "work_units", dealt)
+    monkeypatch.setattr(drive, "work_units", delete_network)
     out = tmp_path / "out"
     args = ["drive", str(crossings), "--predictors", f"dkm:{run}", "--out", str(out)]
     assert main([*args, "--jobs", "2", "--max-scenarios", "2"]) == 2
