@@ -27,7 +27,7 @@ from asp_env.sim.reward import reward_terms, weighted_sum, weights_from
 from asp_env.sim.simulation import Simulation, ending
 from asp_env.sim.traffic.assignment import make_traffic
 from asp_env.sim.world import Ending, Events, world_class
-from asp_env.views import make_picture_view
+from asp_env.views import make_raster_view
 
 RESET_OPTIONS = ("scenario", "start_tick", "ego")
 """The keys that `reset(options=…)` accepts."""
@@ -189,7 +189,7 @@ class ReplayEpisodes:
             self.recordings, options.scenarios, dt_s=options.dt_s, history=history
         )
         self.scenarios = self._sampler.scenarios
-        raster = make_picture_view(options.view, pixels=options.raster_px)
+        raster = make_raster_view(options.view, pixels=options.raster_px)
         self.observer = Observer(options.observations, raster, history)
         kind = world_class(data)
         self.simulation = Simulation(

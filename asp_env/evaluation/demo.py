@@ -19,7 +19,7 @@ from asp_env.evaluation.report import check_report_possible, write_report
 from asp_env.evaluation.results import write_manifest, write_metrics
 from asp_env.evaluation.tables import driving_table, open_loop_tables
 from asp_env.files import atomic_folder
-from asp_env.metrics.driving.rules import DEFAULT_PRESET, RULES
+from asp_env.metrics.driving.rules import DEFAULT_RULES, RULES
 
 SITE = "intersection"
 PREDICTOR = "ffw-asp"
@@ -115,7 +115,7 @@ class Demo:
                 examples=open_loop.examples,
             )
         tables = open_loop_tables(open_loop.rows, open_privileged)
-        shown = RULES[DEFAULT_PRESET].shown
+        shown = RULES[DEFAULT_RULES].shown
         for table in (*tables, driving_table(closed_loop.rows, closed_privileged, shown)):
             console.print(table)
         console.print(f"wrote {self.out / 'report.html'}")

@@ -1,4 +1,4 @@
-"""A value never travels without its mask."""
+"""The result type of all metrics: values with a mask."""
 
 from dataclasses import dataclass
 
@@ -10,7 +10,7 @@ from asp_env.errors import AspEnvError
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Masked:
-    """Values, and where they mean something. Invalid values are neither 0 nor 1: skip them."""
+    """Values and a mask of where they are defined. Invalid values must not enter any average."""
 
     value: Float[np.ndarray, "*shape"]
     valid: Bool[np.ndarray, "*shape"]

@@ -22,7 +22,7 @@ from asp_env.errors import AspEnvError, unknown_name
 from asp_env.geometry import wrap_angle
 from asp_env.sim.episodes import last_ticks
 from asp_env.sim.world import Events, World
-from asp_env.views import VIEWS, PictureView, make_picture_view
+from asp_env.views import VIEWS, RasterView, make_raster_view
 from asp_env.views.vectors import AGENT_FIELDS, LINE_FIELDS, VectorBounds, Vectors, VectorView
 
 PICTURE_VIEWS = tuple(name for name in VIEWS if not name.startswith("vectors"))
@@ -164,7 +164,7 @@ class ObservationComponent(Protocol):
 class RasterComponent:
     """The picture of a view: uint8 (channels, height, width)."""
 
-    def __init__(self, name: str, view: PictureView) -> None:
+    def __init__(self, name: str, view: RasterView) -> None:
         self._name, self._view = name, view
         self.history = view.history
         self.spaces: Spaces = {name: spaces.Box(0, 255, view.shape, dtype=np.uint8)}
@@ -172,7 +172,7 @@ class RasterComponent:
     def write(self, context: ObservationContext, events: Events, out: Observation) -> None:
         """Draws the pictures."""
         del events
-        self._view.draw(context, out[self._name])
+        self._view.render(context, out[self._name])
 
 
 @final
@@ -204,7 +204,7 @@ class VectorsComponent:
         del events
         masks = out["agents_valid"].view(np.bool_), out["lines_valid"].view(np.bool_)
         vectors = Vectors(out["agents"], masks[0], out["lines"], masks[1])
-        self._view.draw(context, vectors, self._bounds)
+        self._view.render(context, vectors, self._bounds)
 
 
 @final
@@ -278,7 +278,7 @@ class RouteComponent:
 class Observer:
     """Writes the observations of the chosen components, and computes nothing else."""
 
-    def __init__(self, names: Sequence[str], raster: PictureView, history: int) -> None:
+    def __init__(self, names: Sequence[str], raster: RasterView, history: int) -> None:
         """Creates the components.
 
         Args:
@@ -333,7 +333,7 @@ class Observer:
         return out
 
 
-def _make_component(name: str, raster: PictureView, history: int) -> ObservationComponent:
+def _make_component(name: str, raster: RasterView, history: int) -> ObservationComponent:
     if name == "raster":
         return RasterComponent(name, raster)
     if name == "vectors":
@@ -344,7 +344,7 @@ def _make_component(name: str, raster: PictureView, history: int) -> Observation
         return StateComponent()
     if name == "route":
         return RouteComponent()
-    return RasterComponent(name, make_picture_view(name))
+    return RasterComponent(name, make_raster_view(name))
 
 
 def _field_bounds(names: tuple[str, ...]) -> tuple[np.ndarray, np.ndarray]:

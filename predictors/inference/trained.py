@@ -14,7 +14,7 @@ from asp_env.data.scene import Scene
 from asp_env.data.snippets import Future
 from asp_env.data.split import TrainedOn
 from asp_env.errors import AspEnvError
-from asp_env.views import PictureView, SceneView
+from asp_env.views import RasterView, SceneView
 from predictors.models.batch import Batch, make_batch, make_labels
 from predictors.models.chaining import Chaining
 from predictors.models.network import AbstractNetwork, Modes
@@ -68,7 +68,7 @@ class TrainedPredictor:
         self._metadata = MappingProxyType(dict(metadata))
         self._temperature = temperature
         self._chunk = MAX_CHUNK_TARGETS
-        if isinstance(view, PictureView):
+        if isinstance(view, RasterView):
             pixels = math.prod(view.shape[1:])
             self._chunk = min(MAX_CHUNK_TARGETS, max(1, MAX_CHUNK_PIXELS // pixels))
 

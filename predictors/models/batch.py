@@ -16,7 +16,7 @@ from torch import Tensor
 from asp_env.data.scene import Scene
 from asp_env.data.snippets import Future
 from asp_env.geometry import states_to_frame, wrap_angle
-from asp_env.views import BinaryView, PictureView, SceneView
+from asp_env.views import BinaryView, RasterView, SceneView
 
 
 class VectorTensors(NamedTuple):
@@ -96,8 +96,8 @@ def make_labels(scene: Scene, future: Future, later: tuple[Batch, ...] = ()) -> 
 
 def _observe(scene: Scene, view: SceneView) -> Observation:
     if isinstance(view, BinaryView):
-        return torch.from_numpy(view.draw_packed(scene))
-    drawn = view.draw(scene)
-    if isinstance(view, PictureView):
+        return torch.from_numpy(view.render_packed(scene))
+    drawn = view.render(scene)
+    if isinstance(view, RasterView):
         return torch.from_numpy(drawn)
     return VectorTensors(*(torch.from_numpy(array) for array in drawn))

@@ -17,7 +17,7 @@ from torch.nn import functional
 
 from asp_env.geometry import to_frame
 from asp_env.metrics.forecast import errors
-from asp_env.metrics.forecast.errors import ModeRule, ends_alike
+from asp_env.metrics.forecast.errors import ModeRule, ends_in_true_direction
 
 Assignment = Literal["angle", "distance", "angle-random"]
 """How the best mode of a label is chosen: see `best_mode` and `best_or_random_mode`."""
@@ -88,7 +88,7 @@ def best_or_random_mode(
     distance = torch.linalg.vector_norm(positions - label[:, None], dim=-1).mean(dim=-1)
     bits = distance.float().contiguous().view(torch.int32).long()
     random = (bits * 2_654_435_761 >> 8 & 0xFFFF).argmax(dim=1)
-    decided = ends_alike(positions, label).any(dim=1)
+    decided = ends_in_true_direction(positions, label).any(dim=1)
     return torch.where(decided, best_mode(positions, label, "angle"), random)
 
 

@@ -203,8 +203,8 @@ def _grown(lanes: Lanes, joined: list[Link]) -> dict[LaneIndex, Sides]:
             grown[follower] = np.concatenate([curve[:, :-1], grown[follower]], axis=1)
         else:
             raise AspEnvError(
-                f"lane {leader} ends short of {follower}, and both have other connections; expected "
-                "one of them to have none, so that it can close the gap: use another road"
+                f"lane {leader} ends short of {follower}, and both have other connections; "
+                "expected one of them to have none, so that it can close the gap: use another road"
             )
     return grown
 

@@ -31,22 +31,22 @@ from scenarios.highway.sites import STEP_S, STEPS_PER_S, empty_road, remove_exit
 from scenarios.highway.vehicles import Road, TrafficVehicle
 
 APART_M = 15.0
-"""Nobody comes this near to somebody else; highway-env's own rule at the intersection."""
+"""Vehicles do not appear nearer to others than this, as at highway-env's intersection."""
 
 
 @dataclass(slots=True, kw_only=True)
 class _Run:
-    """One episode's part of highway-env."""
+    """highway-env's part of one episode."""
 
     road: Road
     frame: int
-    """In the recording."""
+    """Frame of the recording."""
     history: HiddenHistory
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class _Kept:
-    """The same as it was at one tick."""
+class _SavedRun:
+    """The state of `_Run` at one tick."""
 
     rows: Rows
     steps: int
@@ -54,13 +54,14 @@ class _Kept:
 
 
 class HighwayWorld(World):
-    """B episodes that begin as recorded; from then on highway-env's vehicles drive themselves.
+    """Episodes that start from recordings of highway-env's traffic and continue reactively.
 
-    Whom nobody drives is driven by highway-env: its intelligent driver model, its lane changes, its
-    rules of the road. Who is driven obeys the same bicycle model as in every world, so that an
-    action means the same; highway-env's own vehicle has its axles at its bumpers. Vehicles come
-    where and when they were recorded to come, unless somebody is within 15 m; all but the ego leave
-    at the end of the road. Left to itself, an episode goes on exactly as it was recorded.
+    Uncontrolled agents are moved by highway-env: its intelligent driver model, its lane changes
+    and its right of way. Controlled agents obey the same bicycle model as in every world, so that
+    an action has the same meaning; highway-env's own vehicle has its axles at its bumpers.
+    Vehicles appear where and when they were recorded to appear, unless another vehicle is within
+    15 m; all but the ego are removed at the end of the road. Without control, an episode continues
+    exactly as recorded.
     """
 
     traffic = "own"
@@ -68,10 +69,11 @@ class HighwayWorld(World):
     def __init__(
         self, recordings: Sequence[Any], *, num_episodes: int, dt_s: float, history: int
     ) -> None:
-        """A world without episodes yet; `reset` starts them.
+        """Creates a world without episodes; `reset` starts them.
 
         Raises:
-            AspEnvError: the time step is no multiple of 0.2 s, or the recordings are of no folder.
+            AspEnvError: the time step is not a multiple of 0.2 s, or the recordings are not from a
+                folder.
         """
         if not isinstance(recordings, Recordings):
             raise AspEnvError("recordings in memory: expected those of `highway:…`")
@@ -79,13 +81,13 @@ class HighwayWorld(World):
         self._stride = frames_per_tick(float(STEPS_PER_S), dt_s)
         if self._stride % HIDDEN_EVERY_FRAMES:
             raise AspEnvError(
-                f"time step {dt_s:g} s: what highway-env's vehicles have in mind is kept every "
+                f"time step {dt_s:g} s: internal states of highway-env's vehicles are stored every "
                 f"{HIDDEN_EVERY_FRAMES * STEP_S:g} s; choose a multiple of that"
             )
         self._folder = recordings
         self._runs: list[_Run | None] = [None] * num_episodes
         self._slots: list[dict[int, int]] = [{} for _ in range(num_episodes)]
-        """Of each episode, the slot of each track."""
+        """Per episode, the slot of each track."""
         self._histories: dict[int, HiddenHistory] = {}
         """By the number of the recording."""
 
@@ -107,7 +109,7 @@ class HighwayWorld(World):
             history = self._history(scenarios[b].recording)
             frame = scenarios[b].start_tick * self._stride
             rows, steps = history.at(frame)
-            self._begin(b, history, _Kept(rows=rows, steps=steps, frame=frame))
+            self._begin(b, history, _SavedRun(rows=rows, steps=steps, frame=frame))
             self._show_truth(b)
 
     def _history(self, recording: int) -> HiddenHistory:
@@ -116,21 +118,21 @@ class HighwayWorld(World):
             history = load_history(path := hidden_path(tracks))
             if not history.fits(self._folder[recording]):
                 raise DataError(
-                    f"{path} does not tell of the vehicles in {tracks}: expected both as they were "
-                    f"{WANTED}"
+                    f"{path} does not describe the vehicles in {tracks}: expected both as they "
+                    f"were {WANTED}"
                 )
             self._histories[recording] = history
         return self._histories[recording]
 
-    def _begin(self, b: int, history: HiddenHistory, kept: _Kept) -> None:
-        road = empty_road(history.site, steps=kept.steps)
-        road.vehicles = restore(kept.rows, road, history.site.vehicle)
-        self._runs[b] = _Run(road=road, frame=kept.frame, history=history)
+    def _begin(self, b: int, history: HiddenHistory, saved: _SavedRun) -> None:
+        road = empty_road(history.site, steps=saved.steps)
+        road.vehicles = restore(saved.rows, road, history.site.vehicle)
+        self._runs[b] = _Run(road=road, frame=saved.frame, history=history)
         tracks = self.episodes.tracks[b]
         self._slots[b] = {int(tracks[a]): a for a in np.flatnonzero(tracks >= 0).tolist()}
 
     def _show_truth(self, b: int) -> None:
-        """Writes the history as it was; the recording's may be rounded or measured with errors."""
+        """Writes the exact history; the recording is rounded, and may be noisy."""
         run, slots, states = self._runs[b], self._slots[b], self.episodes.states[b]
         assert run is not None
         for back in range(self.history + 1):
@@ -154,11 +156,11 @@ class HighwayWorld(World):
         at = 0
         for i, b in enumerate(rows.tolist()):
             steered = np.flatnonzero(acting[i]).tolist()
-            obeying = {slot: (at + k) for k, slot in enumerate(steered)}
-            for slot, number in obeying.items():
+            commanded = {slot: (at + k) for k, slot in enumerate(steered)}
+            for slot, number in commanded.items():
                 acceleration, steering = commands[number]
                 self._vehicle(b, slot).steer(acceleration, steering, poses[number])
-            self._advance(b, controlled[i], obeying)
+            self._advance(b, controlled[i], commanded)
             self._write(b, int(now[i]) + 1, acting[i], ways[-1, at : at + len(steered)])
             at += len(steered)
 
@@ -167,14 +169,16 @@ class HighwayWorld(World):
         assert run is not None
         return next(each for each in run.road.vehicles if each.track == track)
 
-    def _advance(self, b: int, controlled: Bool[np.ndarray, " a"], obeying: dict[int, Any]) -> None:
-        """One tick of one episode's road."""
+    def _advance(
+        self, b: int, controlled: Bool[np.ndarray, " a"], commanded: dict[int, Any]
+    ) -> None:
+        """Advances the road of one episode by one tick."""
         run, slots, gone = self._runs[b], self._slots[b], self.episodes.departed[b]
         assert run is not None
         road = run.road
         road.vehicles = [each for each in road.vehicles if not gone[slots[each.track]]]
         for vehicle in road.vehicles:
-            if slots[vehicle.track] not in obeying:
+            if slots[vehicle.track] not in commanded:
                 vehicle.release()
         for _ in range(self._stride):
             step_road(road)
@@ -182,12 +186,12 @@ class HighwayWorld(World):
             if run.frame % STEPS_PER_S == 0:
                 remove_exited(run.history.site, road, ego=int(self.episodes.tracks[b, EGO]))
                 away = [slot for slot in slots.values() if controlled[slot] or gone[slot]]
-                self._let_in(run, {int(self.episodes.tracks[b, slot]) for slot in away})
+                self._add_arrivals(run, {int(self.episodes.tracks[b, slot]) for slot in away})
 
-    def _let_in(self, run: _Run, away: set[int]) -> None:
-        """Those who are recorded to come at this frame, unless somebody is where they would be."""
-        comers = run.history.coming(run.frame)
-        for row in comers[~np.isin(comers["track"], [*away])]:
+    def _add_arrivals(self, run: _Run, away: set[int]) -> None:
+        """Adds the vehicles recorded to appear at this frame, unless their place is occupied."""
+        arrivals = run.history.coming(run.frame)
+        for row in arrivals[~np.isin(arrivals["track"], [*away])]:
             place = np.array([row["x"], row["y"]])
             near = [np.linalg.norm(each.position - place) < APART_M for each in run.road.vehicles]
             if not any(near):
@@ -200,34 +204,34 @@ class HighwayWorld(World):
         acting: Bool[np.ndarray, " a"],
         moved: Float[np.ndarray, "n 4"],
     ) -> None:
-        """What became of one episode, into the arrays."""
+        """Writes the result of a tick of one episode to the arrays."""
         run, slots, data = self._runs[b], self._slots[b], self.episodes
         assert run is not None
-        there = data.valid[b, tick]
-        there[:] = False
+        present = data.valid[b, tick]
+        present[:] = False
         vehicles = run.road.vehicles
         if vehicles:
             at = [slots[each.track] for each in vehicles]
-            theirs = np.array([(*v.position, v.heading, v.speed) for v in vehicles])
-            data.states[b, tick, at] = mirror_states(theirs)
-            there[at] = True
+            native = np.array([(*v.position, v.heading, v.speed) for v in vehicles])
+            data.states[b, tick, at] = mirror_states(native)
+            present[at] = True
         data.states[b, tick, acting] = moved
-        data.states[b, tick, ~there] = 0.0
-        data.departed[b] |= data.valid[b, tick - 1] & ~there
+        data.states[b, tick, ~present] = 0.0
+        data.departed[b] |= data.valid[b, tick - 1] & ~present
 
     def snapshot(self) -> Any:
-        """The whole state, to be handed to `restore`."""
-        kept = [
-            run and _Kept(rows=read_vehicles(run.road), steps=run.road.steps, frame=run.frame)
+        """The whole state, for `restore`."""
+        saved = [
+            run and _SavedRun(rows=read_vehicles(run.road), steps=run.road.steps, frame=run.frame)
             for run in self._runs
         ]
-        return super().snapshot(), kept
+        return super().snapshot(), saved
 
     def restore(self, snapshot: Any) -> None:
-        """Goes back to a snapshot, bit for bit."""
-        arrays, kept = snapshot
+        """Restores a snapshot, bit for bit."""
+        arrays, saved = snapshot
         super().restore(arrays)
-        for b, (each, scenario) in enumerate(zip(kept, self.scenarios, strict=True)):
+        for b, (each, scenario) in enumerate(zip(saved, self.scenarios, strict=True)):
             self._runs[b] = None
             if each is not None:
                 assert scenario is not None
@@ -235,5 +239,5 @@ class HighwayWorld(World):
 
 
 def _states_of(rows: Rows) -> Float[np.ndarray, "n 4"]:
-    """In our axes."""
+    """States (n, 4) of some rows, in the axes of this package."""
     return mirror_states(np.stack([rows[name] for name in ("x", "y", "heading", "speed")], axis=-1))

@@ -1,11 +1,11 @@
-"""A street with lanes that tests can reckon with, and what a drive on it is made of."""
+"""A street map with lanes, built by hand."""
 
 import numpy as np
 
 from asp_env.data.road_map import Ragged, RoadMap
 
 EAST, NEXT_EAST, WEST, ONWARDS, LEFT, NORTH = range(6)
-"""The lanes of `STREET`."""
+"""Indices of the lanes of `STREET`."""
 
 
 def strip(
@@ -19,15 +19,15 @@ def strip(
 
 
 def street_map(*, two_way: tuple[int, ...] = (), without: tuple[int, ...] = ()) -> RoadMap:
-    """Lanes 4 m wide with limits of 10 m/s, but for `ONWARDS`, which tells none, and `LEFT`, 15.
+    """Lanes 4 m wide with limits of 10 m/s, except `ONWARDS` (none) and `LEFT` (15 m/s).
 
-    `EAST` from x = 0 to 100 at y = 0, `ONWARDS` behind it to 200; `NEXT_EAST` at y = -4 and `WEST`
-    at y = 4 beside `EAST`; `LEFT` follows `EAST` too, at 45° from (100, 0); `NORTH` crosses all
-    three at x = 50 from y = -30 to 30.
+    `EAST` runs from x = 0 to 100 at y = 0 and continues as `ONWARDS` to x = 200. `NEXT_EAST` at
+    y = -4 and `WEST` at y = 4 run beside `EAST`. `LEFT` follows `EAST` too, at 45° from (100, 0).
+    `NORTH` crosses all three at x = 50 from y = -30 to 30.
 
     Args:
-        two_way: lanes that are.
-        without: lanes that the map lacks, so that it has gaps; the others keep their order.
+        two_way: lanes that may be driven in both directions.
+        without: lanes to leave out; the other lanes retain their order.
     """
     lanes = {
         EAST: strip(0, 0, 100, 0),
@@ -37,24 +37,24 @@ def street_map(*, two_way: tuple[int, ...] = (), without: tuple[int, ...] = ()) 
         LEFT: strip(100, 0, 130, 30),
         NORTH: strip(50, -30, 50, 30),
     }
-    lanes[LEFT][1][[0, -1]] = (100, 2), (100, -2)  # begins where the lane before it ends
-    kept = [lane for lane in lanes if lane not in without]
-    at = {lane: number for number, lane in enumerate(kept)}
+    lanes[LEFT][1][[0, -1]] = (100, 2), (100, -2)  # begins at the end of `EAST`
+    present = [lane for lane in lanes if lane not in without]
+    index = {lane: number for number, lane in enumerate(present)}
     follows = [(EAST, ONWARDS), (EAST, LEFT)]
-    edges = [(at[a], at[b]) for a, b in follows if a in at and b in at]
+    edges = [(index[a], index[b]) for a, b in follows if a in index and b in index]
     limits = {ONWARDS: 0.0, LEFT: 15.0}
-    rings = [lanes[lane][1] for lane in kept]
+    rings = [lanes[lane][1] for lane in present]
     return RoadMap(
         name="street",
         lines=Ragged.pack([]),
         line_types=np.zeros(0, dtype=np.int64),
         drivable=Ragged.pack(rings),
-        lanes=Ragged.pack([lanes[lane][0] for lane in kept]),
+        lanes=Ragged.pack([lanes[lane][0] for lane in present]),
         successors=np.array(edges, dtype=np.int64).reshape(-1, 2),
         areas=Ragged.pack(rings),
-        two_way=np.array([lane in two_way for lane in kept]),
-        limits_mps=np.array([limits.get(lane, 10.0) for lane in kept]),
-        limited=np.array([lane != ONWARDS for lane in kept]),
+        two_way=np.array([lane in two_way for lane in present]),
+        limits_mps=np.array([limits.get(lane, 10.0) for lane in present]),
+        limited=np.array([lane != ONWARDS for lane in present]),
     )
 
 
@@ -63,7 +63,7 @@ CAR = np.array([4.0, 2.0])
 
 
 def moved_map(road_map: RoadMap, pose: tuple[float, float, float]) -> RoadMap:
-    """The same map seen from elsewhere: turned by an angle, then shifted."""
+    """The map rotated by an angle and then translated."""
     x, y, angle = pose
     turn = np.array([(np.cos(angle), np.sin(angle)), (-np.sin(angle), np.cos(angle))])
 

@@ -1,4 +1,4 @@
-"""Contacts with boxes placed by hand; laws on generated boxes."""
+"""Contacts of boxes placed by hand, and laws on generated boxes."""
 
 import math
 
@@ -20,7 +20,7 @@ EGO: State = (0.0, 0.0, 0.0, 10.0)
 
 
 def placed(*others: State, ego: State = EGO, at: State = (0.0, 0.0, 0.0, 0.0)) -> np.ndarray:
-    """One situation of the ego and others, with the origin at a pose."""
+    """One situation of the ego and other agents, in the frame of a pose."""
     states = np.array([ego, *others])
     xy = from_frame(states[:, :2], np.array(at))
     return np.concatenate([xy, states[:, 2:3] + at[2], states[:, 3:]], axis=1)[None]
@@ -29,11 +29,11 @@ def placed(*others: State, ego: State = EGO, at: State = (0.0, 0.0, 0.0, 0.0)) -
 def contacts(
     *others: State, ego: State = EGO, size: tuple[float, float] = CAR, at: State = (0, 0, 0, 0)
 ) -> list[Contact]:
-    """How the ego, a car, meets others of a size."""
+    """The contacts of the ego, a car, with other agents of one size."""
     states = placed(*others, ego=ego, at=at)
     sizes = np.array([[CAR, *[size] * len(others)]])
     found = ego_contacts(states, sizes, np.ones(states.shape[:2], dtype=bool))
-    assert found[0, 0] == Contact.NONE  # the ego does not meet itself
+    assert found[0, 0] == Contact.NONE  # the ego has no contact with itself
     return [Contact(kind) for kind in found[0, 1:]]
 
 
@@ -41,16 +41,16 @@ def contacts(
 @pytest.mark.parametrize(
     ("x", "y", "size", "expected"),
     [
-        (3.5, 0.0, CAR, Contact.FRONT),  # its tail 1.5 m ahead of our centre, our front at 2 m
-        (3.5, 1.9, CAR, Contact.FRONT),  # only our front left corner
+        (3.5, 0.0, CAR, Contact.FRONT),  # its rear at 1.5 m, the ego's front at 2 m
+        (3.5, 1.9, CAR, Contact.FRONT),  # only the ego's front left corner
         (-3.5, 0.0, CAR, Contact.REAR),
-        (0.0, 1.8, (1.0, 2.0), Contact.SIDE),  # 1 m long beside our doors
-        (0.0, 0.0, (6.0, 1.0), Contact.FRONT),  # from end to end of us
-        (-3.5, 1.3, CAR, Contact.REAR),  # 1.3 / 2.3 m: 150.5° off our heading
+        (0.0, 1.8, (1.0, 2.0), Contact.SIDE),  # 1 m long beside the ego
+        (0.0, 0.0, (6.0, 1.0), Contact.FRONT),  # longer than the ego
+        (-3.5, 1.3, CAR, Contact.REAR),  # 1.3 / 2.3 m: 150.5° off the heading
         (-3.5, 1.35, CAR, Contact.SIDE),  # 149.6°
         (-3.5, -1.35, CAR, Contact.SIDE),
-        (-3.0, 1.7, CAR, Contact.SIDE),  # cut in on from behind: 136.6°
-        (-2.2, 0.5, (9.0, 1.0), Contact.REAR),  # 153°: behind decides before the front it reaches
+        (-3.0, 1.7, CAR, Contact.SIDE),  # at the rear left corner: 136.6°
+        (-2.2, 0.5, (9.0, 1.0), Contact.REAR),  # 153°: behind takes precedence over front
         (-1.9, 0.5, (9.0, 1.0), Contact.FRONT),  # 144.5°
         (3.99, 0.0, CAR, Contact.FRONT),
         (4.01, 0.0, CAR, Contact.NONE),
@@ -61,15 +61,11 @@ def contacts(
 def test_contact(
     x: float, y: float, size: tuple[float, float], expected: Contact, at: State
 ) -> None:
-    """Our front is at 2 m, our sides at 1 m, our rear axle at -1.2 m.
-
-    Turning and moving the scene changes nothing.
-    """
+    """The ego's front is at 2 m, its sides at 1 m and its rear axle at -1.2 m, in any pose."""
     assert contacts((x, y, 0.0, 5.0), size=size, at=at) == [expected]
 
 
-def test_touching_is_no_contact() -> None:
-    """Bumper to bumper, to the last bit, is not yet a contact."""
+def test_boxes_that_only_touch_have_no_contact() -> None:
     assert contacts((4.0, 0.0, 0.0, 5.0)) == [Contact.NONE]
 
 
@@ -86,17 +82,15 @@ def test_touching_is_no_contact() -> None:
     ],
 )
 def test_standing(ego_mps: float, other_mps: float, expected: Contact) -> None:
-    """Up to 0.05 m/s is standing; who stands decides before where it hit."""
+    """Up to 0.05 m/s agents stand; this takes precedence over where they touch."""
     assert contacts((3.5, 0.0, 0.0, other_mps), ego=(0.0, 0.0, 0.0, ego_mps)) == [expected]
 
 
-def test_fault() -> None:
-    """The ego answers for hitting with its front or side, and for hitting what stands."""
+def test_contacts_that_may_be_at_fault() -> None:
     assert set(AT_FAULT) == {Contact.OTHER_STANDS, Contact.FRONT, Contact.SIDE}
 
 
-def test_each_agent_by_itself() -> None:
-    """Several others in any order keep their own classes."""
+def test_contacts_do_not_depend_on_the_order_of_agents() -> None:
     others = [(3.5, 0.0, 0.0, 5.0), (50.0, 0.0, 0.0, 5.0), (-3.5, 0.0, 0.0, 5.0)]
     expected = [Contact.FRONT, Contact.NONE, Contact.REAR]
     assert contacts(*others) == expected
@@ -115,7 +109,7 @@ def test_each_agent_by_itself() -> None:
     ],
 )
 def test_touching_trailers(ego: AgentClass, other: AgentClass, x: float, expected: bool) -> None:
-    """A trailer, 4 m long as the ego, within it; only of who may tow, standing or not."""
+    """A trailer overlaps the ego, 4 m long like it; only of classes that tow, standing or not."""
     for speed in (0.0, 5.0):
         states = placed((x, 0.0, 0.0, speed), ego=(0.0, 0.0, 0.0, speed))
         sizes, valid = np.array([[CAR, CAR]]), np.ones((1, 2), dtype=bool)
@@ -125,8 +119,7 @@ def test_touching_trailers(ego: AgentClass, other: AgentClass, x: float, expecte
         assert not touching_trailers(states, sizes, np.array([[ego, other]]), valid).any()
 
 
-def test_the_absent_touch_nobody() -> None:
-    """Neither an invalid other nor an invalid ego has a contact."""
+def test_absent_agents_have_no_contact() -> None:
     states = np.repeat(placed((3.5, 0.0, 0.0, 5.0)), 2, axis=0)
     sizes = np.full((2, 2, 2), CAR)
     valid = np.array([(True, False), (False, True)])
@@ -141,7 +134,7 @@ def boxes() -> SearchStrategy[Box]:
 
 
 def gap_m(box: Box, other: Box) -> float:
-    """The widest gap between the corners' shadows on any side's normal; negative for overlap."""
+    """The widest gap between the projected corners on any side's normal; negative for overlap."""
     corners = [box_corners(np.array(each[:3]), np.array(each[3:])) for each in (box, other)]
     gaps = []
     for heading in (box[2], other[2]):
@@ -153,7 +146,7 @@ def gap_m(box: Box, other: Box) -> float:
 
 @given(box=boxes(), other=boxes())
 def test_overlap(box: Box, other: Box) -> None:
-    """Boxes overlap where no line separates their corners; whoever is asked first."""
+    """Boxes overlap if no line separates their corners, in either order."""
     gap = gap_m(box, other)
     assume(abs(gap) > 1e-9)
     assert overlaps(*box, *other) == (gap < 0)
@@ -161,19 +154,19 @@ def test_overlap(box: Box, other: Box) -> None:
 
 
 @given(box=boxes(), share=st.floats(0, 0.999))
-def test_a_box_within_a_box(box: Box, share: float) -> None:
-    """Boxes of the same centre overlap, also if one is a line without depth."""
+def test_boxes_with_the_same_centre_overlap(box: Box, share: float) -> None:
+    """This holds for a box of length 0 as well."""
     x, y, heading, length, width = box
     assert overlaps(*box, x, y, heading + share, share * length, share * width)
     assert overlaps(*box, x, y, heading, 0.0, width)
 
 
 @given(kinds=st.lists(st.sampled_from(list(Contact)), min_size=2, max_size=2))
-def test_a_contact_that_lasts_keeps_its_kind(kinds: list[Contact]) -> None:
-    """Only where there is one still; a new one is classed anew."""
+def test_lasting_contacts_retain_their_kind(kinds: list[Contact]) -> None:
+    """New contacts are classified; contacts that have ended are removed."""
     touching, apart = (3.5, 0.0, 0.0, 5.0), (30.0, 0.0, 0.0, 5.0)
     states = placed(touching, apart)
     sizes, valid = np.full((1, 3, 2), CAR), np.ones((1, 3), dtype=bool)
-    before = np.array([[Contact.NONE, *kinds]], dtype=np.int8)
-    (found,) = ego_contacts(states, sizes, valid, before)
+    previous = np.array([[Contact.NONE, *kinds]], dtype=np.int8)
+    (found,) = ego_contacts(states, sizes, valid, previous)
     assert found.tolist() == [0, kinds[0] or Contact.FRONT, 0]

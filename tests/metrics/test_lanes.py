@@ -1,4 +1,4 @@
-"""Lanes under vehicles, on a street drawn by hand."""
+"""Lanes under points and boxes, on a street built by hand."""
 
 import math
 from dataclasses import replace
@@ -10,11 +10,11 @@ from hypothesis import given
 
 from asp_env.data.road_map import Ragged, RoadMap
 from asp_env.geometry import box_corners, from_frame
-from asp_env.metrics.driving.map_context import distance_to_route_lanes_m, reachable
+from asp_env.metrics.driving.map_context import distance_to_route_lanes_m, reachable_lanes
 from asp_env.metrics.lanes import (
     against_traffic_m,
     at_crossing,
-    covering,
+    covering_lanes,
     in_several_lanes,
     lane_table,
     speed_limits,
@@ -40,7 +40,7 @@ BARE = replace(
     limits_mps=np.zeros(0),
     limited=np.zeros(0, dtype=bool),
 )
-"""The same street of which only centre lines are known."""
+"""The street with centre lines only."""
 
 
 def at(x: float, y: float, heading: float = 0.0, speed: float = 5.0) -> np.ndarray:
@@ -64,23 +64,22 @@ def at(x: float, y: float, heading: float = 0.0, speed: float = 5.0) -> np.ndarr
     ],
 )
 def test_covering(x: float, y: float, lanes: set[int]) -> None:
-    """Rings by hand."""
-    assert set(np.flatnonzero(covering(STREET, np.array([x, y])))) == lanes
+    assert set(np.flatnonzero(covering_lanes(STREET, np.array([x, y])))) == lanes
 
 
 @pytest.mark.parametrize(
     ("state", "several"),
     [
         (at(20, 0), False),
-        (at(20, 0.9), False),  # its left side at 1.9 m
+        (at(20, 0.9), False),  # its left side is at 1.9 m
         (at(20, 1.1), True),  # two corners over the line to the westbound lane
         (at(20, -2.0), True),
-        (at(100, 0), False),  # its rear in one lane, its front in the next
-        (at(101, 0.6, math.pi / 4), False),  # turning: its rear still in the lane before
+        (at(100, 0), False),  # its rear is in one lane, its front in the next
+        (at(101, 0.6, math.pi / 4), False),  # turning: its rear is in the previous lane
         (at(100, -2.0), True),  # its rear right is in the lane beside
-        (at(50, 0), False),  # where others cross, one lane has all corners
+        (at(50, 0), False),  # at the crossing one lane covers all corners
         (at(50, 0, math.pi / 2), False),
-        (at(20, -6.5), False),  # half of it beside the map: that half is nowhere
+        (at(20, -6.5), False),  # half of it is outside the map and does not count
         (at(20, 40), False),
     ],
 )
@@ -89,8 +88,8 @@ def test_several_lanes(state: np.ndarray, several: bool) -> None:
     assert in_several_lanes(STREET, state, CAR[None]).tolist() == [several]
 
 
-def test_three_lanes_that_follow_each_other_are_one() -> None:
-    """Chains go over two borders, not over three."""
+def test_three_consecutive_lanes_count_as_one() -> None:
+    """Four do not."""
     chained = street_map()
     assert len(lane_table(chained).chains) == 6 + 2  # six lanes, and two pairs
     bus = np.array([[18.0, 2.5]])
@@ -113,27 +112,27 @@ def test_three_lanes_that_follow_each_other_are_one() -> None:
     ("state", "crossing"),
     [
         (at(50, 0), True),
-        (at(46.5, 0), True),  # its front corners are at 48.5 m, the crossing lane begins at 48
+        (at(46.5, 0), True),  # its front is at 48.5 m, the crossing lane begins at 48 m
         (at(45, 0), False),
-        (at(55, 0), False),  # its tail at 53 m, that lane ends at 52
-        (at(50, -20, math.pi / 2), False),  # in the crossing lane, before the first of the others
+        (at(55, 0), False),  # its rear is at 53 m, the crossing lane ends at 52 m
+        (at(50, -20, math.pi / 2), False),  # in the crossing lane, before the first other lane
         (at(50, -4, math.pi / 2), True),
         (at(20, 0), False),  # beside parallel and opposite lanes
-        (at(104, 1.5, math.pi / 4), True),  # where the turn leaves the lane onwards, at 45°
+        (at(104, 1.5, math.pi / 4), True),  # where `LEFT` leaves `ONWARDS` at 45°
         (at(150, 0), False),
     ],
 )
 def test_crossing(state: np.ndarray, crossing: bool) -> None:
-    """At and between the metres at which another lane crosses, to 1 m."""
+    """At and between the metres at which another lane crosses, accurate to 1 m."""
     assert at_crossing(STREET, state, CAR[None]).tolist() == [crossing]
 
 
 def test_against_the_traffic() -> None:
-    """Each tick's way is laid along the lane that it ends in, and only what is against it counts.
+    """Each motion is projected on the lane in which it ends; only motion against it counts.
 
-    Eastwards in the westbound lane 3 m; back 1 m with it; 3 m north and 4 m west in the eastbound
-    one are 4 m; on the crossing eastwards is right for one of the lanes; 2 m west onto a point
-    without a lane are nothing; nor are 5 m from there to another one.
+    Eastwards in the westbound lane is 3 m, 1 m back with the lane nothing. 3 m north and 4 m west
+    in the eastbound lane are 4 m. Eastwards on the crossing is right for one of the lanes, 48 m
+    west is not. 2 m west to a point without a lane and 5 m to another one are nothing.
     """
     xy = np.array([(10, 4), (13, 4), (12, 4), (8, 1), (49, 1), (1, 1), (-1, 1), (-6, 1)])
     found = against_traffic_m(STREET, xy.astype(float))
@@ -141,15 +140,14 @@ def test_against_the_traffic() -> None:
 
 
 def test_of_overlapping_lanes_the_best_counts() -> None:
-    """On the crossing one may go east and north, and south is against the one, west the other."""
+    """On the crossing east and north are right."""
     for step, metres in (((1, 0), 0), ((0, 1), 0), ((0, -1), 0), ((-1, 0), 0), ((-1, -2), 1)):
-        # southwards is square to the eastbound lane, so no way against it
+        # southwards is perpendicular to the eastbound lane and therefore not against it
         xy = np.array([(50, 0), np.array((50, 0)) + step], dtype=float)
         assert against_traffic_m(STREET, xy)[1] == pytest.approx(metres)
 
 
-def test_two_way_lanes_have_no_wrong_direction() -> None:
-    """Neither have gaps: without the westbound lane, its place is nobody's."""
+def test_two_way_lanes_and_gaps_have_no_wrong_direction() -> None:
     xy = np.array([(10.0, 4.0), (20.0, 4.0)])
     assert against_traffic_m(street_map(two_way=(WEST,)), xy).tolist() == [0, 0]
     assert against_traffic_m(street_map(without=(WEST,)), xy).tolist() == [0, 0]
@@ -161,43 +159,40 @@ def test_two_way_lanes_have_no_wrong_direction() -> None:
     [
         (at(10, 0), 10.0),
         (at(110, 10, math.pi / 4), 15.0),
-        (at(150, 0), None),  # a lane that tells none
-        (at(102, 0), 15.0),  # the lane onwards tells none, the other does
+        (at(150, 0), None),  # a lane without a limit
+        (at(102, 0), 15.0),  # `ONWARDS` has no limit, `LEFT` has
         (at(10, 40), None),
-        (at(10, 4), None),  # headed against it
+        (at(10, 4), None),  # heading against the lane
         (at(10, 4, math.pi), 10.0),
     ],
 )
 def test_speed_limit(state: np.ndarray, limit: float | None) -> None:
-    """The highest of the lanes that fit the heading; missing otherwise."""
+    """The highest limit of the lanes that fit the heading."""
     found = speed_limits(STREET, state)
     assert (found.value[0] if found.valid[0] else None) == limit
 
 
-def test_lanes_that_lead_on() -> None:
-    """From the eastbound lane onwards and to the left; nothing from a place without a lane."""
-    assert set(np.flatnonzero(reachable(STREET, at(10, 0)[0]))) == {EAST, ONWARDS, LEFT}
-    assert set(np.flatnonzero(reachable(STREET, at(10, 0, math.pi)[0]))) == set()
-    assert set(np.flatnonzero(reachable(STREET, at(10, 4, math.pi)[0]))) == {WEST}
-    assert set(np.flatnonzero(reachable(STREET, at(10, 40)[0]))) == set()
+def test_reachable_lanes() -> None:
+    """From `EAST` its successors; nothing from a point without a lane or heading against it."""
+    assert set(np.flatnonzero(reachable_lanes(STREET, at(10, 0)[0]))) == {EAST, ONWARDS, LEFT}
+    assert set(np.flatnonzero(reachable_lanes(STREET, at(10, 0, math.pi)[0]))) == set()
+    assert set(np.flatnonzero(reachable_lanes(STREET, at(10, 4, math.pi)[0]))) == {WEST}
+    assert set(np.flatnonzero(reachable_lanes(STREET, at(10, 40)[0]))) == set()
 
 
-def test_distance_to_the_ways() -> None:
-    """4 m beside the lane, but 1 m from the logged route; on the way to the left 0 m from either.
-
-    (120, 20) lies on the lane to the left, 24 m from the route's end.
-    """
+def test_distance_to_route_lanes() -> None:
+    """4 m beside the lane is 1 m from the logged route; (120, 20) is on `LEFT`."""
     route = np.array([(0.0, 3.0), (120.0, 3.0)])
     states = np.concatenate([at(10, 0), at(20, 4), at(120, 20), at(10, -6)])
     np.testing.assert_allclose(distance_to_route_lanes_m(STREET, states, route), [0, 1, 0, 6])
-    beside = street_map(without=(EAST,))  # of what the log drove on, nothing is missed
+    beside = street_map(without=(EAST,))  # the logged route replaces a missing lane
     np.testing.assert_allclose(distance_to_route_lanes_m(beside, states, route)[:2], [3, 1])
 
 
-def test_a_map_of_centre_lines_tells_nothing() -> None:
-    """No areas, so no lane: nothing is several, crossed, against or limited."""
+def test_maps_of_centre_lines_have_no_lane_areas() -> None:
+    """Nothing is in several lanes, at a crossing, against the traffic or limited there."""
     state = at(20, 2)
-    assert covering(BARE, state[:, :2]).shape == (1, 0)
+    assert covering_lanes(BARE, state[:, :2]).shape == (1, 0)
     assert not in_several_lanes(BARE, state, CAR[None]).any()
     assert not at_crossing(BARE, state, CAR[None]).any()
     assert not against_traffic_m(BARE, np.array([(20.0, 4.0), (30.0, 4.0)])).any()
@@ -213,10 +208,10 @@ def test_a_map_of_centre_lines_tells_nothing() -> None:
     y=st.floats(-7, 7),
     heading=st.floats(-3, 3),
 )
-def test_where_the_street_lies_changes_nothing(
+def test_lanes_do_not_depend_on_the_pose_of_the_street(
     pose: Pose, x: float, y: float, heading: float
 ) -> None:
-    """Turned and shifted, a box has the same lanes; points on borders are left out."""
+    """Boxes with points on borders are left out, since rounding decides them."""
     elsewhere = moved_map(STREET, pose)
     state = at(x, y, heading)
     x_m, y_m = from_frame(state[0, :2], np.array(pose))
@@ -231,7 +226,7 @@ def test_where_the_street_lies_changes_nothing(
         return
     for one, other in (
         (in_several_lanes(STREET, state, CAR[None]), in_several_lanes(elsewhere, moved, CAR[None])),
-        (covering(STREET, two[0]), covering(elsewhere, two[1])),
+        (covering_lanes(STREET, two[0]), covering_lanes(elsewhere, two[1])),
     ):
         np.testing.assert_array_equal(one, other)
     np.testing.assert_allclose(
@@ -240,11 +235,11 @@ def test_where_the_street_lies_changes_nothing(
 
 
 def _distance_to_borders(road_map: RoadMap, state: np.ndarray, points: np.ndarray) -> float:
-    asked = np.concatenate([box_corners(state, CAR[None])[0], points])
+    points = np.concatenate([box_corners(state, CAR[None])[0], points])
     away = np.inf
     for i in range(len(road_map.areas)):
         ring = road_map.areas[i]
         for a, b in zip(ring, np.roll(ring, -1, axis=0), strict=True):
-            share = np.clip((asked - a) @ (b - a) / ((b - a) @ (b - a)), 0, 1)
-            away = min(away, np.hypot(*(asked - a - share[:, None] * (b - a)).T).min())
+            share = np.clip((points - a) @ (b - a) / ((b - a) @ (b - a)), 0, 1)
+            away = min(away, np.hypot(*(points - a - share[:, None] * (b - a)).T).min())
     return float(away)

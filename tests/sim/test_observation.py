@@ -15,12 +15,12 @@ from asp_env.sim.observation import (
     Observer,
     ego_context,
 )
-from asp_env.views import make_picture_view
+from asp_env.views import make_raster_view
 from asp_env.views.vectors import AGENT_FIELDS, VectorView
 from tests.builders import make_recording
 from tests.sim.worlds import HISTORY, car, drive, on_road, replay, scenario, simulate
 
-VIEW = make_picture_view("chauffeurnet", pixels=(90, 60))
+VIEW = make_raster_view("chauffeurnet", pixels=(90, 60))
 X, Y, SPEED = (AGENT_FIELDS.index(name) for name in ("x", "y", "speed"))
 
 
@@ -141,7 +141,7 @@ def test_vectors_are_those_of_the_view():
     simulation = simulate(make_recording(), [scenario(3), scenario(5)])
     drive(simulation, [(2.0, 0.1)] * 4)
     scene = simulation.world.scene()
-    drawn = VectorView().draw(scene.with_targets(np.array([(0, 0), (1, 0)])))
+    drawn = VectorView().render(scene.with_targets(np.array([(0, 0), (1, 0)])))
     observation = _observe(simulation, "vectors")
     for name, part in drawn._asdict().items():
         assert observation[name].astype(part.dtype).tobytes() == part.tobytes()

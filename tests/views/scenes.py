@@ -1,4 +1,4 @@
-"""Tiny scenes and maps, built by hand."""
+"""Small scenes and maps, built by hand."""
 
 import math
 from collections.abc import Sequence
@@ -14,15 +14,15 @@ from asp_env.views.mtp import MTP
 
 CAR_M = (4.0, 2.0)
 COARSE = ChauffeurNet.make((90, 60))
-PICTURES = (COARSE, ChauffeurNet.make((90, 60), ego_trail=False), MTP.make((90, 90)))
-"""Every view of pictures, small."""
+RASTER_VIEWS = (COARSE, ChauffeurNet.make((90, 60), ego_trail=False), MTP.make((90, 90)))
+"""Every raster view at a low resolution."""
 
 
 def make_map(
     lines: Sequence[tuple[LineType, Sequence[Sequence[float]]]] = (),
     drivable: Sequence[Sequence[Sequence[float]]] = (),
 ) -> RoadMap:
-    """A map of nothing but lines and rings of drivable area."""
+    """A map that contains only lines and rings of drivable area."""
     return RoadMap(
         name="by hand",
         lines=Ragged.pack([np.array(points, dtype=np.float64) for _, points in lines]),
@@ -43,9 +43,9 @@ def make_scene(
     targets: Sequence[tuple[int, int]] = ((0, 0),),
     maps: tuple[RoadMap, ...] = (),
 ) -> Scene:
-    """A scene of given states, of cars by default.
+    """A scene of the given states, of cars by default.
 
-    Situation i lies on map i of several, or on the only one.
+    With several maps, situation i lies on map i; otherwise all situations lie on the only map.
     """
     situations, agents, num_ticks, _ = states.shape
     maps = maps or (make_map(),)
@@ -68,18 +68,17 @@ def make_scene(
 
 
 def standing(poses: Sequence[Sequence[float]], ticks: int = 16) -> np.ndarray:
-    """States (1, agents, ticks, 4) of agents that stand at poses [x, y, heading]."""
+    """States (1, agents, ticks, 4) of standing agents with the poses [x, y, heading]."""
     now = np.concatenate([np.array(poses, dtype=np.float64), np.zeros((len(poses), 1))], axis=1)
     return np.tile(now[None, :, None], (1, 1, ticks, 1))
 
 
 def channel(name: str) -> int:
-    """The index of a channel."""
     return ChauffeurNet.channels.index(name)
 
 
 def cross_map(turn_rad: float = 0.0, shift_m: tuple[float, float] = (0.0, 0.0)) -> RoadMap:
-    """Lines and a crossing of two roads around the origin, turned and then moved."""
+    """Lines and a crossing of two roads around the origin, rotated and then translated."""
     cos, sin = math.cos(turn_rad), math.sin(turn_rad)
 
     def move(points: Sequence[tuple[float, float]]) -> list[tuple[float, float]]:
@@ -99,7 +98,7 @@ def cross_map(turn_rad: float = 0.0, shift_m: tuple[float, float] = (0.0, 0.0)) 
 
 
 def traffic(seed: int, *, situations: int = 1, agents: int = 6) -> np.ndarray:
-    """States (situations, agents, 16, 4) of agents that drive curves near the origin."""
+    """States (situations, agents, 16, 4) of agents on curves near the origin."""
     rng = np.random.default_rng(seed)
     times = 0.2 * np.arange(-15, 1)
     start = rng.uniform(-20, 20, (situations, agents, 1, 2))
@@ -113,9 +112,9 @@ def traffic(seed: int, *, situations: int = 1, agents: int = 6) -> np.ndarray:
 
 
 def busy_scene(seed: int = 0) -> Scene:
-    """Three situations on two maps, five targets out of order, some agents absent for a while.
+    """Three situations on two maps, five targets out of order, agents absent at some ticks.
 
-    Agents of all classes that overlap here and there.
+    The agents are of all classes and overlap in places.
     """
     states = traffic(seed, situations=3)
     rng = np.random.default_rng(seed)

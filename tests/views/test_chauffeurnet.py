@@ -1,5 +1,6 @@
-"""The ChauffeurNet view: what is drawn where."""
+"""The ChauffeurNet view: what is drawn in which channel and where."""
 
+import dataclasses
 import math
 
 import cv2
@@ -10,8 +11,8 @@ from hypothesis import strategies as st
 
 from asp_env.data.road_map import LineType
 from asp_env.errors import AspEnvError
-from asp_env.views.chauffeurnet import SNAPSHOTS, ChauffeurNet
-from asp_env.views.view import View
+from asp_env.views.chauffeurnet import SNAPSHOT_TICKS, ChauffeurNet
+from asp_env.views.raster import Viewport
 from tests.views.scenes import (
     COARSE,
     busy_scene,
@@ -24,12 +25,13 @@ from tests.views.scenes import (
 )
 
 SMALL = ChauffeurNet(
-    View(height_px=32, width_px=32, metres_per_pixel=1.0, anchor_row_px=24.0, anchor_column_px=16.0)
+    Viewport(
+        height_px=32, width_px=32, metres_per_pixel=1.0, anchor_row_px=24.0, anchor_column_px=16.0
+    )
 )
 
 
-def test_channels() -> None:
-    """Twelve channels in the documented order, 12x360x240 by default."""
+def test_channels_are_in_the_documented_order() -> None:
     assert ChauffeurNet().shape == (12, 360, 240)
     assert ChauffeurNet.channels[:4] == ("road_boundary", "ego_box", "ego_trail", "agents_0")
     assert ChauffeurNet.channels[-1] == "agents_8"
@@ -37,35 +39,34 @@ def test_channels() -> None:
 
 
 def test_lone_ego_on_an_empty_map() -> None:
-    """Only the ego's own box is there: 4 m by 2 m are 20 by 10 pixels around row 288."""
-    picture = ChauffeurNet().draw(make_scene(standing([(7.0, 3.0, 0.7)])))[0]
+    """Only the ego's box is drawn: 4 m by 2 m are 20 by 10 pixels around row 288."""
+    raster = ChauffeurNet().render(make_scene(standing([(7.0, 3.0, 0.7)])))[0]
     expected = np.zeros((360, 240), dtype=np.uint8)
     expected[278:298, 115:125] = 255
-    np.testing.assert_array_equal(picture[channel("ego_box")], expected)
-    drawn = np.flatnonzero(picture.any(axis=(1, 2))).tolist()
+    np.testing.assert_array_equal(raster[channel("ego_box")], expected)
+    drawn = np.flatnonzero(raster.any(axis=(1, 2))).tolist()
     assert drawn == [channel("ego_box"), channel("ego_trail")]
-    assert (picture[channel("ego_trail")] > 0).sum() == 4  # standing leaves a dot of 2 by 2
+    assert (
+        raster[channel("ego_trail")] > 0
+    ).sum() == 4  # the trail of a standing ego is a dot of 2 by 2
 
 
-def test_empty_scene_draws_the_map_alone() -> None:
-    """Without a history and without others, only the map and the ego's box are there."""
+def test_without_history_and_other_agents_only_map_and_ego_box_are_drawn() -> None:
     valid = np.zeros((1, 3, 16), dtype=bool)
     valid[0, 0, -1] = True
     states = standing([(0.0, 0.0, 0.0)] * 3)
-    picture = ChauffeurNet().draw(make_scene(states, valid=valid, maps=(cross_map(),)))[0]
-    drawn = np.flatnonzero(picture.any(axis=(1, 2))).tolist()
+    raster = ChauffeurNet().render(make_scene(states, valid=valid, maps=(cross_map(),)))[0]
+    drawn = np.flatnonzero(raster.any(axis=(1, 2))).tolist()
     assert drawn == [channel("road_boundary"), channel("ego_box")]
 
 
-def test_no_targets() -> None:
-    """A scene without targets gives no pictures."""
+def test_a_scene_without_targets_gives_no_rasters() -> None:
     scene = make_scene(standing([(0.0, 0.0, 0.0)]), targets=[])
-    assert COARSE.draw(scene).shape == (0, 12, 90, 60)
+    assert COARSE.render(scene).shape == (0, 12, 90, 60)
 
 
 def test_values_are_0_and_255() -> None:
-    """Pictures are binary."""
-    assert np.unique(ChauffeurNet().draw(busy_scene())).tolist() == [0, 255]
+    assert np.unique(ChauffeurNet().render(busy_scene())).tolist() == [0, 255]
 
 
 @pytest.mark.parametrize("heading", [0.0, 0.5 * math.pi, math.pi, -0.5 * math.pi, 0.3])
@@ -73,31 +74,29 @@ def test_left_is_left(heading: float) -> None:
     """A car 10 m ahead and 6 m to the left is 50 rows up and 30 columns to the left."""
     cos, sin = math.cos(heading), math.sin(heading)
     other = (5.0 + 10 * cos - 6 * sin, 9.0 + 10 * sin + 6 * cos, heading)
-    picture = ChauffeurNet().draw(make_scene(standing([(5.0, 9.0, heading), other])))[0]
-    rows, columns = np.nonzero(picture[channel("agents_8")])
+    raster = ChauffeurNet().render(make_scene(standing([(5.0, 9.0, heading), other])))[0]
+    rows, columns = np.nonzero(raster[channel("agents_8")])
     assert rows.mean() + 0.5 == pytest.approx(238, abs=0.5)
     assert columns.mean() + 0.5 == pytest.approx(90, abs=0.5)
 
 
-def test_trail_of_a_left_hand_curve_lies_on_the_left() -> None:
-    """Who came round a left-hand curve has its trail on the left, behind its back."""
+def test_trail_of_a_left_hand_curve_lies_behind_on_the_left() -> None:
     angle = np.linspace(-0.9, 0.0, 16)
     states = np.zeros((1, 1, 16, 4))
     states[0, 0] = np.stack(
         [20 * np.sin(angle), 20 - 20 * np.cos(angle), angle, np.full(16, 6.0)], axis=1
     )
-    trail = ChauffeurNet().draw(make_scene(states))[0, channel("ego_trail")]
+    trail = ChauffeurNet().render(make_scene(states))[0, channel("ego_trail")]
     rows, columns = np.nonzero(trail)
     assert rows.min() >= 286
-    # 20 m - 20 m · cos 0.9 = 7.57 m to the left, but 14.4 m back the picture ends: 6.1 m.
+    # 20 m - 20 m · cos 0.9 = 7.57 m to the left, but the raster ends 14.4 m back, at 6.1 m.
     assert columns.min() == pytest.approx(120 - 5 * 6.1, abs=3)
     assert columns.max() <= 121
 
 
-def test_without_the_ego_trail() -> None:
-    """Its channel stays and is empty; all others are as they were."""
+def test_without_the_ego_trail_only_its_channel_is_empty() -> None:
     scene = busy_scene()
-    shown, hidden = (ChauffeurNet(ego_trail=trail).draw(scene) for trail in (True, False))
+    shown, hidden = (ChauffeurNet(ego_trail=trail).render(scene) for trail in (True, False))
     others = [i for i, name in enumerate(ChauffeurNet.channels) if name != "ego_trail"]
     assert shown[:, channel("ego_trail")].any()
     assert not hidden[:, channel("ego_trail")].any()
@@ -105,46 +104,45 @@ def test_without_the_ego_trail() -> None:
 
 
 def test_snapshots_are_those_of_the_paper() -> None:
-    """An agent seen at state s alone is drawn in the channel of s, and nowhere if there is none."""
+    """An agent observed only at state s is drawn in the channel of s, if there is one."""
     for state in range(16):
         valid = np.zeros((1, 2, 16), dtype=bool)
         valid[0, 0, -1] = valid[0, 1, state] = True
         scene = make_scene(standing([(0.0, 0.0, 0.0), (10.0, 0.0, 0.0)]), valid=valid)
-        drawn = np.flatnonzero(COARSE.draw(scene)[0, 3:].any(axis=(1, 2))).tolist()
-        assert drawn == [i for i, snapshot in enumerate(SNAPSHOTS) if snapshot == state]
-    assert SNAPSHOTS == (0, 2, 4, 6, 8, 9, 11, 13, 15)
+        drawn = np.flatnonzero(COARSE.render(scene)[0, 3:].any(axis=(1, 2))).tolist()
+        assert drawn == [i for i, snapshot in enumerate(SNAPSHOT_TICKS) if snapshot == state]
+    assert SNAPSHOT_TICKS == (0, 2, 4, 6, 8, 9, 11, 13, 15)
 
 
-def test_longer_histories_are_cut() -> None:
-    """Of 20 past ticks the last 15 are drawn."""
+def test_of_longer_histories_the_last_15_ticks_are_drawn() -> None:
     states = traffic(0)
     longer = np.concatenate([states[:, :, :5] + 1.0, states], axis=2)
-    np.testing.assert_array_equal(COARSE.draw(make_scene(longer)), COARSE.draw(make_scene(states)))
+    np.testing.assert_array_equal(
+        COARSE.render(make_scene(longer)), COARSE.render(make_scene(states))
+    )
 
 
-def test_shorter_histories_are_refused() -> None:
-    """14 past ticks are one too few."""
+def test_shorter_histories_are_rejected() -> None:
     with pytest.raises(AspEnvError, match="needs 15 past ticks, the scene has 14"):
-        COARSE.draw(make_scene(traffic(0)[:, :, 1:]))
+        COARSE.render(make_scene(traffic(0)[:, :, 1:]))
 
 
-def test_lines_that_bound() -> None:
-    """Curbs and solid lines are drawn, dashed and virtual ones are not."""
+def test_only_curbs_and_solid_lines_are_drawn() -> None:
     for kind in LineType:
         scene = make_scene(
             standing([(0.0, 0.0, 0.0)]), maps=(make_map([(kind, [(5, 5), (20, 5)])]),)
         )
-        drawn = COARSE.draw(scene)[0, channel("road_boundary")].any()
+        drawn = COARSE.render(scene)[0, channel("road_boundary")].any()
         assert drawn == (kind in (LineType.CURB, LineType.SOLID))
 
 
-def test_each_situation_has_its_map() -> None:
-    """A line 5 m to the left on one map and to the right on the other."""
+def test_each_situation_is_drawn_on_its_map() -> None:
+    """A line lies 5 m to the left on one map and 5 m to the right on the other."""
     maps = tuple(make_map([(LineType.CURB, [(5, y), (20, y)])]) for y in (5, -5))
     states = np.repeat(standing([(0.0, 0.0, 0.0)]), 2, axis=0)
-    pictures = ChauffeurNet().draw(make_scene(states, targets=[(1, 0), (0, 0)], maps=maps))
-    _, columns_second = np.nonzero(pictures[0, 0])
-    _, columns_first = np.nonzero(pictures[1, 0])
+    rasters = ChauffeurNet().render(make_scene(states, targets=[(1, 0), (0, 0)], maps=maps))
+    _, columns_second = np.nonzero(rasters[0, 0])
+    _, columns_first = np.nonzero(rasters[1, 0])
     assert set(columns_first) <= {94, 95}
     assert set(columns_second) <= {144, 145}
 
@@ -158,10 +156,9 @@ def test_each_situation_has_its_map() -> None:
     ],
     ids=["shape", "dtype", "order"],
 )
-def test_memory_that_does_not_fit_is_refused(out: np.ndarray) -> None:
-    """Another shape, type or memory order is refused, with the one expected."""
+def test_arrays_that_do_not_fit_are_rejected(out: np.ndarray) -> None:
     with pytest.raises(AspEnvError, match=r"uint8 \(5, 12, 90, 60\)"):
-        COARSE.draw(busy_scene(), out)
+        COARSE.render(busy_scene(), out)
 
 
 @given(
@@ -170,26 +167,38 @@ def test_memory_that_does_not_fit_is_refused(out: np.ndarray) -> None:
     heading=st.floats(-3, 3),
     ego_heading=st.floats(-3, 3),
 )
-def test_pedestrians_stay_visible_at_coarse_scale(
+def test_pedestrians_are_visible_at_coarse_scale(
     x: float, y: float, heading: float, ego_heading: float
 ) -> None:
-    """0.5 m by 0.5 m at 0.8 m per pixel is one to four pixels, in all nine snapshots."""
+    """0.5 m by 0.5 m at 0.8 m per pixel sets one to four pixels in all nine snapshots."""
     cos, sin = math.cos(ego_heading), math.sin(ego_heading)
     other = (cos * x - sin * y, sin * x + cos * y, heading)
     scene = make_scene(standing([(0.0, 0.0, ego_heading), other]), size_m=(0.5, 0.5))
-    counts = (COARSE.draw(scene)[0, 3:] > 0).sum(axis=(1, 2))
+    counts = (COARSE.render(scene)[0, 3:] > 0).sum(axis=(1, 2))
     assert (counts >= 1).all()
     assert (counts <= 4).all()
 
 
 @given(heading=st.floats(-3, 3), x=st.floats(-5, 5), y=st.floats(-5, 5))
-def test_lines_stay_whole_at_coarse_scale(heading: float, x: float, y: float) -> None:
-    """A curb across the picture is one piece from edge to edge, at any angle."""
+def test_lines_have_no_gaps_at_coarse_scale(heading: float, x: float, y: float) -> None:
+    """A curb across the raster is one connected component, at any angle."""
     road_map = make_map([(LineType.CURB, [(-99, 1), (-8, 0), (-3, 1), (2, 0), (99, 3)])])
     scene = make_scene(standing([(x, y, heading)]), maps=(road_map,))
-    drawn = COARSE.draw(scene)[0, channel("road_boundary")]
+    drawn = COARSE.render(scene)[0, channel("road_boundary")]
     assert cv2.connectedComponents(drawn, connectivity=8)[0] == 2
-    assert (drawn > 0).sum() >= 18  # at least as many rows or columns as lie behind the ego
+    assert (drawn > 0).sum() >= 18  # at least the rows behind the ego
+
+
+@pytest.mark.parametrize("width_px", [1, 5, 8, 60, 63, 64, 240])
+@pytest.mark.parametrize("ego_trail", [True, False])
+def test_packed_rasters_are_the_rasters_as_bits(width_px: int, ego_trail: bool) -> None:
+    """Bit for bit, for widths that fill their last byte and for others."""
+    viewport = dataclasses.replace(Viewport(), width_px=width_px, anchor_column_px=0.5 * width_px)
+    view = ChauffeurNet(viewport, ego_trail)
+    scene = busy_scene()
+    scene.valid[0, 3, -1] = False  # one of the targets is absent
+    expected = np.packbits(view.render(scene), axis=-1)
+    np.testing.assert_array_equal(view.render_packed(scene), expected)
 
 
 GOLDEN = """
@@ -228,16 +237,16 @@ GOLDEN = """
 """
 
 
-def as_text(picture: np.ndarray) -> str:
-    """One letter a pixel: ego E, trail t, agents 0 (oldest) to 8 (now, on top), boundary #."""
-    text = np.full(picture.shape[1:], ".", dtype="<U1")
+def as_text(raster: np.ndarray) -> str:
+    """One letter per pixel: ego E, trail t, agents 0 (oldest) to 8 (now, on top), boundary #."""
+    text = np.full(raster.shape[1:], ".", dtype="<U1")
     marks = {0: "#", **{3 + i: str(i) for i in range(9)}, 2: "t", 1: "E"}
     for index, mark in marks.items():
-        text[picture[index] > 0] = mark
+        text[raster[index] > 0] = mark
     return "\n" + "\n".join("".join(row) for row in text) + "\n"
 
 
-def test_golden_picture() -> None:
+def test_golden_raster() -> None:
     """32 m by 32 m at 1 m per pixel: north is up, and a car turns off to the east."""
     times = 0.2 * np.arange(-15, 1)
     ego = np.stack([0 * times, 2 * times, 0 * times + 0.5 * math.pi, 0 * times + 2], axis=1)
@@ -252,4 +261,4 @@ def test_golden_picture() -> None:
         sizes_m=np.array([[(4.0, 2.0), (4.0, 2.0), (0.5, 0.5)]]),
         maps=(make_map([(LineType.CURB, [(4, -10), (4, 6), (6, 9), (18, 9)])]),),
     )
-    assert as_text(SMALL.draw(scene)[0]) == GOLDEN
+    assert as_text(SMALL.render(scene)[0]) == GOLDEN

@@ -1,4 +1,4 @@
-"""Boxes and lines: which pixels are set."""
+"""Which pixels boxes and lines set, and packing of pixels to bits."""
 
 import math
 
@@ -8,7 +8,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from asp_env.views.draw import fill_box, fill_segment
+from asp_env.views.draw import fill_box, fill_segment, pack_rows
 
 HEIGHT, WIDTH = 20, 30
 
@@ -16,7 +16,7 @@ HEIGHT, WIDTH = 20, 30
 def draw_box(
     column: float, row: float, angle: float, half_length: float, half_width: float
 ) -> np.ndarray:
-    """Which pixels of an empty canvas a box sets."""
+    """Mask of the pixels that a box sets on an empty canvas."""
     canvas = np.zeros((HEIGHT, WIDTH), dtype=np.uint8)
     fill_box(canvas, column, row, math.cos(angle), math.sin(angle), half_length, half_width, 255)
     assert set(np.unique(canvas)) <= {0, 255}
@@ -24,7 +24,7 @@ def draw_box(
 
 
 def depth(column: float, row: float, angle: float, half_length: float, half_width: float):
-    """How far every pixel's centre lies inside the box; negative outside."""
+    """Depth (height, width) of every pixel centre inside the box, negative outside."""
     rows, columns = np.mgrid[:HEIGHT, :WIDTH] + 0.5
     along = math.cos(angle) * (columns - column) + math.sin(angle) * (rows - row)
     across = math.cos(angle) * (rows - row) - math.sin(angle) * (columns - column)
@@ -32,7 +32,7 @@ def depth(column: float, row: float, angle: float, half_length: float, half_widt
 
 
 def test_unit_square() -> None:
-    """A box of 1 by 1 around the centre of pixel (row 4, column 7) is that pixel."""
+    """A box of 1 by 1 around the centre of pixel (row 4, column 7) sets that pixel."""
     expected = np.zeros((HEIGHT, WIDTH), dtype=bool)
     expected[4, 7] = True
     np.testing.assert_array_equal(draw_box(7.5, 4.5, 0.0, 0.5, 0.5), expected)
@@ -40,7 +40,7 @@ def test_unit_square() -> None:
 
 @pytest.mark.parametrize("quarter", [0, 1, 2, 3])
 def test_square_of_five(quarter: int) -> None:
-    """A box over rows 3 to 8 and columns 10 to 15 is those 25 pixels, at each right angle."""
+    """A box over rows 3 to 8 and columns 10 to 15 sets those 25 pixels, at each right angle."""
     expected = np.zeros((HEIGHT, WIDTH), dtype=bool)
     expected[3:8, 10:15] = True
     angle = 0.5 * math.pi * quarter
@@ -48,7 +48,7 @@ def test_square_of_five(quarter: int) -> None:
 
 
 def test_boxes_that_share_an_edge_share_no_pixel() -> None:
-    """Pixel centres on the common edge belong to one of two boxes, and none is left out."""
+    """Pixel centres on the common edge belong to exactly one of the two boxes."""
     left = draw_box(8.5, 10.0, 0.0, 2.0, 3.0)
     right = draw_box(12.5, 10.0, 0.0, 2.0, 3.0)
     assert not (left & right).any()
@@ -56,7 +56,7 @@ def test_boxes_that_share_an_edge_share_no_pixel() -> None:
 
 
 def test_diamond() -> None:
-    """A square of half diagonal 2.5, standing on its corner, has rows of 1, 3, 5, 3, 1 pixels."""
+    """A square of half diagonal 2.6 on its corner has rows of 1, 3, 5, 3 and 1 pixels."""
     half = 2.6 / math.sqrt(2)
     assert draw_box(15.5, 9.5, 0.25 * math.pi, half, half).sum(axis=1).tolist() == [
         *[0] * 7,
@@ -72,10 +72,10 @@ def test_diamond() -> None:
     half_length=st.floats(0.8, 12),
     half_width=st.floats(0.8, 12),
 )
-def test_pixels_whose_centre_is_inside(
+def test_pixels_whose_centre_is_inside_are_set(
     column: float, row: float, angle: float, half_length: float, half_width: float
 ) -> None:
-    """Exactly the pixels whose centres lie inside are set, also for boxes cut by the border."""
+    """Exactly these pixels are set, also of boxes that the border cuts."""
     box = (column, row, angle, half_length, half_width)
     inside = depth(*box)
     decided = abs(inside) > 1e-6
@@ -88,22 +88,22 @@ def test_pixels_whose_centre_is_inside(
     angle=st.floats(-7, 7),
     half=st.floats(0, 0.5),
 )
-def test_nothing_vanishes(column: float, row: float, angle: float, half: float) -> None:
-    """A box of at most one pixel still sets the pixel that holds its centre, and at most four."""
+def test_small_boxes_do_not_vanish(column: float, row: float, angle: float, half: float) -> None:
+    """A box of at most one pixel sets the pixel that contains its centre, and at most four."""
     drawn = draw_box(column, row, angle, half, half)
     assert drawn[int(row), int(column)]
     assert drawn.sum() <= 4
 
 
 @pytest.mark.parametrize(
-    ("place", "bad"),
-    [(place, math.nan) for place in range(4)]
-    + [(place, bad) for place in (0, 1) for bad in (math.inf, -math.inf, 1e300)],
+    ("index", "bad"),
+    [(index, math.nan) for index in range(4)]
+    + [(index, bad) for index in (0, 1) for bad in (math.inf, -math.inf, 1e300)],
 )
-def test_senseless_numbers_draw_nothing(place: int, bad: float) -> None:
-    """A centre or direction of NaN and a centre at infinity leave the canvas empty."""
+def test_numbers_that_are_not_finite_draw_nothing(index: int, bad: float) -> None:
+    """NaN in the centre or direction and a centre at infinity leave the canvas empty."""
     numbers = [5.0, 5.0, 1.0, 0.0, 2.0, 1.0]
-    numbers[place] = bad
+    numbers[index] = bad
     canvas = np.zeros((HEIGHT, WIDTH), dtype=np.uint8)
     fill_box(canvas, *numbers, value=255)
     assert not canvas.any()
@@ -113,18 +113,42 @@ def test_senseless_numbers_draw_nothing(place: int, bad: float) -> None:
     ends=st.tuples(st.floats(0, 29), st.floats(0, 19), st.floats(0, 29), st.floats(0, 19)),
 )
 def test_lines_have_no_gaps(ends: tuple[float, float, float, float]) -> None:
-    """A line 1.5 pixels wide is one piece and holds the pixels of both ends."""
+    """A line 1.5 pixels wide is one connected component that contains both ends."""
     canvas = np.zeros((HEIGHT, WIDTH), dtype=np.uint8)
     fill_segment(canvas, *ends, 0.75, 255)
-    pieces, labels = cv2.connectedComponents(canvas, connectivity=8)
-    assert pieces == 2  # the background and the line
+    components, labels = cv2.connectedComponents(canvas, connectivity=8)
+    assert components == 2  # the background and the line
     assert labels[int(ends[1]), int(ends[0])] == labels[int(ends[3]), int(ends[2])] == 1
 
 
-def test_line_reaches_half_its_width_beyond_its_ends() -> None:
-    """From (4, 10) to (8, 10), 2 wide, are rows 9 and 10 and columns 3 to 9."""
+def test_lines_extend_half_their_width_beyond_their_ends() -> None:
+    """From (4, 10) to (8, 10), 2 pixels wide: rows 9 and 10, columns 3 to 8."""
     canvas = np.zeros((HEIGHT, WIDTH), dtype=np.uint8)
     fill_segment(canvas, 4.0, 10.0, 8.0, 10.0, 1.0, 255)
     expected = np.zeros((HEIGHT, WIDTH), dtype=bool)
     expected[9:11, 3:9] = True
     np.testing.assert_array_equal(canvas > 0, expected)
+
+
+def packed(pixels: np.ndarray) -> np.ndarray:
+    """The rows of pixels (rows, width) as bits."""
+    out = np.empty((len(pixels), -(-pixels.shape[1] // 8)), dtype=np.uint8)
+    pack_rows(pixels, out)
+    return out
+
+
+def test_bits_by_hand() -> None:
+    """Of ten pixels the first, the eighth and the last are set: 1000 0001 and 0100 0000."""
+    pixels = np.zeros((1, 10), dtype=np.uint8)
+    pixels[0, [0, 7, 9]] = 255
+    assert packed(pixels).tolist() == [[0b10000001, 0b01000000]]
+
+
+@given(
+    shape=st.tuples(st.integers(0, 6), st.integers(1, 40)),
+    seed=st.integers(0, 1000),
+    share=st.sampled_from([0.0, 0.1, 0.5, 1.0]),
+)
+def test_bits_are_those_of_numpy(shape: tuple[int, int], seed: int, share: float) -> None:
+    pixels = np.where(np.random.default_rng(seed).random(shape) < share, 255, 0).astype(np.uint8)
+    np.testing.assert_array_equal(packed(pixels), np.packbits(pixels, axis=-1))

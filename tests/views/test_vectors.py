@@ -1,4 +1,4 @@
-"""The vector view: hand-worked numbers, and what must not change them."""
+"""The vector view: numbers derived by hand, and what must not change them."""
 
 import copy
 import dataclasses
@@ -16,7 +16,7 @@ from asp_env.data.road_map import LineType, Ragged, RoadMap
 from asp_env.data.scene import Scene
 from asp_env.errors import AspEnvError
 from asp_env.geometry import to_frame
-from asp_env.views.vectors import AGENT_FIELDS, KINDS, LINE_FIELDS, Vectors, VectorView, lane_pieces
+from asp_env.views.vectors import AGENT_FIELDS, KINDS, LINE_FIELDS, Vectors, VectorView, map_pieces
 from tests.views.scenes import busy_scene, cross_map, make_map, make_scene, standing, traffic
 
 SMALL = VectorView(agents=4, lines=3)
@@ -29,14 +29,13 @@ def assert_equal(one: Vectors, other: Vectors) -> None:
 
 
 def with_lanes(road_map: RoadMap, *lanes: list[tuple[float, float]]) -> RoadMap:
-    """The map with centre lines."""
+    """The map with the given centre lines."""
     packed = Ragged.pack([np.array(lane, dtype=np.float64) for lane in lanes])
     return dataclasses.replace(road_map, lanes=packed)
 
 
 def test_shapes() -> None:
-    """16 agents of 16 ticks and 12 fields, 64 lines of 10 points and 8 fields."""
-    drawn = VectorView().draw(busy_scene())
+    drawn = VectorView().render(busy_scene())
     shape = VectorView().shape
     assert drawn.agents.shape == (5, 16, 16, 12) == (5, shape.agents, shape.ticks, 12)
     assert drawn.lines.shape == (5, 64, 10, 8) == (5, shape.lines, shape.points, 8)
@@ -47,13 +46,13 @@ def test_shapes() -> None:
 
 
 def test_a_neighbour_by_hand() -> None:
-    """Heading north at (10, 20): a truck at (7, 24) heading west is 4 m ahead, 3 m left, cos 0."""
+    """Target at (10, 20) heading north; truck at (7, 24) heading west, 4 m ahead, 3 m left."""
     states = standing([(10.0, 20.0, 0.5 * math.pi), (7.0, 24.0, math.pi)])
     states[0, 1, :, 3] = 5.0
     states[0, 1, 0, :2] = (9.0, 24.0)
     scene = make_scene(states, sizes_m=np.array([[(4.0, 2.0), (9.0, 2.5)]]))
     scene.classes[0, 1] = AgentClass.TRUCK
-    drawn = VectorView().draw(scene)
+    drawn = VectorView().render(scene)
     row = dict(zip(AGENT_FIELDS, drawn.agents[0, 1, -1].round(5).tolist(), strict=True))
     assert row == {
         **{"x": 4.0, "y": 3.0, "cos": 0.0, "sin": 1.0, "speed": 5.0, "length": 9.0, "width": 2.5},
@@ -66,9 +65,9 @@ def test_a_neighbour_by_hand() -> None:
 
 
 def test_a_lane_and_a_curb_by_hand() -> None:
-    """Heading east at (5, 1): a lane from (5, 1) and a curb 2 m left, ten points over 18 m."""
+    """Target at (5, 1) heading east, a lane from (5, 1), a curb 2 m left: ten points over 18 m."""
     road_map = with_lanes(make_map([(LineType.CURB, [(23, 3), (5, 3)])]), [(5, 1), (23, 1)])
-    drawn = VectorView().draw(make_scene(standing([(5.0, 1.0, 0.0)]), maps=(road_map,)))
+    drawn = VectorView().render(make_scene(standing([(5.0, 1.0, 0.0)]), maps=(road_map,)))
     lane, curb = drawn.lines[0, :2]
     at = np.arange(0, 19, 2)
     ones, zeros = np.ones(10), np.zeros(10)
@@ -80,58 +79,57 @@ def test_a_lane_and_a_curb_by_hand() -> None:
 
 
 def test_pieces_by_hand() -> None:
-    """An L of 30 and 20 m is two pieces of 25 m; its directions turn at the corner."""
-    pieces = lane_pieces(with_lanes(make_map(), [(0, 0), (30, 0), (30, 20)]))
+    """An L of 30 and 20 m is two pieces of 25 m; the direction changes at the corner."""
+    pieces = map_pieces(with_lanes(make_map(), [(0, 0), (30, 0), (30, 20)]))
     np.testing.assert_allclose(pieces.middles, [[12.5, 30], [0, 7.5]], atol=1e-9)
     np.testing.assert_allclose(pieces.points[0, [0, -1]], [[0, 0, 1, 0], [25, 0, 1, 0]], atol=1e-9)
     np.testing.assert_allclose(pieces.points[1, [0, -1]], [[25, 0, 1, 0], [30, 20, 0, 1]])
 
 
 def test_pieces_of_every_kind_but_virtual() -> None:
-    """Lines that cannot be seen, repeated points and single points are no pieces."""
+    """Virtual lines, repeated points and single points give no pieces."""
     lines = [(kind, [(0, 0), (0, 0), (3, 4)]) for kind in LineType]
-    pieces = lane_pieces(make_map([*lines, (LineType.CURB, [(1, 1)])]))
+    pieces = map_pieces(make_map([*lines, (LineType.CURB, [(1, 1)])]))
     assert [KINDS[kind] for kind in pieces.kinds] == ["curb", "solid", "dashed"]
     np.testing.assert_allclose(pieces.points[:, -1], [[3, 4, 0.6, 0.8]] * 3)
 
 
-def test_a_map_without_lines() -> None:
-    """Nothing but agents is seen on it."""
-    drawn = VectorView().draw(make_scene(standing([(0.0, 0.0, 0.0)])))
+def test_a_map_without_lines_gives_no_lines() -> None:
+    drawn = VectorView().render(make_scene(standing([(0.0, 0.0, 0.0)])))
     assert not drawn.lines_valid.any()
     assert not drawn.lines.any()
 
 
-def test_nearest_agents_first() -> None:
-    """At 9, 3, 6 and 3 m, of ids 1 to 4: ids 2, 4, 3; the farthest has no place left."""
+def test_agents_are_sorted_by_distance_and_id() -> None:
+    """At 9, 3, 6 and 3 m with the ids 1 to 4: ids 2, 4, 3; there is no room for the farthest."""
     places = [(0.0, 0.0), (9.0, 0.0), (-3.0, 0.0), (0.0, 6.0), (0.0, -3.0)]
-    drawn = SMALL.draw(make_scene(standing([(*place, 0.0) for place in places])))
+    drawn = SMALL.render(make_scene(standing([(*place, 0.0) for place in places])))
     np.testing.assert_array_equal(
         drawn.agents[0, :, -1, :2], np.array([(0, 0), (-3, 0), (0, -3), (0, 6)])
     )
 
 
-def test_nearest_lines_are_those_ahead() -> None:
-    """Of curbs 30 m behind, beside and ahead, and 50 m ahead, only the one behind has no place."""
+def test_lines_ahead_are_preferred() -> None:
+    """Of curbs 30 m behind, beside and ahead, and 50 m ahead, there is no room for that behind."""
     places = [(-30, 0), (0, 30), (30, 0), (50, 0)]
     lines = [(LineType.CURB, [(x - 1, y), (x + 1, y)]) for x, y in places]
-    drawn = SMALL.draw(make_scene(standing([(0.0, 0.0, 0.0)]), maps=(make_map(lines),)))
+    drawn = SMALL.render(make_scene(standing([(0.0, 0.0, 0.0)]), maps=(make_map(lines),)))
     np.testing.assert_allclose(drawn.lines[0, :, 0, :2], [(-1, 30), (29, 0), (49, 0)])
 
 
-def test_equally_near_lines() -> None:
-    """Of ten curbs at one place the first three are taken: exactly as many as there is room."""
+def test_of_equally_near_lines_the_first_are_chosen() -> None:
+    """Of ten curbs with the same middle the first three are chosen."""
     lines = [(LineType.CURB, [(20.0 - i, 0.0), (20.0 + i, 0.0)]) for i in range(1, 11)]
-    drawn = SMALL.draw(make_scene(standing([(0.0, 0.0, 0.0)]), maps=(make_map(lines),)))
+    drawn = SMALL.render(make_scene(standing([(0.0, 0.0, 0.0)]), maps=(make_map(lines),)))
     np.testing.assert_allclose(drawn.lines[0, :, 0, 0], [19, 18, 17])
 
 
-def test_agents_that_have_left_are_not_there() -> None:
-    """Someone seen until the tick before now is left out; a gap in the past stays a gap."""
+def test_agents_that_are_absent_now_are_left_out() -> None:
+    """An agent observed until the previous tick is left out; a gap in the past remains a gap."""
     scene = make_scene(standing([(0.0, 0.0, 0.0), (5.0, 0.0, 0.0), (7.0, 0.0, 0.0)]))
     scene.valid[0, 1, -1] = False
     scene.valid[0, 2, 4] = False
-    drawn = VectorView().draw(scene)
+    drawn = VectorView().render(scene)
     assert drawn.agents_valid[0].sum(axis=1).tolist() == [16, 15, *[0] * 14]
     assert not drawn.agents[0, 1, 4].any()
     assert drawn.agents[0, 1, 5, 0] == 7
@@ -142,16 +140,16 @@ def test_agents_that_have_left_are_not_there() -> None:
     turn=st.floats(-math.pi, math.pi),
     shift=st.tuples(st.floats(-500, 500), st.floats(-500, 500)),
 )
-def test_turning_the_world_changes_nothing(
+def test_vectors_do_not_depend_on_the_pose_of_the_world(
     seed: int, turn: float, shift: tuple[float, float]
 ) -> None:
-    """World and agents turned and moved together: float32 keeps positions at 500 m to 0.1 mm."""
+    """World and agents rotated and translated together; float32 resolves 500 m to 0.1 mm."""
     states = traffic(seed)
     moved = states.copy()
     moved[..., :2] = to_frame(states[..., :2], np.array([0.0, 0.0, -turn])) + np.array(shift)
     moved[..., 2] += turn
-    before = VectorView().draw(make_scene(states, maps=(cross_map(),)))
-    after = VectorView().draw(make_scene(moved, maps=(cross_map(turn, shift),)))
+    before = VectorView().render(make_scene(states, maps=(cross_map(),)))
+    after = VectorView().render(make_scene(moved, maps=(cross_map(turn, shift),)))
     np.testing.assert_allclose(after.agents, before.agents, atol=2e-4)
     np.testing.assert_allclose(after.lines, before.lines, atol=2e-4)
     np.testing.assert_array_equal(after.agents_valid, before.agents_valid)
@@ -161,26 +159,24 @@ def test_turning_the_world_changes_nothing(
 
 
 def test_left_is_left() -> None:
-    """What lies left of a target, or comes from its left, has y > 0 and sin < 0 there."""
+    """An agent on the left of the target that heads to the right has y > 0 and sin < 0."""
     states = standing([(0.0, 0.0, 0.7), (-5 * math.sin(0.7), 5 * math.cos(0.7), 0.7 - 1.0)])
-    row = VectorView().draw(make_scene(states)).agents[0, 1, -1]
+    row = VectorView().render(make_scene(states)).agents[0, 1, -1]
     np.testing.assert_allclose(row[:4], [0, 5, math.cos(1), -math.sin(1)], atol=1e-6)
 
 
 def test_targets_do_not_depend_on_each_other() -> None:
-    """Any order and any selection of targets gives the same numbers for each."""
     scene = busy_scene()
-    together = SMALL.draw(scene)
-    reversed_ = SMALL.draw(scene.with_targets(scene.targets[::-1].copy()))
+    together = SMALL.render(scene)
+    reversed_ = SMALL.render(scene.with_targets(scene.targets[::-1].copy()))
     assert_equal(Vectors(*(array[::-1] for array in reversed_)), together)
     for row, target in enumerate(scene.targets):
-        alone = SMALL.draw(scene.with_targets(target[None]))
+        alone = SMALL.render(scene.with_targets(target[None]))
         assert_equal(alone, Vectors(*(array[row : row + 1] for array in together)))
 
 
 @pytest.mark.parametrize("seed", range(5))
 def test_order_of_slots_does_not_matter(seed: int) -> None:
-    """Agents in other slots give the same numbers, bit for bit."""
     scene = busy_scene(seed)
     order = np.random.default_rng(seed).permutation(scene.states.shape[1])
     shuffled = dataclasses.replace(
@@ -191,15 +187,15 @@ def test_order_of_slots_does_not_matter(seed: int) -> None:
         },
         targets=np.stack([scene.targets[:, 0], np.argsort(order)[scene.targets[:, 1]]], axis=1),
     )
-    assert_equal(SMALL.draw(shuffled), SMALL.draw(scene))
+    assert_equal(SMALL.render(shuffled), SMALL.render(scene))
 
 
 @pytest.mark.parametrize("garbage", [math.nan, math.inf, 1e30, 3.0])
-def test_what_is_not_valid_changes_nothing(garbage: float) -> None:
-    """Whatever stands in states that are not valid, and in absent agents, is not seen."""
+def test_entries_that_are_not_valid_have_no_effect(garbage: float) -> None:
+    """States that are not valid, and sizes and classes of absent agents, may be any number."""
     scene = busy_scene()
     scene.valid[:, 4] = False
-    clean = VectorView().draw(scene)
+    clean = VectorView().render(scene)
     for values, valid in ((clean.agents, clean.agents_valid), (clean.lines, clean.lines_valid)):
         assert not values[~valid].any()
         assert values[valid].any(axis=-1).all()
@@ -208,26 +204,25 @@ def test_what_is_not_valid_changes_nothing(garbage: float) -> None:
     sizes[:, 4] = garbage
     classes[:, 4] = 1_000_000
     dirty = dataclasses.replace(scene, states=states, sizes=sizes, classes=classes)
-    assert_equal(VectorView().draw(dirty), clean)
+    assert_equal(VectorView().render(dirty), clean)
 
 
-def test_a_target_that_is_not_there_sees_nothing() -> None:
-    """Without a pose now there is no frame; the other targets see what they saw."""
+def test_an_absent_target_has_only_zeros() -> None:
+    """The vectors of the other targets are unchanged."""
     scene = busy_scene()
-    whole = VectorView().draw(scene)
+    whole = VectorView().render(scene)
     scene = dataclasses.replace(scene, targets=scene.targets[[0, 1, 3, 4]])
     scene.valid[0, 3, -1] = False
     scene.states[0, 3, -1] = math.nan
-    drawn = VectorView().draw(scene)
+    drawn = VectorView().render(scene)
     assert not any(array[1].any() for array in drawn)
     others = Vectors(*(array[[0, 2, 3]] for array in drawn))
     assert_equal(others, Vectors(*(array[[0, 3, 4]] for array in whole)))
 
 
-def test_without_the_own_past() -> None:
-    """Only the target's own ticks before now are gone."""
+def test_without_own_past_only_the_targets_ticks_before_now_are_missing() -> None:
     scene = busy_scene()
-    whole, now = VectorView().draw(scene), VectorView(own_past=False).draw(scene)
+    whole, now = VectorView().render(scene), VectorView(own_past=False).render(scene)
     assert not now.agents_valid[:, 0, :-1].any()
     assert not now.agents[:, 0, :-1].any()
     assert whole.agents_valid[:, 0, :-1].any()
@@ -236,31 +231,29 @@ def test_without_the_own_past() -> None:
     assert_equal(now, whole)
 
 
-def test_a_longer_history_is_cut() -> None:
-    """A scene of 20 ticks gives what its last 16 give; one of 15 is refused."""
+def test_longer_histories_are_cut_and_shorter_ones_rejected() -> None:
     states = traffic(0)
     longer = np.concatenate([states[:, :, :4] + 7, states], axis=2)
-    assert_equal(SMALL.draw(make_scene(longer)), SMALL.draw(make_scene(states)))
+    assert_equal(SMALL.render(make_scene(longer)), SMALL.render(make_scene(states)))
     with pytest.raises(AspEnvError, match="needs 15 past ticks, the scene has 14"):
-        SMALL.draw(make_scene(states[:, :, 1:]))
+        SMALL.render(make_scene(states[:, :, 1:]))
 
 
-def test_no_targets() -> None:
-    """A scene without targets gives arrays without rows."""
+def test_a_scene_without_targets_gives_empty_arrays() -> None:
     scene: Scene = busy_scene().with_targets(np.zeros((0, 2), dtype=np.int64))
-    assert [len(array) for array in SMALL.draw(scene)] == [0, 0, 0, 0]
+    assert [len(array) for array in SMALL.render(scene)] == [0, 0, 0, 0]
 
 
 @pytest.mark.parametrize("view", [VectorView(), SMALL, VectorView(own_past=False)], ids=str)
-def test_configuration_survives_json_and_pickle(view: VectorView) -> None:
-    """Read back from JSON, pickled and copied views are equal; no map goes with them."""
+def test_configurations_can_be_stored_as_json_and_pickled(view: VectorView) -> None:
+    """Views restored from JSON, pickles and copies are equal and contain no cached map."""
     assert VectorView.from_config(json.loads(json.dumps(view.config()))) == view
     empty = len(pickle.dumps(view))
-    drawn = view.draw(busy_scene())
+    drawn = view.render(busy_scene())
     assert len(pickle.dumps(view)) == empty
     for again in (pickle.loads(pickle.dumps(view)), copy.deepcopy(view)):
         assert again == view
-        assert_equal(again.draw(busy_scene()), drawn)
+        assert_equal(again.render(busy_scene()), drawn)
     fields = {each.name for each in dataclasses.fields(view) if each.compare}
     assert set(view.config()) == fields | {"name"}
 
@@ -277,15 +270,13 @@ def test_configuration_survives_json_and_pickle(view: VectorView) -> None:
     ],
     ids=str,
 )
-def test_wrong_configurations_are_refused(config: dict[str, object]) -> None:
-    """Another view's configuration, an unknown field or an impossible number: one line."""
+def test_wrong_configurations_are_rejected(config: dict[str, object]) -> None:
     with pytest.raises(AspEnvError, match="view") as caught:
         VectorView.from_config(config)
     assert "\n" not in str(caught.value)
 
 
-def test_pixels_are_refused() -> None:
-    """There are none in this view; without them the options are taken."""
+def test_pixels_are_rejected() -> None:
     assert VectorView.make(own_past=False) == VectorView(own_past=False)
-    with pytest.raises(AspEnvError, match="no pictures"):
+    with pytest.raises(AspEnvError, match="no rasters"):
         VectorView.make((90, 60))

@@ -1,4 +1,4 @@
-"""Views: where a point of the world lies in the picture, and how a view is made."""
+"""Viewports, and views made by name and from configurations."""
 
 import dataclasses
 import json
@@ -13,15 +13,23 @@ from hypothesis import strategies as st
 
 from asp_env.errors import AspEnvError
 from asp_env.geometry import from_frame
-from asp_env.views import VIEWS, PictureView, make_picture_view, make_view, view_from_config
-from asp_env.views.chauffeurnet import ChauffeurNet
-from asp_env.views.mtp import MTP
-from asp_env.views.view import View
-from tests.views.scenes import PICTURES
+from asp_env.views import (
+    MTP,
+    VIEWS,
+    ChauffeurNet,
+    RasterView,
+    Viewport,
+    make_raster_view,
+    make_view,
+    view_from_config,
+)
+from tests.views.scenes import RASTER_VIEWS
 
 
-def pixel(view: View, pose: tuple[float, float, float], point: tuple[float, float]) -> np.ndarray:
-    """(column, row) of a point seen from a pose."""
+def pixel(
+    view: Viewport, pose: tuple[float, float, float], point: tuple[float, float]
+) -> np.ndarray:
+    """(column, row) of a point in the viewport around a pose."""
     return view.pixels_from_world(np.array(pose)) @ np.array([*point, 1.0])
 
 
@@ -40,17 +48,17 @@ def pixel(view: View, pose: tuple[float, float, float], point: tuple[float, floa
 def test_known_points_at_four_headings(
     ahead_m: float, left_m: float, column: float, row: float, heading: float
 ) -> None:
-    """The default view reaches 57.6 m ahead, 14.4 m back and 24 m to either side."""
+    """The default viewport shows 57.6 m ahead, 14.4 m behind and 24 m to either side."""
     pose = (31.0, -7.0, heading)
-    # Ahead and left are (cos, sin) and (-sin, cos): whole numbers at these headings.
+    # ahead and left are (cos, sin) and (-sin, cos), integers at these headings
     cos, sin = round(math.cos(heading)), round(math.sin(heading))
     point = (31.0 + ahead_m * cos - left_m * sin, -7.0 + ahead_m * sin + left_m * cos)
-    np.testing.assert_allclose(pixel(View(), pose, point), [column, row], atol=1e-9)
+    np.testing.assert_allclose(pixel(Viewport(), pose, point), [column, row], atol=1e-9)
 
 
 def test_anchor_off_the_centre() -> None:
     """With the anchor at row 8, column 2 and 0.5 m pixels, 3 m ahead and 1 m left is (0, 2)."""
-    view = View(
+    view = Viewport(
         height_px=10, width_px=9, metres_per_pixel=0.5, anchor_row_px=8.0, anchor_column_px=2.0
     )
     np.testing.assert_allclose(pixel(view, (0.0, 0.0, 0.0), (3.0, 1.0)), [0, 2], atol=1e-12)
@@ -64,24 +72,24 @@ def test_anchor_off_the_centre() -> None:
 def test_agrees_with_the_vehicle_frame(
     pose: tuple[float, float, float], ahead: float, left: float
 ) -> None:
-    """Columns fall by 5 a metre to the left, rows fall by 5 a metre ahead, at any pose."""
+    """Columns decrease by 5 per metre to the left, rows by 5 per metre ahead, at any pose."""
     x, y = from_frame(np.array([ahead, left]), np.array(pose))
     expected = [120 - 5 * left, 288 - 5 * ahead]
-    np.testing.assert_allclose(pixel(View(), pose, (x, y)), expected, atol=1e-8)
+    np.testing.assert_allclose(pixel(Viewport(), pose, (x, y)), expected, atol=1e-8)
 
 
-def test_poses_keep_their_axes() -> None:
-    """Poses (4, 3, n) give matrices (4, 3, 2, 3), one for each."""
+def test_leading_axes_of_poses_are_preserved() -> None:
+    """Poses (4, 3, n) give matrices (4, 3, 2, 3)."""
     poses = np.random.default_rng(0).normal(size=(4, 3, 4)).astype(np.float32)
-    matrices = View().pixels_from_world(poses)
+    matrices = Viewport().pixels_from_world(poses)
     assert matrices.shape == (4, 3, 2, 3)
-    np.testing.assert_array_equal(matrices[2, 1], View().pixels_from_world(poses[2, 1]))
+    np.testing.assert_array_equal(matrices[2, 1], Viewport().pixels_from_world(poses[2, 1]))
 
 
 @pytest.mark.parametrize(("height", "width"), [(360, 240), (180, 120), (90, 60), (45, 30)])
-def test_scaled_shows_the_same_extent(height: int, width: int) -> None:
-    """72 m by 48 m and the anchor at 80 % from the top, in any number of pixels."""
-    view = View().scaled((height, width))
+def test_scaled_viewports_show_the_same_extent(height: int, width: int) -> None:
+    """72 m by 48 m with the anchor at 80 % from the top, in any resolution."""
+    view = Viewport().scaled((height, width))
     assert (view.height_px, view.width_px) == (height, width)
     assert view.metres_per_pixel * height == pytest.approx(72)
     assert view.metres_per_pixel * width == pytest.approx(48)
@@ -89,15 +97,14 @@ def test_scaled_shows_the_same_extent(height: int, width: int) -> None:
     assert view.anchor_column_px == pytest.approx(0.5 * width)
 
 
-def test_scaled_to_its_own_size_is_the_view_itself() -> None:
-    """360x240 of the default view, and no size at all."""
-    assert View().scaled((360, 240)) == View().scaled(None) == View()
+def test_scaling_to_the_same_size_or_none_changes_nothing() -> None:
+    assert Viewport().scaled((360, 240)) == Viewport().scaled(None) == Viewport()
 
 
 @pytest.mark.parametrize("side", [360, 180, 90, 45])
 def test_mtp_shows_the_same_extent(side: int) -> None:
-    """57.6 m ahead, 14.4 m behind and 36 m to either side, in any number of pixels."""
-    view = MTP.make((side, side)).view
+    """57.6 m ahead, 14.4 m behind and 36 m to either side, in any resolution."""
+    view = MTP.make((side, side)).viewport
     per_metre = side / 72
     for point, expected in (
         ((57.6, 36.0), (0, 0)),
@@ -118,10 +125,9 @@ def test_mtp_shows_the_same_extent(side: int) -> None:
         {"anchor_column_px": -1.0},
     ],
 )
-def test_impossible_views_are_refused(fields: dict[str, Any]) -> None:
-    """Each impossible value gives one line that says what it was."""
+def test_impossible_viewports_are_rejected(fields: dict[str, Any]) -> None:
     with pytest.raises(AspEnvError, match="view") as caught:
-        View(**fields)
+        Viewport(**fields)
     assert "\n" not in str(caught.value)
 
 
@@ -135,50 +141,47 @@ def test_impossible_views_are_refused(fields: dict[str, Any]) -> None:
         ("mtp", (-90, -90), "360x360"),
     ],
 )
-def test_oblong_pixels_are_refused(view: str, pixels: tuple[int, int], good: str) -> None:
-    """Sizes of another ratio than the extent's are refused in one line, with sizes that are not."""
+def test_pixels_that_are_not_square_are_rejected(
+    view: str, pixels: tuple[int, int], good: str
+) -> None:
+    """The error is one line that suggests sizes with the aspect ratio of the extent."""
     with pytest.raises(AspEnvError, match=good) as caught:
         make_view(view, pixels=pixels)
     assert "\n" not in str(caught.value)
 
 
-@pytest.mark.parametrize("view", PICTURES, ids=lambda view: view.name)
-def test_configuration_survives_json(view: PictureView) -> None:
-    """A view written to JSON and read back draws the same pictures, by equality."""
+@pytest.mark.parametrize("view", RASTER_VIEWS, ids=lambda view: view.name)
+def test_configurations_can_be_stored_as_json(view: RasterView) -> None:
     again = view_from_config(json.loads(json.dumps(view.config())))
     assert again == view
-    assert [again == other for other in PICTURES].count(True) == 1
+    assert [again == other for other in RASTER_VIEWS].count(True) == 1
 
 
-@pytest.mark.parametrize("view", PICTURES, ids=lambda view: view.name)
-def test_configuration_names_every_field(view: PictureView) -> None:
-    """Nothing that decides the picture is left out of the configuration."""
-    fields = {field.name for field in dataclasses.fields(View)} | {"name"}
+@pytest.mark.parametrize("view", RASTER_VIEWS, ids=lambda view: view.name)
+def test_configurations_contain_every_field(view: RasterView) -> None:
+    fields = {field.name for field in dataclasses.fields(Viewport)} | {"name"}
     extra = {"ego_trail"} if isinstance(view, ChauffeurNet) else set()
     assert set(view.config()) == fields | extra
 
 
-@pytest.mark.parametrize("name", [view.name for view in PICTURES])
-def test_make_picture_view_knows_every_name(name: str) -> None:
-    """Every view of pictures comes in the size asked for and knows its own name."""
-    whole = make_picture_view(name)
+@pytest.mark.parametrize("name", [view.name for view in RASTER_VIEWS])
+def test_make_raster_view_makes_every_view_in_the_given_size(name: str) -> None:
+    whole = make_raster_view(name)
     channels, height, width = whole.shape
-    view = make_picture_view(name, pixels=(height // 4, width // 4))
-    assert isinstance(view, PictureView)
+    view = make_raster_view(name, pixels=(height // 4, width // 4))
+    assert isinstance(view, RasterView)
     assert view.name == whole.name == name
     assert len(view.channels) == channels
     assert view.shape == (channels, height // 4, width // 4)
     assert view_from_config(view.config()) == view != whole
 
 
-def test_the_registry_names_the_pictures() -> None:
-    """Besides the vector views, the registered views are the three of pictures."""
-    names = {view.name for view in PICTURES}
+def test_all_registered_views_but_the_vector_views_are_raster_views() -> None:
+    names = {view.name for view in RASTER_VIEWS}
     assert {name for name in VIEWS if not name.startswith("vectors")} == names
 
 
-def test_unknown_names_list_the_known() -> None:
-    """A misspelt view is refused with the known names."""
+def test_unknown_names_are_rejected_with_the_known_names() -> None:
     with pytest.raises(AspEnvError, match="did you mean 'chauffeurnet'"):
         make_view("chaufeurnet", pixels=(90, 60))
     with pytest.raises(AspEnvError, match="known are chauffeurnet"):
@@ -198,17 +201,17 @@ def test_unknown_names_list_the_known() -> None:
     ],
     ids=str,
 )
-def test_foreign_configurations_are_refused(
-    make: Callable[[dict[str, Any]], PictureView], config: dict[str, Any]
+def test_wrong_configurations_are_rejected(
+    make: Callable[[dict[str, Any]], RasterView], config: dict[str, Any]
 ) -> None:
-    """Another view's configuration, none, an unknown field, or a missing one: one line."""
+    """The configuration of another view, none, an unknown field or a missing one."""
     with pytest.raises(AspEnvError, match="configuration") as caught:
         make(config)
     assert "\n" not in str(caught.value)
 
 
-def test_configurations_from_before_the_trail_was_a_choice() -> None:
-    """A configuration without `ego_trail`, as older checkpoints hold, is of the view with it."""
+def test_configurations_of_older_checkpoints_have_the_ego_trail() -> None:
+    """They contain no field `ego_trail`."""
     config = ChauffeurNet.make((90, 60)).config()
     del config["ego_trail"]
     assert view_from_config(config) == ChauffeurNet.make((90, 60))
@@ -224,7 +227,6 @@ def test_configurations_from_before_the_trail_was_a_choice() -> None:
     ],
     ids=str,
 )
-def test_a_trail_that_contradicts_the_name_is_refused(fields: dict[str, Any]) -> None:
-    """The name says whether there is a trail; a field that says otherwise, or neither, is wrong."""
+def test_a_trail_that_contradicts_the_name_is_rejected(fields: dict[str, Any]) -> None:
     with pytest.raises(AspEnvError, match="ego_trail"):
         view_from_config({**ChauffeurNet().config(), **fields})

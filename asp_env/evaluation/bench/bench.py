@@ -29,7 +29,7 @@ from asp_env.evaluation.bench.timing import (
     write_bandwidth,
 )
 from asp_env.evaluation.selection import no_data_error
-from asp_env.views import make_picture_view
+from asp_env.views import make_raster_view
 
 RASTER_SIZES_PX = ((360, 240), (90, 60))
 SECTIONS = ("rasters", "stepping", "environments", "scaling")
@@ -161,9 +161,9 @@ def _raster_rates(recordings: Recordings, write_bytes_per_s: float) -> list[Rate
     scene = gather_scene(recordings, index.select(chosen))
     rates = []
     for height_px, width_px in RASTER_SIZES_PX:
-        view = make_picture_view("chauffeurnet", pixels=(height_px, width_px))
+        view = make_raster_view("chauffeurnet", pixels=(height_px, width_px))
         out = np.zeros((len(chosen), *view.shape), dtype=np.uint8)
-        per_s = len(chosen) / median_s(lambda view=view, out=out: view.draw(scene, out))
+        per_s = len(chosen) / median_s(lambda view=view, out=out: view.render(scene, out))
         rates.append(
             Rate(
                 name=f"raster 12x{height_px}x{width_px}",

@@ -37,7 +37,7 @@ from asp_env.evaluation.results import Row, write_manifest, write_metrics
 from asp_env.evaluation.selection import PartChoice, no_data_error, short_names, ticks_to_evaluate
 from asp_env.evaluation.tables import driving_table
 from asp_env.files import atomic_folder
-from asp_env.metrics.driving.rules import DEFAULT_PRESET, RULES, Rules
+from asp_env.metrics.driving.rules import DEFAULT_RULES, RULES, Rules
 from asp_env.metrics.masked import Masked
 from asp_env.sim.world import world_class
 from asp_env.workers import WorkerPool
@@ -76,7 +76,7 @@ class Drive:
     """Duration of a tick in seconds."""
     part: PartChoice = "auto"
     """Part of DATA; auto is all that no predictor was trained or selected on."""
-    rules: str = DEFAULT_PRESET
+    rules: str = DEFAULT_RULES
     """Driving rules that define the metrics: nuplan, pdms, waymax or strict."""
     jobs: int = 1
     """Number of processes that drive. The results do not depend on it."""
@@ -162,7 +162,11 @@ def drive(config: Drive) -> ClosedLoopResult:
                 *(name for name, p in predictors.items() if p.privileged),
             ],
             "traffic": config.traffic,
-            "metrics": {"preset": rules.name, "version": rules.version, "about": rules.about},
+            "metrics": {
+                "preset": rules.name,
+                "version": rules.version,
+                "about": rules.description,
+            },
             "horizon_s": config.horizon,
             "dt_s": config.dt,
             "part": part,

@@ -13,13 +13,13 @@ from asp_env.data.rollout import Rollout
 from asp_env.data.scenarios.scenario import Scenario
 from asp_env.data.scene import EGO, Scene
 from asp_env.metrics.driving.map_context import map_context
-from asp_env.metrics.driving.realism import features, realism
+from asp_env.metrics.driving.realism import realism, realism_features
 from asp_env.metrics.driving.rules import Rules
 from asp_env.metrics.driving.scores import (
     COMPLIANT_M,
     OVERSPEED_MPS,
-    Drives,
-    against_traffic_m,
+    EpisodeRecord,
+    against_traffic_in_window_m,
     at_fault,
     overspeed_mps,
 )
@@ -68,7 +68,7 @@ class Decision:
 class DrivenEpisodes:
     """B episodes that have ended."""
 
-    drives: Drives
+    drives: EpisodeRecord
     realism: Mapping[str, Masked]
     """Realism of the traffic (b,); missing where it was replayed."""
     endings: Int[np.ndarray, " b"]
@@ -83,7 +83,7 @@ def drive_episodes(
     predictor: Predictor,
     settings: EpisodeSettings,
 ) -> DrivenEpisodes:
-    """Drives every scenario to its end, all side by side: one forecast and one plan per tick.
+    """EpisodeRecord every scenario to its end, all side by side: one forecast and one plan per tick.
 
     If the planner is privileged, the world replays the logged egos instead. Contacts and the
     drivable area end episodes, so they are measured at every tick; all else is measured at the
@@ -168,7 +168,7 @@ def _measure(
     events: Sequence[Events],
     active: Bool[np.ndarray, "b t"],
     rules: Rules,
-) -> Drives:
+) -> EpisodeRecord:
     episodes = world.episodes
     ticks = slice(world.history, world.history + len(events))
     states, valid = episodes.states[:, ticks], episodes.valid[:, ticks]
@@ -185,7 +185,7 @@ def _measure(
             valid=np.array([limit is not None for limit in limits]),
         ),
     )
-    return Drives(
+    return EpisodeRecord(
         states=states[:, :, EGO],
         log_states=episodes.log_states[:, ticks, EGO],
         contacts=contacts,
@@ -196,15 +196,15 @@ def _measure(
             episodes.sizes,
             contacts=contacts,
             ignored=episodes.own_trailer,
-            beside=on_map.several_lanes | on_map.at_crossing | (off_road_m > rules.off_road_m),
-            count=active.sum(axis=1),
+            wide_sector=on_map.several_lanes | on_map.at_crossing | (off_road_m > rules.off_road_m),
+            num_ticks=active.sum(axis=1),
             rule=rules.ttc,
             dt_s=world.dt_s,
         ),
         route_m=np.stack([each.route_m for each in events], axis=1),
         route_offset_m=np.stack([each.route_offset_m for each in events], axis=1),
         goal_m=events[0].goal_m,
-        on_map=on_map,
+        map_context=on_map,
         active=active,
         dt_s=world.dt_s,
     )
@@ -238,8 +238,8 @@ def traffic_realism(world: World, active: Bool[np.ndarray, "b t"]) -> dict[str, 
             simulated,
             world.dt_s,
         )
-        sample = features(states, valid, *shared)
-        for name, each in realism(features(log_states, log_valid, *shared), [sample]).items():
+        sample = realism_features(states, valid, *shared)
+        for name, each in realism(realism_features(log_states, log_valid, *shared), [sample]).items():
             by_name.setdefault(name, []).append(each)
     return {
         name: Masked(
@@ -250,7 +250,7 @@ def traffic_realism(world: World, active: Bool[np.ndarray, "b t"]) -> dict[str, 
     }
 
 
-def _event_flags(drives: Drives, rules: Rules) -> Bool[np.ndarray, "b t kinds"]:
+def _event_flags(drives: EpisodeRecord, rules: Rules) -> Bool[np.ndarray, "b t kinds"]:
     """Mask of the ticks of each of `EVENTS`."""
     over = overspeed_mps(drives)
     return np.stack(
@@ -259,7 +259,7 @@ def _event_flags(drives: Drives, rules: Rules) -> Bool[np.ndarray, "b t kinds"]:
             at_fault(drives, rules),
             drives.off_road_m > rules.off_road_m,
             drives.ttc_s <= rules.ttc.min_ttc_s,
-            against_traffic_m(drives) > COMPLIANT_M,
+            against_traffic_in_window_m(drives) > COMPLIANT_M,
             over.valid & (over.value > OVERSPEED_MPS),
         ],
         axis=-1,

@@ -32,7 +32,7 @@ from asp_env.metrics.forecast.errors import (
 )
 from asp_env.metrics.forecast.feasibility import (
     infeasible_modes,
-    off_road_points,
+    off_road_modes,
     overlapping_modes,
 )
 from asp_env.metrics.masked import Masked
@@ -237,7 +237,7 @@ def _violations(
     """For each rule, a mask of the modes that violate it and one of the targets it applies to."""
     future = truth.future
     known = np.asarray(future.valid.all(axis=1))
-    off_road, _ = off_road_points(truth.maps, truth.map_index, sample.states[..., :2])
+    off_road, _ = off_road_modes(truth.maps, truth.map_index, sample.states[..., :2])
     overlap = overlapping_modes(
         sample.states,
         future.states,
@@ -263,7 +263,7 @@ def stays_on_road(truth: GroundTruth) -> Bool[np.ndarray, " n"]:
     it. False for maps without drivable area.
     """
     positions = truth.states[:, None, truth.now :, :2]
-    off, known = off_road_points(truth.maps, truth.map_index, positions)
+    off, known = off_road_modes(truth.maps, truth.map_index, positions)
     return known & ~off[:, 0] & truth.valid[:, truth.now :].all(axis=1)
 
 

@@ -1,4 +1,4 @@
-"""nuPlan's comfort bounds on the motion of one vehicle, from its states at the ticks."""
+"""nuPlan's comfort bounds on the motion of a vehicle, from its states at consecutive ticks."""
 
 import numpy as np
 from jaxtyping import Bool, Float
@@ -13,25 +13,37 @@ BOUNDS = {
     "longitudinal jerk m/s³": (-4.13, 4.13),
     "jerk m/s³": (0.0, 8.37),
 }
-"""nuPlan's lowest and highest value of each quantity."""
+"""Lowest and highest comfortable value of each signal (nuPlan)."""
 
 WINDOW_S = 1.0
-"""Derivatives are slopes of a parabola fitted over the ticks within this time."""
+"""Duration of the window over which a parabola is fitted for each derivative. Chosen by hand."""
 
-LEAST_TICKS = 5
-"""The window has at least so many ticks, so that it smooths where ticks are over 0.25 s."""
+MIN_WINDOW_TICKS = 5
+"""Minimum length of the window, which smooths at ticks over 0.25 s as well. Chosen by hand."""
 
 
 def window_ticks(dt_s: float) -> int:
-    """How many ticks the window has: odd, no more than 1 s from first to last, at least 5."""
-    # a little more than half the window, so that rounding takes no tick away
-    return max(2 * int(0.5 * WINDOW_S / dt_s + 1e-6) + 1, LEAST_TICKS)
+    """Number of ticks in the window: odd, at most 1 s from first to last, at least 5.
+
+    Args:
+        dt_s: seconds per tick.
+    """
+    # half the window and a little more, so that rounding removes no tick
+    return max(2 * int(0.5 * WINDOW_S / dt_s + 1e-6) + 1, MIN_WINDOW_TICKS)
 
 
 def slope(values: Float[np.ndarray, "*batch t"], dt_s: float) -> Float[np.ndarray, "*batch t"]:
-    """Derivative by a least-squares parabola over a sliding window; at the ends, that window's.
+    """Derivative by a least-squares parabola over a sliding window.
 
-    A Savitzky-Golay filter as nuPlan uses; exact for parabolas. Needs `window_ticks` ticks.
+    This is a Savitzky-Golay filter, as nuPlan uses it, and exact for parabolas. The values at both
+    ends are those of the first and the last window.
+
+    Args:
+        values: at least `window_ticks` ticks.
+        dt_s: seconds per tick.
+
+    Returns:
+        The derivative per second at every tick.
     """
     ticks = window_ticks(dt_s)
     half = ticks // 2
@@ -47,7 +59,15 @@ def slope(values: Float[np.ndarray, "*batch t"], dt_s: float) -> Float[np.ndarra
 
 
 def comfort_signals(states: Float[np.ndarray, "*batch t 4"], dt_s: float) -> dict[str, np.ndarray]:
-    """What is bounded, (*batch, t) by the names of `BOUNDS`. Needs `window_ticks` ticks."""
+    """The signals that are bounded, by the names of `BOUNDS`.
+
+    Args:
+        states: [x m, y m, heading rad, speed m/s] at at least `window_ticks` ticks.
+        dt_s: seconds per tick.
+
+    Returns:
+        (*batch, t) for each name.
+    """
     heading = np.unwrap(states[..., 2].astype(np.float64), axis=-1)
     speed = states[..., 3].astype(np.float64)
     yaw_rate = slope(heading, dt_s)
@@ -63,13 +83,19 @@ def comfort_signals(states: Float[np.ndarray, "*batch t 4"], dt_s: float) -> dic
 def comfortable(
     states: Float[np.ndarray, "*batch t 4"], dt_s: float, long_enough: Bool[np.ndarray, "*batch"]
 ) -> Masked:
-    """1 where every bound holds at every tick, else 0; invalid for motions under one window."""
+    """1 if every bound holds at every tick, else 0.
+
+    Args:
+        states: [x m, y m, heading rad, speed m/s].
+        dt_s: seconds per tick.
+        long_enough: mask of the result; all are invalid for fewer than `window_ticks` ticks.
+    """
     if states.shape[-2] < window_ticks(dt_s):
         return Masked(
             value=np.zeros(states.shape[:-2]), valid=np.zeros(states.shape[:-2], dtype=bool)
         )
-    fine = np.ones(states.shape[:-1], dtype=bool)
+    within = np.ones(states.shape[:-1], dtype=bool)
     for name, value in comfort_signals(states, dt_s).items():
         low, high = BOUNDS[name]
-        fine &= (value >= low) & (value <= high)
-    return Masked(value=np.asarray(fine.all(axis=-1), dtype=np.float64), valid=long_enough)
+        within &= (value >= low) & (value <= high)
+    return Masked(value=np.asarray(within.all(axis=-1), dtype=np.float64), valid=long_enough)

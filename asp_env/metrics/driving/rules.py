@@ -1,4 +1,4 @@
-"""Whose definitions a drive is judged by: bundles of thresholds and rules with a name."""
+"""The rules by which drives are judged: named sets of thresholds and definitions."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -10,32 +10,31 @@ from asp_env.metrics.driving.ttc import TtcRule
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Rules:
-    """The rules in which published scores differ. What is not here, all of them share."""
+    """The definitions in which published scores differ. All other definitions are shared."""
 
     name: str
     version: int
-    """Raised whenever the same drive would get another number."""
-    about: str
+    """Increased whenever the same drive would receive another number."""
+    description: str
     off_road_m: float
-    """A corner further outside the drivable area than this is off the road."""
+    """The ego is off the road if a corner is further outside the drivable area than this."""
     any_side_is_fault: bool
-    """Whether a contact at the ego's side is its fault everywhere, or, as in nuPlan, only while it
-    is in several lanes or off the road."""
+    """Whether a contact at the ego's side is always its fault, or, as in nuPlan, only while it is
+    in several lanes or off the road."""
     ttc: TtcRule
     min_progress_m: float
-    """Ways that are compared for progress are no shorter than this: that of the log, and with
-    `lifts` that of the ego too."""
-    lifts: bool
+    """The progress of the log is at least this, and with `lifts_ego` that of the ego too."""
+    lifts_ego: bool
     multipliers: tuple[str, ...] = ()
     """Metrics whose product scales the score."""
     weights: Mapping[str, float]
-    """Metrics whose weighted mean is the score; without any there is no score."""
+    """Metrics whose weighted mean is the score; without weights there is no score."""
     shown: tuple[str, ...]
-    """Metrics that the table shows, in its order."""
+    """Metrics in the printed table, in their order."""
 
     @property
     def label(self) -> str:
-        """Name and version, as results carry them."""
+        """Name and version, as results contain them."""
         return f"{self.name} {self.version}"
 
 
@@ -45,7 +44,7 @@ _NUPLAN_TTC = TtcRule(
     horizon_s=3.0,
     min_ttc_s=0.95,
     sector=True,
-    ignore_after_contact=False,
+    ignore_after_contact=True,
     standing_mps=0.005,
 )
 _PDMS_WEIGHTS = {"progress": 5.0, "TTC": 5.0, "comfort": 2.0}
@@ -53,12 +52,12 @@ _PDMS_WEIGHTS = {"progress": 5.0, "TTC": 5.0, "comfort": 2.0}
 NUPLAN = Rules(
     name="nuplan",
     version=1,
-    about="nuPlan's closed-loop score",
+    description="nuPlan's closed-loop score",
     off_road_m=OFF_ROAD_M,
     any_side_is_fault=False,
     ttc=_NUPLAN_TTC,
     min_progress_m=2.0,
-    lifts=True,
+    lifts_ego=True,
     multipliers=("no at-fault collision", "on road", "direction", "making progress"),
     weights={"progress": 5.0, "TTC": 5.0, "speed": 4.0, "comfort": 2.0},
     shown=("no at-fault collision", "on road", "direction", "TTC", "progress", "speed", "comfort"),
@@ -67,7 +66,7 @@ NUPLAN = Rules(
 PDMS = Rules(
     name="pdms",
     version=1,
-    about="NAVSIM's predictive driver model score over a whole closed-loop episode",
+    description="NAVSIM's predictive driver model score over a whole closed-loop episode",
     off_road_m=OFF_ROAD_M,
     any_side_is_fault=False,
     ttc=TtcRule(
@@ -76,11 +75,11 @@ PDMS = Rules(
         horizon_s=0.9,  # the last step within NAVSIM's window of 1 s
         min_ttc_s=0.95,
         sector=True,
-        ignore_after_contact=False,
+        ignore_after_contact=True,
         standing_mps=0.005,
     ),
     min_progress_m=1.0,
-    lifts=False,
+    lifts_ego=False,
     multipliers=("no at-fault collision", "on road"),
     weights=_PDMS_WEIGHTS,
     shown=("no at-fault collision", "on road", "TTC", "progress", "comfort"),
@@ -89,12 +88,12 @@ PDMS = Rules(
 WAYMAX = Rules(
     name="waymax",
     version=1,
-    about="Waymax's metrics; it has no score",
+    description="Waymax's metrics; it has no score",
     off_road_m=0.0,
     any_side_is_fault=True,
     ttc=_NUPLAN_TTC,
     min_progress_m=1.0,
-    lifts=False,
+    lifts_ego=False,
     weights={},
     shown=(
         *("no collision", "on road", "right way", "feasible"),
@@ -105,7 +104,9 @@ WAYMAX = Rules(
 STRICT = Rules(
     name="strict",
     version=1,
-    about="PDMS on the road as mapped, at fault at any side, with TTC to all but those behind",
+    description=(
+        "PDMS on the road as mapped, at fault at any side, with TTC to all but those behind"
+    ),
     off_road_m=OFF_ROAD_M,
     any_side_is_fault=True,
     ttc=TtcRule(
@@ -114,26 +115,26 @@ STRICT = Rules(
         horizon_s=3.0,
         min_ttc_s=0.95,
         sector=False,
-        ignore_after_contact=True,
+        ignore_after_contact=False,
         standing_mps=0.05,
     ),
     min_progress_m=1.0,
-    lifts=False,
+    lifts_ego=False,
     multipliers=("no at-fault collision", "on mapped road"),
     weights=_PDMS_WEIGHTS,
     shown=("no at-fault collision", "on mapped road", "TTC", "progress", "comfort"),
 )
 
-RULES = {preset.name: preset for preset in (NUPLAN, PDMS, WAYMAX, STRICT)}
-DEFAULT_PRESET = PDMS.name
+RULES = {rules.name: rules for rules in (NUPLAN, PDMS, WAYMAX, STRICT)}
+DEFAULT_RULES = PDMS.name
 
 
 def find_rules(name: str) -> Rules:
-    """A preset by its name.
+    """The rules of the given name.
 
     Raises:
-        AspEnvError: there is none of that name.
+        AspEnvError: the name is unknown; the known names are listed.
     """
     if name not in RULES:
-        raise unknown_name("metrics", name, list(RULES))
+        raise unknown_name("rules", name, list(RULES))
     return RULES[name]

@@ -1,7 +1,7 @@
-"""Whether probabilities of modes mean what they say. N targets, M modes, T ticks.
+"""Calibration of the probabilities of modes.
 
-The event that a mode's probability speaks of is that this mode is the nearest to the truth at the
-last tick.
+The probability of a mode is understood as that of being the mode nearest to the ground truth at the
+last tick. Shapes: N targets, M modes.
 """
 
 import math
@@ -12,9 +12,10 @@ from jaxtyping import Bool, Float
 from asp_env.metrics.masked import Masked
 
 NLL_SIGMA_M = 1.0
-"""Standard deviation of each mode's Gaussian in x and in y; the unit variance of l5kit's NLL."""
+"""Standard deviation of each mode's Gaussian in x and in y: the unit variance of l5kit's NLL."""
 
 BINS = 10
+"""Number of bins of equal width of the expected calibration error. Chosen by hand."""
 
 
 def mixture_nll(
@@ -23,14 +24,22 @@ def mixture_nll(
     true_end: Float[np.ndarray, "n 2"],
     valid: Bool[np.ndarray, " n"],
 ) -> Masked:
-    """Per target, -log Σ_m p_m N(x; μ_m, s² I) at the last tick, nats; s = 1 m.
+    """Negative log-likelihood of the true end, -log Σ_m p_m N(x; μ_m, s² I) with s = 1 m, nats.
 
-    x is where the target ends and μ_m where mode m does. A single sure mode that is right has
-    log 2π = 1.84, and one that is off FDE² / 2 more. Any number of modes; missing where the end of
-    the truth is not known.
+    x is the end of the ground truth and μ_m that of mode m. A single certain mode has log 2π = 1.84
+    if it is right, and FDE² / 2 more otherwise.
+
+    Args:
+        ends: last positions of the modes, metres.
+        log_probs: log-probabilities of any number of modes.
+        true_end: last position of the ground truth, metres.
+        valid: targets whose true end is known.
+
+    Returns:
+        (n,) nats; missing where the true end is not known.
     """
-    off = ((ends - true_end[:, None]).astype(np.float64) ** 2).sum(axis=-1)
-    exponents = log_probs - off / (2 * NLL_SIGMA_M**2)
+    square = ((ends - true_end[:, None]).astype(np.float64) ** 2).sum(axis=-1)
+    exponents = log_probs - square / (2 * NLL_SIGMA_M**2)
     highest = exponents.max(axis=1, keepdims=True)
     total = highest[:, 0] + np.log(np.exp(exponents - highest).sum(axis=1))
     return Masked(value=math.log(2 * math.pi * NLL_SIGMA_M**2) - total, valid=valid)
@@ -39,9 +48,14 @@ def mixture_nll(
 def nearest_modes(
     ends: Float[np.ndarray, "n m 2"], true_end: Float[np.ndarray, "n 2"]
 ) -> Float[np.ndarray, "n m"]:
-    """(n, m) 1 for the mode nearest to the truth at the end, 0 for others; k equals get 1/k."""
-    off = np.linalg.vector_norm(ends - true_end[:, None], axis=-1)
-    nearest = off == off.min(axis=1, keepdims=True)
+    """1 for the mode that ends nearest to the ground truth, 0 for others; 1/k for k equal ones.
+
+    Args:
+        ends: last positions of the modes, metres.
+        true_end: last position of the ground truth, metres.
+    """
+    distance = np.linalg.vector_norm(ends - true_end[:, None], axis=-1)
+    nearest = distance == distance.min(axis=1, keepdims=True)
     return nearest / nearest.sum(axis=1, keepdims=True)
 
 
@@ -50,10 +64,16 @@ def brier(
     nearest: Float[np.ndarray, "n m"],
     valid: Bool[np.ndarray, " n"],
 ) -> Masked:
-    """Per target, Σ_m (p_m - y_m)² with y from `nearest_modes`: 0 is right and sure, 2 the worst.
+    """Brier score Σ_m (p_m - y_m)² of each target, from 0 (certain and right) to 2.
 
-    Missing where the end of the truth is not known, and for forecasts of a single mode, which are
-    always sure and always right about it.
+    Args:
+        log_probs: log-probabilities of the modes.
+        nearest: y, the value of `nearest_modes`.
+        valid: targets whose true end is known.
+
+    Returns:
+        (n,); missing where the true end is not known, and for forecasts of a single mode, which is
+        always certain and always the nearest.
     """
     value = ((np.exp(log_probs) - nearest) ** 2).sum(axis=1)
     return Masked(value=value, valid=valid & (log_probs.shape[1] > 1))
@@ -62,26 +82,39 @@ def brier(
 def calibration_sums(
     probabilities: Float[np.ndarray, "n m"], nearest: Float[np.ndarray, "n m"]
 ) -> Float[np.ndarray, "n bins 3"]:
-    """What each target adds to each bin: its modes' number, probabilities, and y.
+    """Contribution of each target to each bin of the calibration error.
 
-    Ten bins of equal width by probability; the last one holds 1. Sums over targets of one
-    recording, or of a resample, are what `calibration_error` takes.
+    The ten bins have equal widths by probability; the last one contains 1. `calibration_error`
+    takes the sums over the targets of a recording or of a resample.
+
+    Args:
+        probabilities: of the modes.
+        nearest: y, the value of `nearest_modes`.
+
+    Returns:
+        Number of modes, sum of their probabilities and sum of their y.
     """
-    at = np.minimum((probabilities * BINS).astype(np.int64), BINS - 1)
-    sums = np.zeros((len(at), BINS, 3))
-    rows = np.repeat(np.arange(len(at)), at.shape[1])
-    whole = np.stack([np.ones_like(nearest), probabilities, nearest], axis=-1)
-    np.add.at(sums, (rows, at.reshape(-1)), whole.reshape(-1, 3))
+    bins = np.minimum((probabilities * BINS).astype(np.int64), BINS - 1)
+    sums = np.zeros((len(bins), BINS, 3))
+    rows = np.repeat(np.arange(len(bins)), bins.shape[1])
+    terms = np.stack([np.ones_like(nearest), probabilities, nearest], axis=-1)
+    np.add.at(sums, (rows, bins.reshape(-1)), terms.reshape(-1, 3))
     return sums
 
 
 def calibration_error(sums: Float[np.ndarray, "*batch bins 3"]) -> Float[np.ndarray, "*batch"]:
     """Expected calibration error of the modes of all targets together, from 0 to 1.
 
-    Σ_b n_b / n · |mean p - mean y| over the bins of `calibration_sums`; NaN of no modes. Few
-    targets overstate it, since chance differences add up whatever their sign. It does not apply to
-    forecasts of a single mode.
+    This is Σ_b n_b / n · |mean p - mean y| over the bins. It is overestimated for few targets,
+    since random differences add up regardless of their sign, and does not apply to forecasts of a
+    single mode.
+
+    Args:
+        sums: sums of `calibration_sums` over targets.
+
+    Returns:
+        The error; NaN without modes.
     """
-    count, said, came = np.moveaxis(sums, -1, 0)
+    count, probability, frequency = np.moveaxis(sums, -1, 0)
     with np.errstate(invalid="ignore", divide="ignore"):
-        return np.asarray(np.abs(said - came).sum(axis=-1) / count.sum(axis=-1))
+        return np.asarray(np.abs(probability - frequency).sum(axis=-1) / count.sum(axis=-1))

@@ -1,9 +1,7 @@
-"""Which of several modes a truth speaks for: one rule for training and evaluation.
+"""Errors of forecasts against the ground truth, the choice of the scored mode, and manoeuvres.
 
-Written once for NumPy arrays and torch tensors. N targets, M modes, T ticks.
-
-MERGED: Errors of forecasts against what happened. N targets, M modes, T ticks.
-MERGED: What a target does around now, from its recorded past and future: one manoeuvre each.
+Shapes: N targets, M modes, T ticks. `best_mode` works on NumPy arrays and on torch tensors, so that
+training and evaluation choose modes by the same rules.
 """
 
 import math
@@ -23,10 +21,30 @@ MODE_RULES: dict[ModeRule, str] = {
     "ade": "the lowest mean error",
     "paper": "the lowest mean error among those that end within 5° of the truth",
 }
-"""What each rule takes, in words."""
+"""The mode that each rule chooses, in words."""
+
+Selection = Literal["most-probable", "best-of-3"]
+SELECTIONS: tuple[Selection, ...] = ("most-probable", "best-of-3")
 
 MAX_ANGLE_RAD = math.radians(5.0)
-STANDING_M = 2.0
+"""Modes that end within this angle of the ground truth have its direction (Cui et al. 2019)."""
+
+NO_DIRECTION_M = 2.0
+"""A ground truth that ends within this distance has no direction. Chosen by hand."""
+
+BEST_OF = 3
+"""Number of most probable modes of which `best-of-3` chooses one (Janjoš et al. 2021)."""
+
+MISS_M = 2.0
+"""Final errors above this are misses (Argoverse 2)."""
+
+MOVING_MPS = 1.0
+"""Targets above this present speed are in the subset `moving`. Chosen by hand."""
+
+MOVING_M = 2.0
+"""So are targets that are ever further away than this in the future. Chosen by hand."""
+
+_TIME_TOLERANCE_S = 1e-6
 
 
 def best_mode(
@@ -36,59 +54,53 @@ def best_mode(
     *,
     among: Bool[Any, "n m"] | None = None,
 ) -> Int[Any, " n"]:
-    """(n,) index of the mode that fits the truth best; of equals the first.
+    """Index of the mode that fits the ground truth best; the first of equal ones.
 
     `fde` takes the lowest L2 distance at the last tick (Argoverse 2), `ade` the lowest mean of it.
     `paper` (Cui et al. 2019, Janjoš et al. 2021) takes the lowest mean among the modes whose last
-    point lies within 5° of the truth's last point, seen from the target; where there is none the
-    lowest mean of all, for which the published code draws a random mode. A truth that ends within
-    2 m has no direction: the mean alone.
+    point is within 5° of the last point of the ground truth, seen from the target. If there is no
+    such mode it takes the lowest mean of all, where the published code draws a random mode. A
+    ground truth that ends within 2 m has no direction, so that only the mean decides.
 
     Args:
-        positions: of the modes, metres; the target now is at (0, 0), the axes may point anywhere.
-        truth: what happened, in the same frame, known at all ticks.
-        rule: see above.
-        among: the modes that may be taken, at least one of each target; all without it.
+        positions: of the modes, metres; the target's present position is (0, 0).
+        truth: positions of the ground truth in the same frame, known at all ticks.
+        rule: one of `MODE_RULES`.
+        among: modes that may be chosen, at least one of each target; all modes if omitted.
+
+    Returns:
+        (n,) indices.
     """
     xp = namespace(positions)
-    away_m = xp.linalg.vector_norm(positions - truth[:, None], axis=-1)
-    distance_m = away_m[..., -1] if rule == "fde" else away_m.mean(axis=-1)
-    allowed = xp.ones_like(distance_m, dtype=bool) if among is None else among
+    error_m = xp.linalg.vector_norm(positions - truth[:, None], axis=-1)
+    criterion_m = error_m[..., -1] if rule == "fde" else error_m.mean(axis=-1)
+    allowed = xp.ones_like(criterion_m, dtype=bool) if among is None else among
     if rule == "paper":
-        near = allowed & ends_alike(positions, truth)
+        near = allowed & ends_in_true_direction(positions, truth)
         allowed = xp.where(near.any(axis=1)[:, None], near, allowed)
-    return xp.where(allowed, distance_m, math.inf).argmin(axis=1)
+    return xp.where(allowed, criterion_m, math.inf).argmin(axis=1)
 
 
-def ends_alike(positions: Float[Any, "n m t 2"], truth: Float[Any, "n t 2"]) -> Bool[Any, "n m"]:
-    """(n, m) whether a mode ends within 5° of where the truth ends, seen from (0, 0).
+def ends_in_true_direction(
+    positions: Float[Any, "n m t 2"], truth: Float[Any, "n t 2"]
+) -> Bool[Any, "n m"]:
+    """Whether a mode ends within 5° of the end of the ground truth, seen from (0, 0).
 
-    All modes do where the truth ends within 2 m, and so has no direction.
+    All modes do if the ground truth ends within 2 m.
+
+    Args:
+        positions: of the modes, metres; the target's present position is (0, 0).
+        truth: positions of the ground truth in the same frame.
+
+    Returns:
+        (n, m) mask.
     """
     xp = namespace(positions)
     end, true_end = positions[:, :, -1], truth[:, None, -1]
     cross = end[..., 0] * true_end[..., 1] - end[..., 1] * true_end[..., 0]
     dot = (end * true_end).sum(axis=-1)
-    stands = xp.linalg.vector_norm(true_end, axis=-1) < STANDING_M
-    return (xp.abs(xp.arctan2(cross, dot)) <= MAX_ANGLE_RAD) | stands
-
-
-Selection = Literal["most-probable", "best-of-3"]
-SELECTIONS: tuple[Selection, ...] = ("most-probable", "best-of-3")
-
-BEST_OF = 3
-MISS_M = 2.0
-WHOLE_S = 1e-6
-"""A time this close to a tick is that tick's."""
-MOVING_MPS = 1.0
-MOVING_M = 2.0
-
-
-def displacement(
-    modes: Float[np.ndarray, "n m t 2"], truth: Float[np.ndarray, "n t 2"]
-) -> Float[np.ndarray, "n m t"]:
-    """(n, m, t) L2 distance of every mode to the truth, metres."""
-    return np.linalg.vector_norm(modes - truth[:, None], axis=-1)
+    no_direction = xp.linalg.vector_norm(true_end, axis=-1) < NO_DIRECTION_M
+    return (xp.abs(xp.arctan2(cross, dot)) <= MAX_ANGLE_RAD) | no_direction
 
 
 def select_mode(
@@ -98,12 +110,21 @@ def select_mode(
     selection: Selection,
     rule: ModeRule = "fde",
 ) -> Int[np.ndarray, " n"]:
-    """(n,) index of the mode that is scored.
+    """Index of the mode that is scored.
 
-    `most-probable` looks at the probabilities alone. `best-of-3` takes, of the three most
-    probable, the one that `best_mode` names; under `fde`, Argoverse 2's choice, its ADE is that of
-    the mode with the best end. For the rule `paper`, modes and truth are seen from the target. The
-    truth must be valid at the ticks that the rule reads.
+    `most-probable` depends only on the probabilities. `best-of-3` takes the `best_mode` of the
+    three most probable ones; with the rule `fde` (Argoverse 2) its ADE is that of the mode with the
+    best end.
+
+    Args:
+        modes: positions, metres; seen from the target for the rule `paper`.
+        log_probs: log-probabilities of the modes.
+        truth: positions of the ground truth, valid at the ticks that the rule reads.
+        selection: one of `SELECTIONS`.
+        rule: one of `MODE_RULES`.
+
+    Returns:
+        (n,) indices.
     """
     if selection == "most-probable":
         return log_probs.argmax(axis=1)
@@ -119,11 +140,20 @@ def open_loop_errors(
     selection: Selection,
     rule: ModeRule = "fde",
 ) -> dict[str, Masked]:
-    """Per target, metres unless said.
+    """Errors of the selected mode of each target, (n,) by name.
 
-    MAE and MSE are means of |Δ| and Δ² over time and coordinate (Janjoš et al. 2021), ADE and FDE
-    the mean and last L2 distance (minADE and minFDE under `best-of-3`), `miss` whether FDE exceeds
-    2 m, `brier-FDE` is FDE + (1 - p)² (Argoverse 2). Valid where the truth is known throughout.
+    `MAE` (m) and `MSE` (m²) are the means of |Δ| and Δ² over time and coordinate (Janjoš et al.
+    2021), `ADE` and `FDE` (m) the mean and the last L2 distance (minADE and minFDE with
+    `best-of-3`). `miss` is whether FDE exceeds 2 m, and `brier-FDE` (m) is FDE + (1 - p)²
+    (Argoverse 2).
+
+    Args:
+        modes: positions, metres.
+        log_probs: log-probabilities of the modes.
+        truth: positions of the ground truth, metres.
+        valid: ticks at which the ground truth is known; errors are valid if it is known at all.
+        selection: one of `SELECTIONS`.
+        rule: one of `MODE_RULES`.
     """
     chosen = select_mode(modes, log_probs, truth, selection, rule)
     rows = np.arange(len(modes))
@@ -152,18 +182,28 @@ def errors_over_time(
     *,
     dt_s: float,
 ) -> dict[str, Masked]:
-    """Per target, `L2@1s`, `L2@2s` and so on: the chosen mode's distance to the truth then, m.
+    """L2 distance of the selected mode at each whole second: `L2@1s`, `L2@2s`, …, (n,) metres.
 
-    Only seconds that are a whole number of ticks: with ticks of 0.3 s the first is `L2@3s`.
+    Seconds that are no whole number of ticks are left out: with ticks of 0.3 s the first is
+    `L2@3s`. The other arguments are those of `open_loop_errors`.
+
+    Args:
+        modes: positions, metres.
+        log_probs: log-probabilities of the modes.
+        truth: positions of the ground truth, metres.
+        valid: ticks at which the ground truth is known.
+        selection: one of `SELECTIONS`.
+        rule: one of `MODE_RULES`.
+        dt_s: seconds per tick.
     """
     chosen = select_mode(modes, log_probs, truth, selection, rule)
     distance = np.linalg.vector_norm(modes[np.arange(len(modes)), chosen] - truth, axis=-1)
-    whole = range(1, int(truth.shape[1] * dt_s + 1e-6) + 1)
-    ticks = {second: round(second / dt_s) for second in whole}
+    seconds = range(1, int(truth.shape[1] * dt_s + 1e-6) + 1)
+    ticks = {second: round(second / dt_s) for second in seconds}
     return {
         f"L2@{second}s": Masked(value=distance[:, tick - 1], valid=valid[:, tick - 1])
         for second, tick in ticks.items()
-        if abs(tick * dt_s - second) < WHOLE_S
+        if abs(tick * dt_s - second) < _TIME_TOLERANCE_S
     }
 
 
@@ -174,18 +214,18 @@ def inconsistency(
     *,
     apart: int,
 ) -> Masked:
-    """Per target, how far two forecasts of it disagree: mean L2 distance at shared times, m.
+    """Mean L2 distance between two forecasts of the same target at the ticks they share, metres.
 
-    The later one is made `apart` ticks after the earlier one, so its tick k is the earlier one's
-    tick k + `apart`. Both are the most probable modes: what a planner is told first and then. A
-    best mode is chosen by the truth, which no planner knows, so it is not asked.
+    Tick k of the later forecast is tick k + `apart` of the earlier one. Both are most probable
+    modes, the forecasts that a planner receives; the best mode depends on the ground truth, which
+    no planner has.
 
     Args:
-        earlier: positions of the earlier forecast, in the same frame as the later one's.
-        later: positions of the later forecast.
-        paired: where there is an earlier forecast of the target; elsewhere the value is missing,
-            and everywhere if the forecasts share no tick.
-        apart: ticks between them.
+        earlier: positions of the earlier forecast, metres.
+        later: positions of the later forecast in the same frame.
+        paired: targets with an earlier forecast; the value is missing elsewhere, and everywhere if
+            the forecasts share no tick.
+        apart: number of ticks between the forecasts.
     """
     shared = max(later.shape[1] - apart, 0)
     if shared == 0:
@@ -199,13 +239,19 @@ def moving(
     truth: Float[np.ndarray, "n t 2"],
     valid: Bool[np.ndarray, "n t"],
 ) -> Bool[np.ndarray, " n"]:
-    """(n,) the subset `moving`: over 1 m/s now, or over 2 m away at any valid tick to come."""
+    """Mask of the subset `moving`: over 1 m/s now, or over 2 m away at any valid future tick.
+
+    Args:
+        now: present states [x m, y m, heading rad, speed m/s].
+        truth: positions of the ground truth, metres.
+        valid: ticks at which the ground truth is known.
+    """
     away = np.linalg.vector_norm(truth - now[:, None, :2], axis=-1)
     return (np.abs(now[:, 3]) > MOVING_MPS) | ((away > MOVING_M) & valid).any(axis=1)
 
 
 class Manoeuvre(IntEnum):
-    """In the order of the rules of `manoeuvres`: the first that holds."""
+    """Manoeuvres in the order of their rules in `manoeuvres`, of which the first applies."""
 
     STANDING = 0
     STARTING = 1
@@ -221,26 +267,29 @@ def manoeuvres(
     *,
     now: int,
 ) -> Int[np.ndarray, " n"]:
-    """(n,) `Manoeuvre` of each target, the first whose rule holds.
+    """The `Manoeuvre` of each target, the first whose rule applies.
 
     - `STANDING`: not in the subset `moving`, so at most 1 m/s now and never over 2 m away.
-    - `STARTING`: at most 1 m/s now, so it will be over 2 m away.
+    - `STARTING`: at most 1 m/s now, and therefore over 2 m away later.
     - `STOPPING`: over 1 m/s now, at most 1 m/s at the last tick.
-    - `LEFT`, `RIGHT`: its heading turns by over 30° from the first tick of the past to the last one
-      of the future, whole turns counted.
-    - `STRAIGHT`: all others.
+    - `LEFT`, `RIGHT`: the heading turns by over 30° from the first tick of the past to the last
+      tick of the future, including full turns.
+    - `STRAIGHT`: all other targets.
 
     Args:
-        states: past, present and future.
-        valid: ticks that are known. Turns between ticks of which one is not are not seen; an
-            unknown last tick is no stop.
-        now: the tick of the present.
+        states: past, present and future states [x m, y m, heading rad, speed m/s].
+        valid: ticks that are known. Turns to and from unknown ticks are left out, and an unknown
+            last tick is no stop.
+        now: index of the present tick.
+
+    Returns:
+        (n,) values of `Manoeuvre`.
     """
     speed = np.abs(states[:, :, 3])
     moves = moving(states[:, now], states[:, now + 1 :, :2], valid[:, now + 1 :])
     slow = speed[:, now] <= MOVING_MPS
     stops = valid[:, -1] & (speed[:, -1] <= MOVING_MPS)
     both = valid[:, 1:] & valid[:, :-1]
-    turned = np.where(both, wrap_angle(np.diff(states[:, :, 2], axis=1)), 0).sum(axis=1)
-    rules = [~moves, slow, stops, turned > TURN_RAD, turned < -TURN_RAD]
-    return np.select(rules, [int(kind) for kind in Manoeuvre][:-1], int(Manoeuvre.STRAIGHT))
+    turn = np.where(both, wrap_angle(np.diff(states[:, :, 2], axis=1)), 0).sum(axis=1)
+    conditions = [~moves, slow, stops, turn > TURN_RAD, turn < -TURN_RAD]
+    return np.select(conditions, [int(kind) for kind in Manoeuvre][:-1], int(Manoeuvre.STRAIGHT))

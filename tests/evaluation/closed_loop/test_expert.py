@@ -17,7 +17,7 @@ from asp_env.evaluation.closed_loop.episodes import (
 )
 from asp_env.metrics.driving.rules import NUPLAN, RULES, Rules
 from asp_env.metrics.driving.scores import driving_metrics
-from asp_env.metrics.lanes import covering
+from asp_env.metrics.lanes import covering_lanes
 from asp_env.planning.planner import load_planner
 from asp_env.sim.world import Ending
 from predictors.physical import ConstantVelocity
@@ -97,7 +97,7 @@ def test_a_missing_lanelet_is_not_charged_to_the_expert() -> None:
     recording = recordings[0]
     road_map = recording.road_map
     positions = np.concatenate([recording.track(i)[::25, :2] for i in range(len(recording))])
-    busiest = int(covering(road_map, positions).sum(axis=0).argmax())
+    busiest = int(covering_lanes(road_map, positions).sum(axis=0).argmax())
     with_gap = replace(recording, road_map=without_lane(road_map, busiest))
     driven, metrics = drive_expert([with_gap], NUPLAN, scenarios)
     for name in ("on road", "direction", "right way", "no at-fault collision", "progress"):

@@ -1,4 +1,4 @@
-"""Derivatives of known motions, and each comfort bound from either side."""
+"""Derivatives of known motions, and each comfort bound from both sides."""
 
 from collections.abc import Callable
 
@@ -12,11 +12,11 @@ from asp_env.metrics.driving.comfort import comfortable, slope, window_ticks
 DT_S = 0.2
 Values = float | np.ndarray
 TIMES_S = np.arange(-2, 3) * DT_S
-"""One window: derivatives at its five ticks are exact for parabolas."""
+"""One window; derivatives at its five ticks are exact for parabolas."""
 
 
 def is_comfortable(speed_mps: Values, heading_rad: Values, *, ticks: int = 5) -> bool | None:
-    """The verdict on a motion, None where there is none."""
+    """Whether a motion is comfortable; None where this is missing."""
     states = np.zeros((ticks, 4))
     states[:, 2], states[:, 3] = heading_rad, speed_mps
     metric = comfortable(states, DT_S, np.ones((), dtype=bool))
@@ -28,10 +28,10 @@ def is_comfortable(speed_mps: Values, heading_rad: Values, *, ticks: int = 5) ->
     dt_s=st.sampled_from([0.04, 0.1, 0.2, 0.5]),
     ticks=st.integers(25, 40),
 )
-def test_slope_of_parabolas(
+def test_slope_is_exact_for_parabolas(
     coefficients: tuple[float, float, float], dt_s: float, ticks: int
 ) -> None:
-    """Of c + bt + at² it is b + 2at at every tick, the ends included."""
+    """The slope of c + bt + at² is b + 2at at every tick, including the ends."""
     c, b, a = coefficients
     t = np.arange(ticks) * dt_s
     rows = np.stack([c + b * t + a * t**2, 0 * t])
@@ -47,21 +47,21 @@ def test_slope_of_parabolas(
     ],
 )
 def test_window(dt_s: float, ticks: int) -> None:
-    """Odd, the most ticks with 1 s at most from first to last, and never fewer than five."""
+    """The largest odd number of ticks within 1 s, and at least five."""
     assert window_ticks(dt_s) == ticks
 
 
-@pytest.mark.parametrize(("bump_mps", "verdict"), [(0.1, True), (8.4, True), (9.0, False)])
-def test_one_wrong_tick_is_smoothed_over_a_second(bump_mps: float, verdict: bool) -> None:
+@pytest.mark.parametrize(("bump_mps", "expected"), [(0.1, True), (8.4, True), (9.0, False)])
+def test_one_outlier_is_smoothed_over_one_second(bump_mps: float, expected: bool) -> None:
     """At 25 Hz the window is 25 ticks, k = -12 … 12 with Σk² = 1300; slope weights k/(1300 dt).
 
-    One tick's error b makes a jerk of b/(1300 dt²) = 0.481 b: 4.04 or 4.33 m/s³, the bound is 4.13.
-    Over five ticks it would be b/(10 dt²), 6.25 m/s³ for 0.1 m/s.
+    An error b at one tick causes a jerk of b/(1300 dt²) = 0.481 b: 4.04 or 4.33 m/s³; the bound is
+    4.13. Over five ticks it would be b/(10 dt²), 6.25 m/s³ for 0.1 m/s.
     """
     states = np.zeros((100, 4))
     states[:, 3] = 10.0
     states[50, 3] += bump_mps
-    assert bool(comfortable(states, 0.04, np.ones((), dtype=bool)).value) is verdict
+    assert bool(comfortable(states, 0.04, np.ones((), dtype=bool)).value) is expected
 
 
 def test_slope_by_hand() -> None:
@@ -87,7 +87,7 @@ BOUNDS: dict[str, tuple[Callable[[float], tuple[Values, Values]], float, float]]
     # 10 m/s times the yaw acceleration
     "jerk sideways": (lambda a: (10.0, 0.5 * a * TIMES_S**2), 0.836, 0.838),
 }
-"""A motion, a value within its bound, and one beyond it; all other bounds hold with room."""
+"""A motion, a value within its bound and one beyond it; all other bounds hold by a margin."""
 
 
 @pytest.mark.parametrize("bound", BOUNDS)
@@ -99,23 +99,23 @@ def test_bounds(bound: str) -> None:
 
 
 def test_jerk_of_both_axes() -> None:
-    """4.0 m/s³ ahead and 7.3 m/s³ sideways are 8.32 m/s³ together; with 7.5 they are 8.5."""
+    """4.0 m/s³ ahead and 7.3 m/s³ sideways add up to 8.32 m/s³; with 7.5 to 8.5 m/s³."""
     ahead = 80 + 0.5 * 4.0 * TIMES_S**2
-    for sideways, verdict in ((7.3, True), (7.5, False)):
-        # the speed stays within 0.5 % of 80 m/s, so the sideways jerk too of what is said
+    for sideways, expected in ((7.3, True), (7.5, False)):
+        # the speed is within 0.5 % of 80 m/s, and so is the sideways jerk of the given one
         heading = 0.5 * sideways / 80 * TIMES_S**2
-        assert is_comfortable(ahead, heading) is verdict
+        assert is_comfortable(ahead, heading) is expected
 
 
-def test_the_wrap_is_no_turn() -> None:
-    """A heading that goes from π to -π turns no more than any other."""
+def test_headings_are_unwrapped() -> None:
+    """A step from π to -π is no turn."""
     heading = (np.pi + 0.3 * TIMES_S + np.pi) % (2 * np.pi) - np.pi
     assert np.ptp(heading) > 6
     assert is_comfortable(5.0, heading) is True
 
 
 def test_one_bad_tick_is_enough() -> None:
-    """A second of braking in a minute of rest is found."""
+    """One second of braking in 12 s of steady motion is detected."""
     speed = np.full(60, 15.0)
     speed[30:] -= np.minimum(np.arange(30), 5) * 1.2
     assert is_comfortable(np.full(60, 15.0), 0.0, ticks=60) is True
@@ -123,16 +123,15 @@ def test_one_bad_tick_is_enough() -> None:
 
 
 @pytest.mark.parametrize("ticks", [0, 1, 4])
-def test_too_short(ticks: int) -> None:
-    """Under one window, five ticks of 0.2 s or eleven of 0.1 s, there is no verdict."""
+def test_motions_shorter_than_one_window_are_missing(ticks: int) -> None:
+    """One window is five ticks of 0.2 s or eleven of 0.1 s."""
     assert is_comfortable(5.0, 0.0, ticks=ticks) is None
     states, mask = np.zeros((ticks + 6, 4)), np.ones((), dtype=bool)
     assert not comfortable(states, 0.1, mask).valid
     assert comfortable(np.zeros((11, 4)), 0.1, mask).valid
 
 
-def test_the_mask_is_kept() -> None:
-    """Motions that the caller calls too short have no verdict either."""
+def test_the_given_mask_is_returned() -> None:
     states = np.zeros((2, 3, 8, 4))
     mask = np.array([(True, False, True), (False, True, True)])
     metric = comfortable(states, DT_S, mask)

@@ -1,4 +1,4 @@
-"""Probabilities of modes against numbers worked out by hand, and laws."""
+"""Calibration metrics against numbers derived by hand, and laws."""
 
 import math
 
@@ -21,7 +21,7 @@ LOG_2PI = math.log(2 * math.pi)
 
 
 def nll(ends: list[tuple[float, float]], probabilities: list[float]) -> float:
-    """Of one target that ends at the origin."""
+    """The NLL of one target that ends at the origin."""
     found = mixture_nll(np.array([ends]), np.log([probabilities]), ORIGIN, KNOWN)
     assert found.valid.all()
     return float(found.value[0])
@@ -40,7 +40,7 @@ def nll(ends: list[tuple[float, float]], probabilities: list[float]) -> float:
     ids=["right", "5 m off", "a quarter right", "all 1 m off", "half right", "300 m off"],
 )
 def test_nll(ends: list[tuple[float, float]], probabilities: list[float], expected: float) -> None:
-    """-log of the density of Gaussians of 1 m, without underflow far away."""
+    """-log of the density of Gaussians of 1 m, without underflow far from them."""
     assert nll(ends, probabilities) == pytest.approx(expected)
 
 
@@ -54,15 +54,14 @@ def test_nll_is_a_density() -> None:
     assert np.exp(-found.value).sum() * 0.25**2 == pytest.approx(1, abs=1e-6)
 
 
-def test_nearest() -> None:
-    """One mode, or equal shares of those that are equally near."""
+def test_nearest_modes_share_ties() -> None:
     ends = np.array([[(3.0, 0.0), (0.0, 1.0), (0.0, 2.0)], [(1.0, 0.0), (0.0, 1.0), (5.0, 5.0)]])
     expected = [[0, 1, 0], [0.5, 0.5, 0]]
     assert nearest_modes(ends, np.zeros((2, 2))).tolist() == expected
 
 
 def test_brier() -> None:
-    """0.7² + (0.2 - 1)² + 0.1² = 1.14; sure and right 0; sure and wrong 2."""
+    """0.7² + (0.2 - 1)² + 0.1² = 1.14; certain and right 0; certain and wrong 2."""
     probabilities = np.array([[0.7, 0.2, 0.1], [1.0, 0.0, 0.0], [1.0, 0.0, 0.0]])
     nearest = np.array([[0.0, 1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])
     with np.errstate(divide="ignore"):
@@ -71,27 +70,25 @@ def test_brier() -> None:
     assert found.valid.all()
 
 
-def test_a_single_mode_has_no_brier() -> None:
-    """It is always sure and always the nearest."""
+def test_brier_is_missing_for_a_single_mode() -> None:
     assert not brier(np.zeros((4, 1)), np.ones((4, 1)), np.ones(4, dtype=bool)).valid.any()
 
 
-def test_unknown_ends() -> None:
-    """Nothing is said where the end of the truth is not known."""
+def test_metrics_are_missing_where_the_true_end_is_unknown() -> None:
     unknown = np.zeros(1, dtype=bool)
     assert not mixture_nll(np.zeros((1, 2, 2)), np.log([[0.5, 0.5]]), ORIGIN, unknown).valid.any()
     assert not brier(np.log([[0.5, 0.5]]), np.array([[1.0, 0.0]]), unknown).valid.any()
 
 
 def ece(probabilities: np.ndarray, nearest: np.ndarray) -> float:
-    """Of all targets together."""
+    """The calibration error of all targets together."""
     return float(calibration_error(calibration_sums(probabilities, nearest).sum(axis=0)))
 
 
 def test_ece_by_hand() -> None:
-    """Twice (0.85, 0.15), once right: both bins are 0.35 off.
+    """Two targets with (0.85, 0.15), one of them right: both bins are off by 0.35.
 
-    A third target with (0.5, 0.5) is off by (1 - 1) / 2 = 0 in its bin, and has a third of the
+    A third target with (0.5, 0.5) is off by (1 - 1) / 2 = 0 in its bin and has a third of the
     weight: 0.35 · 4 / 6.
     """
     probabilities = np.array([(0.85, 0.15), (0.85, 0.15)])
@@ -102,20 +99,19 @@ def test_ece_by_hand() -> None:
 
 
 @pytest.mark.parametrize(("right", "expected"), [(1.0, 0.0), (0.0, 1.0)])
-def test_ece_of_the_sure(right: float, expected: float) -> None:
-    """Sure and right 0, sure and wrong 1; a probability of 1 has a bin."""
+def test_ece_of_certain_forecasts(right: float, expected: float) -> None:
+    """Certain and right 0, certain and wrong 1; the last bin contains the probability 1."""
     assert ece(np.array([[1.0, 0.0]]), np.array([[right, 1 - right]])) == expected
 
 
-def test_no_modes_no_error() -> None:
-    """NaN in a resample without targets, without a warning."""
+def test_ece_without_modes_is_nan_without_a_warning() -> None:
     assert math.isnan(ece(np.zeros((0, 3)), np.zeros((0, 3))))
 
 
-def test_ece_of_who_says_what_happens() -> None:
-    """20,000 targets whose nearest mode is drawn with the probabilities said: under 0.01.
+def test_ece_of_calibrated_and_overconfident_forecasts() -> None:
+    """20,000 targets whose nearest mode is drawn with the forecast probabilities: under 0.01.
 
-    Said twice as sharp as drawn, it is over 0.1.
+    With sharper probabilities than those drawn with it is over 0.1.
     """
     rng = np.random.default_rng(0)
     probabilities = rng.dirichlet([1.0, 1.0, 1.0], size=20_000)
@@ -128,7 +124,7 @@ def test_ece_of_who_says_what_happens() -> None:
 
 @given(seed=st.integers(0, 10**6), count=st.integers(1, 30), modes=st.integers(1, 6))
 def test_bounds(seed: int, count: int, modes: int) -> None:
-    """ECE lies within [0, 1], Brier within [0, 2]; the order of modes does not matter."""
+    """ECE is within [0, 1] and Brier within [0, 2], regardless of the order of modes."""
     rng = np.random.default_rng(seed)
     probabilities = rng.dirichlet(np.full(modes, 0.3), size=count) * (1 - 1e-9) + 1e-12
     ends = rng.normal(size=(count, modes, 2))

@@ -1,4 +1,4 @@
-"""What targets do, from made-up drives whose manoeuvre is plain."""
+"""Manoeuvres of targets, from synthetic motions."""
 
 import numpy as np
 import pytest
@@ -12,13 +12,13 @@ NOW, DT_S, LENGTH_M = 15, 0.2, np.array(4.5)
 
 
 def drive(speed_mps: float, *phases: tuple[float, float]) -> np.ndarray:
-    """31 states; each phase is (acceleration m/s², yaw rate rad/s) for as long as the others."""
+    """31 states; the phases (acceleration m/s², yaw rate rad/s) are equally long."""
     parts = [np.tile(phase, (30 // len(phases), 1)) for phase in phases]
     acceleration, yaw_rate = np.concatenate(parts).T
     speed = np.maximum(speed_mps + np.cumsum(acceleration) * DT_S, 0)
     heading = np.cumsum(yaw_rate) * DT_S
-    way = np.cumsum(np.stack([np.cos(heading), np.sin(heading)]) * speed * DT_S, axis=1)
-    after = np.stack([*way, heading, speed], axis=-1)
+    xy = np.cumsum(np.stack([np.cos(heading), np.sin(heading)]) * speed * DT_S, axis=1)
+    after = np.stack([*xy, heading, speed], axis=-1)
     return np.concatenate([[(0.0, 0.0, 0.0, speed_mps)], after])
 
 
@@ -45,19 +45,17 @@ RATE = np.radians(40) / 6.0
         (drive(8.0, (0, 8 * RATE)), Manoeuvre.LEFT),
     ],
     ids=[
-        *("stands", "creeps 1.8 m", "creeps 2.7 m", "moves off", "moves off into a turn", "halts"),
-        *("turns, then halts", "brakes to 3 m/s", "left", "right", "left before now"),
-        *("there and back", "28°", "320° round a roundabout"),
+        *("stands", "creeps 1.8 m", "creeps 2.7 m", "starts", "starts into a turn", "stops"),
+        *("turns, then stops", "brakes to 3 m/s", "left", "right", "left before now"),
+        *("turns and turns back", "28°", "320° on a roundabout"),
     ],
 )
-def test_by_hand(states: np.ndarray, expected: Manoeuvre) -> None:
-    """One drive, one manoeuvre."""
+def test_manoeuvres_by_hand(states: np.ndarray, expected: Manoeuvre) -> None:
     known = np.ones((1, len(states)), dtype=bool)
     assert manoeuvres(states[None], known, now=NOW) == [expected]
 
 
-def test_what_is_not_known_does_not_count() -> None:
-    """Zeros at unknown ticks are neither a stop nor a turn."""
+def test_unknown_ticks_are_neither_a_stop_nor_a_turn() -> None:
     states = drive(8.0, (0, 0))
     states[:, 2] = 2.0
     known = np.ones((1, len(states)), dtype=bool)
@@ -66,8 +64,7 @@ def test_what_is_not_known_does_not_count() -> None:
 
 
 @given(seed=st.integers(0, 10**6))
-def test_everybody_has_one(seed: int) -> None:
-    """Exactly one each; those who stand are all but the moving; left mirrored is right."""
+def test_standing_is_the_complement_of_moving_and_left_mirrors_right(seed: int) -> None:
     rng = np.random.default_rng(seed)
     count = 50
     actions = np.stack(

@@ -9,7 +9,6 @@ import torch
 from safetensors.torch import load_file, save_file
 
 from asp_env.errors import AspEnvError, CheckpointError
-from asp_env.views.draw import pack_bits
 from predictors.models.encoders import (
     RasterEncoder,
     ResNet18,
@@ -139,7 +138,7 @@ def test_small_encoder_distinguishes_positions() -> None:
 def test_unpacking_inverts_packing(width: int) -> None:
     """Rasters of 0 and 255 become 0 and 1, also if the last byte is not full."""
     rasters = np.random.default_rng(width).choice(np.array([0, 255], np.uint8), (2, 3, 4, width))
-    packed = torch.from_numpy(pack_bits(rasters))
+    packed = torch.from_numpy(np.packbits(rasters, axis=-1))
     assert torch.equal(unpack_bits(packed, width), torch.from_numpy(rasters // 255))
 
 
@@ -152,7 +151,7 @@ def test_packed_rasters_have_the_same_features() -> None:
     unpacked.load_state_dict(bits.state_dict())
     rasters = np.random.default_rng(0).choice(np.array([0, 255], np.uint8), (3, 2, 12, 20))
     with torch.no_grad():
-        one = bits(torch.from_numpy(pack_bits(rasters)))
+        one = bits(torch.from_numpy(np.packbits(rasters, axis=-1)))
         other = unpacked(torch.from_numpy(rasters))
     torch.testing.assert_close(one, other, atol=1e-5, rtol=1e-4)
 

@@ -80,7 +80,7 @@ def test_reads_what_the_view_draws() -> None:
     encoder = make_encoder(view.shape)
     with torch.inference_mode():
         one, other = (
-            encoder(VectorTensors(*map(torch.from_numpy, view.draw(busy_scene(seed)))))
+            encoder(VectorTensors(*map(torch.from_numpy, view.render(busy_scene(seed)))))
             for seed in (0, 1)
         )
     assert one.shape == (5, 7)

@@ -11,8 +11,7 @@ from asp_env.data.classes import AgentClass
 from asp_env.data.snippets import gather_future, gather_present, gather_scene, index_snippets
 from asp_env.dynamics import inverse
 from asp_env.errors import AspEnvError
-from asp_env.views import make_picture_view
-from asp_env.views.draw import pack_bits
+from asp_env.views import make_raster_view
 from predictors.training import data as training_data
 from predictors.training.data import (
     Batches,
@@ -27,7 +26,7 @@ EAST = Drive(kind=AgentClass.CAR, start=(-50.0, 2.0, 0.0, 10.0))
 WAITING = Drive(kind=AgentClass.CAR, start=(20.0, -2.0, 0.0, 0.0), appears_s=0.4)
 """Stands all the time, but is absent in the first frame, so it is not parked."""
 
-SMALL = make_picture_view("chauffeurnet", pixels=(36, 24))
+SMALL = make_raster_view("chauffeurnet", pixels=(36, 24))
 
 
 @given(
@@ -155,7 +154,7 @@ def test_batches_hold_every_snippet_in_order() -> None:
     assert [len(batch.actions) for batch, _ in samples] == [4, 4, 2]
     scene = gather_scene(recordings, chosen)
     packed = np.concatenate([np.asarray(batch.observation) for batch, _ in samples])
-    np.testing.assert_array_equal(packed, pack_bits(SMALL.draw(scene)))
+    np.testing.assert_array_equal(packed, np.packbits(SMALL.render(scene), axis=-1))
     actions = np.concatenate([batch.actions.numpy() for batch, _ in samples])
     index = (scene.targets[:, 0], scene.targets[:, 1])
     np.testing.assert_array_equal(actions, scene.actions[index])

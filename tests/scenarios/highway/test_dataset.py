@@ -186,7 +186,7 @@ def test_an_environment_reports_damage(short, tmp_path, harm):
     shutil.copytree(short, tmp_path / "copy")
     harm(tmp_path / "copy" / "hidden" / "00_hidden.npz")
     env = make(f"highway:{tmp_path / 'copy'}")
-    with pytest.raises(DataError, match=r"00_hidden\.npz (is damaged|does not tell of)"):
+    with pytest.raises(DataError, match=r"00_hidden\.npz (is damaged|does not describe)"):
         env.reset(seed=0)
 
 
@@ -199,7 +199,7 @@ def test_the_history_of_another_recording_is_refused(tmp_path):
     (hidden / "aside").rename(hidden / "01_hidden.npz")
     env = make(f"highway:{tmp_path / 'copy'}")
     with pytest.raises(
-        DataError, match=r"^\S+00_hidden.npz does not tell of the vehicles in [^\n]+$"
+        DataError, match=r"^\S+00_hidden.npz does not describe the vehicles in [^\n]+$"
     ):
         env.reset(options={"scenario": 0})
 

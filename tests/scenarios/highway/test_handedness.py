@@ -11,7 +11,7 @@ from asp_env.dynamics import forward, inverse, normalize_actions
 from asp_env.dynamics.bicycle import AXLE_SHARE_OF_LENGTH
 from asp_env.geometry import to_frame, wrap_angle
 from asp_env.sim.world import world_class
-from asp_env.views import make_picture_view
+from asp_env.views import make_raster_view
 from scenarios.highway.road_map import mirror_actions, mirror_states
 from scenarios.highway.rounds import hidden_path, load_history
 from scenarios.highway.sites import network
@@ -130,7 +130,7 @@ def test_an_observed_vehicle_turns_the_same_way(tag, side):
     simulation = simulate(
         highway_recordings("intersection"), scenario, "own", world_class("highway:")
     )
-    view, steering, heading, trail = make_picture_view("chauffeurnet"), [], [], []
+    view, steering, heading, trail = make_raster_view("chauffeurnet"), [], [], []
     for _ in range(scenario.length):
         scene = simulation.world.scene()
         slot = int(np.flatnonzero(scene.ids[0] == turner.ego_id)[0])
@@ -138,7 +138,7 @@ def test_an_observed_vehicle_turns_the_same_way(tag, side):
             break
         steering.append(scene.actions[0, slot, -1, 1])
         heading.append(scene.states[0, slot, -1, 2])
-        picture = view.draw(scene.with_targets(np.array([[0, slot]])))[0]
+        picture = view.render(scene.with_targets(np.array([[0, slot]])))[0]
         trail.append(_side(picture[TRAIL]))
         replay(simulation, 1)
     turned = np.unwrap(heading)
@@ -172,7 +172,7 @@ def test_steering_turns_the_body_that_other_vehicles_see(side):
     # seen by a target in whose raster the front of the ego is in range
     others = scene.targets[:, 1]
     nearest = others[np.argmin(np.hypot(*(scene.states[0, others, -1, :2] - state[:2]).T))]
-    picture = make_picture_view("chauffeurnet", pixels=(720, 480)).draw(
+    picture = make_raster_view("chauffeurnet", pixels=(720, 480)).render(
         scene.with_targets(np.array([[0, nearest]]))
     )[0, -1]
     for turn, shown in ((state[2], True), (2 * first[2] - state[2], False)):

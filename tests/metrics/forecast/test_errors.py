@@ -1,4 +1,4 @@
-"""Errors of forecasts against values worked out on paper."""
+"""Errors of forecasts against values derived by hand."""
 
 import math
 
@@ -11,7 +11,6 @@ from asp_env.errors import AspEnvError
 from asp_env.metrics.forecast.errors import (
     SELECTIONS,
     Selection,
-    displacement,
     errors_over_time,
     inconsistency,
     moving,
@@ -34,13 +33,13 @@ def errors_of(
 
 
 def values(errors: dict[str, Masked]) -> dict[str, float]:
-    """The values of one target, all of which must be valid."""
+    """The values of one target, which must all be valid."""
     assert all(metric.valid.all() for metric in errors.values())
     return {name: float(metric.value[0]) for name, metric in errors.items()}
 
 
 def test_stationary() -> None:
-    """Standing still where 1, 2, 3, 4 m would have been right.
+    """A standing forecast where 1, 2, 3, 4 m is right.
 
     MAE (1+2+3+4)/8, MSE (1+4+9+16)/8, ADE 10/4, FDE 4, which is over 2 m.
     """
@@ -49,8 +48,7 @@ def test_stationary() -> None:
     )
 
 
-def test_straight() -> None:
-    """A forecast that comes true has no error."""
+def test_perfect_forecast_has_no_error() -> None:
     assert values(errors_of(ALONG_X)) == dict.fromkeys(NAMES, 0.0)
 
 
@@ -66,8 +64,7 @@ def test_diagonal() -> None:
 
 
 @pytest.mark.parametrize("known", [(True, False, True, True), (False,) * 4])
-def test_masked(known: tuple[bool, ...]) -> None:
-    """With one tick unknown, or all of them, there is no error to speak of."""
+def test_errors_are_missing_with_an_unknown_tick(known: tuple[bool, ...]) -> None:
     errors = errors_of(ALONG_X, known=known)
     assert set(errors) == NAMES
     assert not any(metric.valid.any() for metric in errors.values())
@@ -75,13 +72,13 @@ def test_masked(known: tuple[bool, ...]) -> None:
 
 @pytest.mark.parametrize(("end_m", "miss"), [(1.99, 0.0), (2.0, 0.0), (2.01, 1.0)])
 def test_miss(end_m: float, miss: float) -> None:
-    """A miss is over 2 m, not 2 m."""
+    """A miss is over 2 m."""
     off = np.array([(0.0, 0.0)] * 3 + [(0.0, end_m)])
     assert values(errors_of(off, 0 * ALONG_X))["miss"] == miss
 
 
 FOUR_MODES = ALONG_X + np.array([(0, 3), (0, 2), (0, 1), (0, 0)])[:, None]
-"""Off by 3, 2, 1, 0 m throughout, the right one being the least probable."""
+"""Off by 3, 2, 1, 0 m at all ticks; the right mode is the least probable."""
 
 FOUR_PROBABILITIES = np.array([0.4, 0.3, 0.2, 0.1])
 
@@ -91,7 +88,7 @@ FOUR_PROBABILITIES = np.array([0.4, 0.3, 0.2, 0.1])
     [("most-probable", 0, 3.0, 3 + 0.6**2), ("best-of-3", 2, 1.0, 1 + 0.8**2)],
 )
 def test_selection(selection: Selection, mode: int, ade: float, brier: float) -> None:
-    """Best of 3 is the third of four modes: the fourth is right but not among the three."""
+    """Best of 3 is the third of four modes: the fourth is right but not among the most probable."""
     log_probs, truth = np.log(FOUR_PROBABILITIES)[None], ALONG_X[None]
     assert select_mode(FOUR_MODES[None], log_probs, truth, selection) == [mode]
     known = np.ones((1, 4), dtype=bool)
@@ -101,7 +98,7 @@ def test_selection(selection: Selection, mode: int, ade: float, brier: float) ->
 
 
 def test_best_by_final_error() -> None:
-    """A mode off by 1 m until it ends right beats one that is right until it ends 1 m off."""
+    """A mode that is off by 1 m but ends right is better than one that only ends 1 m off."""
     ends_right, ends_wrong = ALONG_X.copy(), ALONG_X.copy()
     ends_right[:3, 1] = 1
     ends_wrong[3, 1] = 1
@@ -115,22 +112,22 @@ def test_best_by_final_error() -> None:
 
 
 def test_best_by_mean_error() -> None:
-    """The rule is passed on: by ADE the mode that ends wrong is the best, by FDE the other."""
+    """By ADE the mode that ends wrong is the best, by FDE the other."""
     ends_right, ends_wrong = ALONG_X.copy(), ALONG_X.copy()
     ends_right[:3, 1] = 1
     ends_wrong[3, 1] = 1
-    told = (np.stack([ends_right, ends_wrong])[None], np.log([[0.5, 0.5]]), ALONG_X[None])
+    forecast = (np.stack([ends_right, ends_wrong])[None], np.log([[0.5, 0.5]]), ALONG_X[None])
     known = np.ones((1, 4), bool)
-    found = values(open_loop_errors(*told, known, "best-of-3", "ade"))
+    found = values(open_loop_errors(*forecast, known, "best-of-3", "ade"))
     assert (found["ADE"], found["FDE"]) == (0.25, 1.0)
-    over_time = errors_over_time(*told, known, "best-of-3", "ade", dt_s=0.25)
+    over_time = errors_over_time(*forecast, known, "best-of-3", "ade", dt_s=0.25)
     assert over_time["L2@1s"].value.tolist() == [1.0]
 
 
 def test_inconsistency() -> None:
-    """Forecasts of 4 ticks made one tick apart share 3: off by 0, 1 and 2 m at those, mean 1.
+    """Forecasts of 4 ticks made one tick apart share 3, off by 0, 1 and 2 m, mean 1.
 
-    The earlier one says 2, 3, 4 m for what the later one calls its ticks 1, 2 and 3.
+    The earlier one is at 2, 3 and 4 m at the ticks 1, 2 and 3 of the later one.
     """
     later = np.array([(2.0, 0.0), (3.0, 1.0), (4.0, 2.0), (9.0, 9.0)])
     pair = np.stack([ALONG_X] * 2), np.stack([later] * 2)
@@ -140,30 +137,23 @@ def test_inconsistency() -> None:
     assert not inconsistency(*pair, np.array([True, True]), apart=4).valid.any()
 
 
-def test_equals() -> None:
-    """Of equally probable modes the first counts as the most probable."""
+def test_of_equally_probable_modes_the_first_is_the_most_probable() -> None:
     log_probs = np.log([[0.25, 0.25, 0.25, 0.25]])
     modes, truth = FOUR_MODES[None], ALONG_X[None]
     assert select_mode(modes, log_probs, truth, "most-probable") == [0]
     assert select_mode(modes, log_probs, truth, "best-of-3") == [2]
 
 
-def test_displacement() -> None:
-    """Modes 3, 2, 1 and 0 m to the side are that far away at every tick."""
-    expected = np.repeat([[[3.0], [2.0], [1.0], [0.0]]], 4, axis=2)
-    np.testing.assert_allclose(displacement(FOUR_MODES[None], ALONG_X[None]), expected)
-
-
 @pytest.mark.parametrize("selection", SELECTIONS)
 @given(
     seed=st.integers(0, 10**6), turn=st.floats(-4, 4), shift=st.tuples(*[st.floats(-99, 99)] * 2)
 )
-def test_invariance(
+def test_errors_do_not_depend_on_order_and_pose(
     selection: Selection, seed: int, turn: float, shift: tuple[float, float]
 ) -> None:
-    """Neither the order of modes nor that of targets matters, nor where the scene lies.
+    """The order of modes and of targets and the pose of the scene do not matter.
 
-    Turning the scene changes what is measured along its axes, so MAE alone is left out there.
+    MAE is measured along the axes and therefore changes if the scene is rotated.
     """
     rng = np.random.default_rng(seed)
     modes, truth = rng.normal(size=(6, 5, 7, 2)), rng.normal(size=(6, 7, 2))
@@ -187,7 +177,7 @@ def test_invariance(
 
 
 @pytest.mark.parametrize(
-    ("speed", "way_m", "known", "expected"),
+    ("speed", "distance_m", "known", "expected"),
     [
         (0.0, 0.0, True, False),
         (1.0, 0.0, True, False),
@@ -198,10 +188,10 @@ def test_invariance(
         (0.0, 2.01, False, False),
     ],
 )
-def test_moving(speed: float, way_m: float, known: bool, expected: bool) -> None:
-    """Over 1 m/s either way, or over 2 m away from now at a tick that is known."""
+def test_moving(speed: float, distance_m: float, known: bool, expected: bool) -> None:
+    """Over 1 m/s in either direction, or over 2 m away at a known tick."""
     now = np.array([(5.0, 5.0, 0.3, speed)])
-    truth = np.array([[(5.0, 5.0), (5.0, 5.0 + way_m)]])
+    truth = np.array([[(5.0, 5.0), (5.0, 5.0 + distance_m)]])
     assert moving(now, truth, np.array([[True, known]])) == [expected]
 
 
@@ -217,7 +207,7 @@ def test_moving(speed: float, way_m: float, known: bool, expected: bool) -> None
     ],
 )
 def test_errors_over_time(dt_s: float, ticks: int, expected: dict[int, int]) -> None:
-    """The error at tick k is k metres; only seconds that are whole ticks are told.
+    """The error at tick k is k metres; seconds that are no whole number of ticks are left out.
 
     The truth is known up to the tick before the last.
     """
@@ -231,8 +221,7 @@ def test_errors_over_time(dt_s: float, ticks: int, expected: dict[int, int]) -> 
         assert found[f"L2@{second}s"].valid.tolist() == [tick < ticks]
 
 
-def test_nobody() -> None:
-    """Of no targets there are no errors."""
+def test_without_targets_errors_are_empty() -> None:
     errors = open_loop_errors(
         np.zeros((0, 3, 4, 2)), np.zeros((0, 3)), np.zeros((0, 4, 2)), np.zeros((0, 4), bool),
         "best-of-3",
@@ -240,8 +229,7 @@ def test_nobody() -> None:
     assert all(metric.value.shape == (0,) for metric in errors.values())
 
 
-def test_valid_values_are_finite() -> None:
-    """A value that is not finite is refused where it is valid, and only there."""
+def test_only_valid_values_must_be_finite() -> None:
     value = np.array([1.0, math.nan])
     Masked(value=value, valid=np.array([True, False]))
     with pytest.raises(AspEnvError, match="not finite"):

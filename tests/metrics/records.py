@@ -1,4 +1,4 @@
-"""Drives composed by hand, a tick at a time."""
+"""Records of episodes composed by hand, tick by tick."""
 
 import dataclasses
 import math
@@ -8,18 +8,18 @@ import numpy as np
 from asp_env.metrics.boxes import Contact
 from asp_env.metrics.driving.map_context import MapContext
 from asp_env.metrics.driving.rules import STRICT, Rules
-from asp_env.metrics.driving.scores import Drives, driving_metrics
+from asp_env.metrics.driving.scores import EpisodeRecord, driving_metrics
 from asp_env.metrics.masked import Masked
 
 TICKS = 8
 DT_S = 0.2
 
 
-def drive(*, active: int = TICKS, dt_s: float = DT_S, **changes: object) -> Drives:
-    """One episode at 5 m/s that is perfect but for its progress of 40 m out of 50 m.
+def record(*, active: int = TICKS, dt_s: float = DT_S, **changes: object) -> EpisodeRecord:
+    """One episode at 5 m/s that is perfect except for its progress of 40 m out of 50 m.
 
-    Fields of `Drives` and `MapContext` are given as values for all ticks, or as arrays; `limit_mps` is
-    `None` where none is known, and `against_m` where the map has no lanes.
+    Fields of `EpisodeRecord` and `MapContext` are given as one value for all ticks or as arrays.
+    `limit_mps` is `None` without a speed limit, `against_m` on maps without lanes.
     """
     states = np.zeros((1, TICKS, 4))
     states[0, :, 0] = np.arange(TICKS)
@@ -46,50 +46,50 @@ def drive(*, active: int = TICKS, dt_s: float = DT_S, **changes: object) -> Driv
         if change is not None:
             fields[name] = np.broadcast_to(np.asarray(change), fields[name].shape)
     limited = np.isfinite(fields["limit_mps"]) & known["limit_mps"]
-    on_map = MapContext(
+    context = MapContext(
         outside_m=fields.pop("outside_m"),
         several_lanes=fields.pop("several_lanes"),
         at_crossing=fields.pop("at_crossing"),
-        against_traffic=Masked(value=fields.pop("against_m"), valid=no | known["against_m"]),
-        limits=Masked(value=np.where(limited, fields.pop("limit_mps"), 0), valid=limited),
+        against_traffic_m=Masked(value=fields.pop("against_m"), valid=no | known["against_m"]),
+        speed_limits_mps=Masked(value=np.where(limited, fields.pop("limit_mps"), 0), valid=limited),
         distance_to_route_lanes_m=fields.pop("distance_to_route_lanes_m"),
     )
-    lasts = np.arange(TICKS)[None] < active
-    return Drives(**fields, on_map=on_map, active=lasts, dt_s=dt_s)
+    is_active = np.arange(TICKS)[None] < active
+    return EpisodeRecord(**fields, map_context=context, active=is_active, dt_s=dt_s)
 
 
 def at_tick(tick: int, value: float, otherwise: float = 0.0) -> np.ndarray:
-    """(1, ticks) with one value at one tick."""
+    """(1, ticks) with one value at one tick and another elsewhere."""
     return np.where(np.arange(TICKS) == tick, value, otherwise)[None]
 
 
 def contact(tick: int, kind: Contact) -> np.ndarray:
     """(1, ticks, 3) with one contact at one tick, with the third agent."""
-    found = np.zeros((1, TICKS, 3), dtype=np.int8)
-    found[0, tick, 2] = kind
-    return found
+    contacts = np.zeros((1, TICKS, 3), dtype=np.int8)
+    contacts[0, tick, 2] = kind
+    return contacts
 
 
-def values(drives: Drives, preset: Rules = STRICT) -> dict[str, float]:
+def values(episodes: EpisodeRecord, rules: Rules = STRICT) -> dict[str, float]:
     """The metrics of one episode; NaN where missing."""
     return {
         name: float(metric.value[0]) if metric.valid[0] else math.nan
-        for name, metric in driving_metrics(drives, preset).items()
+        for name, metric in driving_metrics(episodes, rules).items()
     }
 
 
-def joined(episodes: list[Drives]) -> Drives:
-    """Several drives side by side."""
+def joined(episodes: list[EpisodeRecord]) -> EpisodeRecord:
+    """Several episodes as one batch."""
 
-    def side_by_side(kind: type, parts: list) -> dict:
-        found = {}
+    def batched(kind: type, parts: list) -> dict:
+        fields = {}
         for field in dataclasses.fields(kind):
             values = [getattr(part, field.name) for part in parts]
             if isinstance(values[0], MapContext | Masked):
-                found[field.name] = type(values[0])(**side_by_side(type(values[0]), values))
+                fields[field.name] = type(values[0])(**batched(type(values[0]), values))
             else:
-                whole = isinstance(values[0], float)
-                found[field.name] = values[0] if whole else np.concatenate(values)
-        return found
+                is_scalar = isinstance(values[0], float)
+                fields[field.name] = values[0] if is_scalar else np.concatenate(values)
+        return fields
 
-    return Drives(**side_by_side(Drives, episodes))
+    return EpisodeRecord(**batched(EpisodeRecord, episodes))

@@ -1,4 +1,4 @@
-"""Filled areas: which pixels belong to rings."""
+"""Filled areas and the segments of lines."""
 
 import math
 from collections.abc import Sequence
@@ -9,26 +9,27 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from asp_env.views.map_layers import drivable_rings, fill_rings
-from asp_env.views.view import View, place
+from asp_env.data.road_map import LineType, MapCache
+from asp_env.views.map_layers import drivable_rings, fill_rings, line_segments
+from asp_env.views.raster import Viewport, place_targets
 from tests.views.scenes import make_map, make_scene, standing
 
 HEIGHT, WIDTH = 20, 30
-VIEW = View(
+VIEWPORT = Viewport(
     height_px=HEIGHT, width_px=WIDTH, metres_per_pixel=1.0, anchor_row_px=20.0, anchor_column_px=0.0
 )
-"""Around who stands at the origin and looks north, x are columns and 20 - y are rows."""
+"""Around an agent at the origin that heads north, columns are x and rows are 20 - y."""
 
 Ring = Sequence[tuple[float, float]]
 
 
 def fill(*rings: Ring) -> np.ndarray:
-    """Which pixels rings of (column, row) set."""
+    """Mask of the pixels that rings of (column, row) set."""
     turned = [[(column, HEIGHT - row) for column, row in ring] for ring in rings]
     road_map = make_map(drivable=turned)
     scene = make_scene(standing([(0.0, 0.0, 0.5 * math.pi)]), maps=(road_map,))
     out = np.full((1, 3, HEIGHT, WIDTH), 77, dtype=np.uint8)
-    placed = place(scene, VIEW, history=0, who="a test")
+    placed = place_targets(scene, VIEWPORT, history=0, view_name="a test")
     fill_rings(drivable_rings(road_map), 0, placed, 5, out)
     assert set(np.unique(out[0, 0])) <= {0, 5}
     assert (out[0, 1:] == 77).all()
@@ -36,7 +37,7 @@ def fill(*rings: Ring) -> np.ndarray:
 
 
 def around(column: float, row: float, radii: Sequence[float], turn: float) -> Ring:
-    """A star of points about a centre, at equal angles."""
+    """A star of points around a centre, at equal angles."""
     angles = [turn + 2 * math.pi * i / len(radii) for i in range(len(radii))]
     return [
         (column + r * math.cos(a), row + r * math.sin(a))
@@ -54,21 +55,21 @@ STARS = st.builds(
 
 
 def test_rectangle_by_hand() -> None:
-    """Columns 3.2 to 7.2 and rows 4.8 to 6.8 hold the middles of 4 by 2 pixels."""
+    """Columns 3.2 to 7.2 and rows 4.8 to 6.8 contain the centres of 4 by 2 pixels."""
     expected = np.zeros((HEIGHT, WIDTH), dtype=bool)
     expected[5:7, 3:7] = True
     np.testing.assert_array_equal(fill([(3.2, 4.8), (7.2, 4.8), (7.2, 6.8), (3.2, 6.8)]), expected)
 
 
 def test_triangle_by_hand() -> None:
-    """Below the diagonal of the 4 by 4 pixels that it cuts: rows of 0, 1, 2 and 3, of 0.5 left."""
+    """The diagonal of 4 by 4 pixels leaves 0, 1, 2 and 3 pixel centres in its rows."""
     drawn = fill([(10, 2.1), (10, 6.1), (14, 6.1)])
     assert drawn.sum(axis=1)[2:6].tolist() == [0, 1, 2, 3]
     assert drawn[5].nonzero()[0].tolist() == [10, 11, 12]
 
 
-def test_a_notch_is_left_out() -> None:
-    """A ring that runs back into itself like a U is two legs and a floor."""
+def test_a_concave_ring_leaves_its_notch_out() -> None:
+    """A U-shaped ring consists of two legs and a floor."""
     ring = [(2, 2), (4, 2), (4, 8), (8, 8), (8, 2), (10, 2), (10, 10), (2, 10)]
     expected = np.zeros((HEIGHT, WIDTH), dtype=bool)
     expected[2:10, 2:10] = True
@@ -78,18 +79,16 @@ def test_a_notch_is_left_out() -> None:
 
 @pytest.mark.parametrize("ring", [[(3, 3), (9, 9)], [(3, 3)], [(3, 5), (9, 5), (6, 5)]])
 def test_rings_without_an_inside_are_empty(ring: Ring) -> None:
-    """Points and lines are no area."""
     assert not fill(ring).any()
 
 
-def test_no_rings_are_an_empty_picture() -> None:
-    """A map without a drivable area is cleared all the same."""
+def test_without_rings_the_raster_is_cleared() -> None:
     assert not fill().any()
 
 
 @given(ring=STARS)
-def test_pixels_whose_middle_lies_inside(ring: Ring) -> None:
-    """As OpenCV decides for each point, but for those on the edge; what is outside is cut."""
+def test_pixels_whose_centre_is_inside_are_set(ring: Ring) -> None:
+    """As OpenCV decides for each pixel centre that is not on the edge."""
     contour = np.array(ring, dtype=np.float32)
     depth = np.array(
         [
@@ -102,8 +101,7 @@ def test_pixels_whose_middle_lies_inside(ring: Ring) -> None:
 
 
 @given(rings=st.lists(STARS, max_size=4))
-def test_several_rings_are_their_union(rings: list[Ring]) -> None:
-    """Whether they overlap or not, and in any order."""
+def test_several_rings_fill_their_union_in_any_order(rings: list[Ring]) -> None:
     expected = np.zeros((HEIGHT, WIDTH), dtype=bool)
     for ring in rings:
         expected |= fill(ring)
@@ -116,12 +114,55 @@ def test_several_rings_are_their_union(rings: list[Ring]) -> None:
     turn=st.floats(-3, 3),
     centre=st.tuples(st.floats(0, WIDTH), st.floats(0, HEIGHT)),
 )
-def test_neighbours_share_no_pixel_and_leave_none_out(
+def test_adjacent_rings_share_no_pixel_and_leave_none_out(
     radii: list[float], turn: float, centre: tuple[float, float]
 ) -> None:
-    """A star cut into triangles at its centre: together the star, each pixel in one of them."""
+    """Of a star cut into triangles at its centre, each pixel belongs to exactly one triangle."""
     ring = around(*centre, radii, turn)
     parts = [
         fill([centre, one, other]) for one, other in zip(ring, [*ring[1:], ring[0]], strict=True)
     ]
     np.testing.assert_array_equal(np.sum(parts, axis=0), fill(ring).astype(int))
+
+
+def test_segments_by_hand() -> None:
+    """An L of 6 m and 8 m is two segments: middles, directions and half lengths."""
+    road_map = make_map([(LineType.CURB, [(0, 0), (6, 0), (6, 8)])])
+    expected = [[3, 0, 1, 0, 3], [6, 4, 0, 1, 4]]
+    np.testing.assert_allclose(line_segments(road_map), expected, atol=1e-12)
+
+
+def test_straight_lines_become_one_segment() -> None:
+    """Points 1 m apart on a slope of 3 to 4, at most 2 cm off, are one segment of 50 m."""
+    at = np.arange(51.0)
+    wobble = 0.02 * np.sin(at) * np.sin(math.pi * at / 50)
+    points = np.stack([0.8 * at - 0.6 * wobble, 0.6 * at + 0.8 * wobble], axis=1)
+    segments = line_segments(make_map([(LineType.SOLID, points.tolist())]))
+    np.testing.assert_allclose(segments, [[20, 15, 0.8, 0.6, 25]], atol=1e-12)
+
+
+def test_closed_lines_remain_closed() -> None:
+    """The segments of a closed circle of 10 m radius remain within 5 cm of the circle."""
+    angle = np.linspace(0, 2 * math.pi, 361)
+    points = 10 * np.stack([np.cos(angle), np.sin(angle)], axis=1)
+    points[-1] = points[0]
+    segments = line_segments(make_map([(LineType.CURB, points.tolist())]))
+    assert 2 * segments[:, 4].sum() > 2 * math.pi * 10 * 0.99
+    assert (np.hypot(segments[:, 0], segments[:, 1]) > 9.95).all()
+    assert len(segments) < 90
+
+
+def test_repeated_and_single_points_are_left_out() -> None:
+    lines = [(LineType.CURB, [(1, 1)]), (LineType.CURB, [(2, 2), (2, 2), (5, 2), (5, 2)])]
+    segments = line_segments(make_map(lines))
+    np.testing.assert_allclose(segments, [[3.5, 2, 1, 0, 1.5]])
+
+
+def test_segments_are_cached_by_map() -> None:
+    cache = MapCache(line_segments, 2)
+    maps = [make_map([(LineType.CURB, [(0, 0), (i, 1)])]) for i in range(4)]
+    first = cache(maps[0])
+    assert cache(maps[0]) is first
+    for road_map in maps:
+        np.testing.assert_array_equal(cache(road_map), line_segments(road_map))
+    assert cache(maps[0]) is not first
