@@ -129,7 +129,7 @@ def test_files_that_are_no_rollouts_are_errors(drives, tmp_path, capsys):
     """A missing file, another file, a truncated one among good ones, a folder without any."""
     assert "No such file" in error(capsys, tmp_path / "none.npz")
     (tmp_path / "words.txt").write_text("words")
-    assert "not a rollout" in error(capsys, tmp_path / "words.txt")
+    assert "not a readable rollout" in error(capsys, tmp_path / "words.txt")
     assert "no rollouts (.npz) below it" in error(capsys, tmp_path)
     shutil.copytree(drives, tmp_path / "copy")
     damaged = one(tmp_path / "copy")
