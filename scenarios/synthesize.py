@@ -6,6 +6,7 @@
 
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Annotated
 
 import tyro
 
@@ -25,10 +26,10 @@ class Samples:
     """Generate the sample recordings that ship with `asp_env`.
 
     Attributes:
-        out: folder to create.
+        out: Folder to create.
     """
 
-    out: tyro.conf.Positional[Path]
+    out: Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="OUT")]
 
     def run(self) -> None:
         """Writes one folder per site: one recording of two minutes with compressed tracks."""
@@ -49,19 +50,19 @@ class Synthesize:
     """Generate traffic with SUMO or highway-env, in the inD layout.
 
     Attributes:
-        out: folder to create.
-        site: `intersection` (crossroads and T-junctions) or `roundabout` (one and two lanes) of
-            SUMO, `highway:intersection` or `highway:roundabout` of highway-env.
-        recordings: number of recordings.
-        minutes: length of each recording.
-        seed: the same seed gives the same bytes.
-        noise: add measurement errors and smooth them as in drone datasets; true tracks go to
-            `truth/`.
-        locations: number of locations; by default one for every three recordings. A site of
+        out: Folder to create.
+        site: Site of SUMO, `intersection` (crossroads and T-junctions) or `roundabout` (one and
+            two lanes), or of highway-env, `highway:intersection` or `highway:roundabout`.
+        recordings: Number of recordings.
+        minutes: Length of each recording in minutes.
+        seed: Seed of the generator; the same seed gives the same bytes.
+        noise: Add measurement errors and smooth them as in drone datasets. The true tracks are
+            written to `truth/`.
+        locations: Number of locations; by default one for every three recordings. A site of
             highway-env has a single location.
     """
 
-    out: tyro.conf.Positional[Path]
+    out: Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="OUT")]
     site: str = "intersection"
     recordings: int = 10
     minutes: float = 10.0

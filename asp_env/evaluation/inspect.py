@@ -102,7 +102,7 @@ class Inspect:
     """Show the recordings, maps, snippets, scenarios and faults of DATA."""
 
     data: Annotated[tyro.conf.Positional[str], tyro.conf.arg(metavar="DATA")]
-    """Folder in the inD/rounD or INTERACTION layout, sample:SITE or synthetic:SITE."""
+    """Folder in the inD/rounD or INTERACTION layout, or sample:…, synthetic:… or highway:…."""
     dt: float = DEFAULT_DT_S
     """Duration of a tick in seconds; a whole number of frames."""
 

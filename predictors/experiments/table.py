@@ -53,27 +53,28 @@ class Table:
     out: Path
     """Folder of the runs, errors and tables."""
     validation: tuple[str, ...] = ()
-    """Data to select on, one for each DATA. Then all of DATA is trained on."""
+    """Validation data, one for each DATA. All of DATA is then used for training."""
     test: tuple[str, ...] = ()
-    """Data to evaluate on, one for each DATA. The default is the part test of DATA."""
+    """Test data, one for each DATA. The default is the part test of DATA."""
     recipe: str = "cpu"
-    """Training recipe: cpu (minutes on two cores) or paper."""
+    """Recipe of the predictors: cpu (minutes on two cores) or paper."""
     views: tuple[str, ...] = ("chauffeurnet", "vectors")
     """Views of the networks."""
     predictors: tuple[str, ...] = ("mtp", "dkm", "ffw-asp", "ssp-asp")
-    """Predictors, such as ssp-asp, or ssp-asp:ours with another recipe."""
+    """Predictors such as ssp-asp; ssp-asp:ours is one with another recipe."""
     horizons: tuple[float, ...] = (3.0, 6.0)
     """Horizons in seconds. Runs of ssp-asp over 3 s start from the 3 s weights of the same seed."""
     seeds: tuple[int, ...] = (0, 1, 2)
     """Training seeds."""
     ablations: tuple[str, ...] = ("none",)
-    """Variants of the recipes at the first site: none, all, or
-    names such as no-trail or ssp-asp:skip."""
+    """Variants of the recipes at the first site: none, all,
+    or names such as no-trail or ssp-asp:skip."""
     ablation_view: str = "chauffeurnet"
     """View of the ablations."""
     jobs: int = 2
-    """Number of cells that run at a time, with one thread each.
-    0 prints the finished ones, even while another command runs."""
+    """Number of cells that run at a time, with one thread
+    each. With 0, the command only prints the finished
+    cells, even while another command runs."""
     per_recording: int | None = None
     """Largest number of test snippets of each recording; they are chosen at random."""
     epochs: int | None = None

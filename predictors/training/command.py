@@ -15,32 +15,36 @@ from asp_env.errors import MissingExtraError
 class Train:
     """Train a predictor; an interrupted run resumes after its last complete epoch."""
 
-    predictor: Annotated[str, tyro.conf.Positional]
-    """Predictor to train, such as ffw-asp."""
-    data: Annotated[str, tyro.conf.Positional]
-    """A folder of recordings, or a source such as synthetic:intersection."""
+    predictor: Annotated[tyro.conf.Positional[str], tyro.conf.arg(metavar="PREDICTOR")]
+    """Predictor to train: mtp, dkm, ffw-asp or ssp-asp."""
+    data: Annotated[tyro.conf.Positional[str], tyro.conf.arg(metavar="DATA")]
+    """Folder in the inD/rounD or INTERACTION layout, or sample:…, synthetic:… or highway:…."""
     out: Path
     """Folder of the run."""
     recipe: str = "cpu"
-    """Recipe: cpu (the paper's structure, minutes on two cores), ours (more accurate at the same
-    size) or paper (the paper's size and schedule)."""
+    """Recipe: cpu (the paper's structure, minutes on two
+    cores), ours (more accurate at the same size) or paper
+    (the paper's size and schedule)."""
     variant: str | None = None
     """Variant of the recipe by name, such as no-trail, for ablations."""
     view: str = "chauffeurnet"
     """View that the network observes: chauffeurnet, mtp or vectors."""
     horizon: float = 3.0
-    """Horizon of the forecasts, seconds. Above 3 s, ssp-asp and the variant staged of the others
-    start from a run for 3 s in OUT/3s."""
+    """Horizon of the forecasts in seconds. Above 3 s, ssp-asp
+    and the variant staged of the others start from a run for
+    3 s in OUT/3s."""
     start: Path | None = None
     """A finished run to start from, or a safetensors file of ResNet18 weights."""
     validation: str | None = None
-    """Separate validation data; all of DATA is trained on then."""
+    """Separate validation data. All of DATA is then used for training."""
     history: Literal["recorded", "causal"] = "recorded"
-    """Histories as recorded, or filtered again without later frames."""
+    """Histories that the network observes: as recorded
+    (smoothed with later frames), or filtered again without
+    later frames."""
     split: Literal["recording", "blocks"] = "recording"
     """What is held out: whole recordings, or blocks of time within each."""
     epochs: int | None = None
-    """Number of epochs instead of the recipe's; of each stage if there are two."""
+    """Number of epochs instead of the recipe's; with two stages, the number for each."""
     seed: int = 0
     """Seed of the initial weights and of the order of the data."""
     max_snippets: int | None = None
@@ -49,17 +53,20 @@ class Train:
     precision: Literal["32-true", "bf16-mixed"] | None = None
     """Precision of the encoder instead of the recipe's; the rest is always float32."""
     devices: int | Literal["auto"] = 1
-    """Processes on each node, with a GPU each if there are GPUs; auto is one per GPU. They share
+    """Number of processes on each node, with a GPU each if
+    there are GPUs; auto is one per GPU. The processes share
     every batch."""
     nodes: int = 1
-    """Number of machines. The same command is started on each, with OUT and DATA in folders that
-    all of them see, and with MASTER_ADDR, MASTER_PORT and NODE_RANK set, or by torchrun."""
+    """Number of machines. The same command is started on each,
+    with OUT and DATA in folders that all of them see, and
+    with MASTER_ADDR, MASTER_PORT and NODE_RANK set, or by
+    torchrun."""
     strategy: Literal["auto", "ddp"] = "auto"
     """Strategy of distributed training; ddp forces it even for a single process."""
     compile: bool = False
-    """Compile the encoder with torch.compile: tens of seconds at first, faster later."""
+    """Compile the encoder with torch.compile, which takes tens of seconds at the start."""
     num_workers: int = 0
-    """Processes for data loading of each device, where one thread is too slow for a GPU."""
+    """Number of processes that load data for each device. With 0, a thread loads it."""
 
     def run(self) -> None:
         """Trains.

@@ -46,7 +46,7 @@ class Bench:
     data: Annotated[tyro.conf.Positional[str], tyro.conf.arg(metavar="DATA")] = (
         "sample:intersection"
     )
-    """DATA to rasterize and to simulate."""
+    """Recordings to rasterize and to simulate, named as for asp-env drive."""
     episodes: int = 256
     """Number of episodes that are simulated together."""
     agents: int = 64
@@ -54,7 +54,7 @@ class Bench:
     envs: int = 64
     """Number of environments in a batch."""
     sections: Annotated[tuple[str, ...], tyro.conf.arg(metavar="SECTION …")] = SECTIONS
-    """What to measure."""
+    """Sections of the benchmark to run."""
     predictors: Annotated[tuple[str, ...], tyro.conf.arg(metavar="NAME[:RUN] …")] = ()
     """Predictors whose latency is measured for 1, 16 and 64 agents, beside constant velocity."""
 

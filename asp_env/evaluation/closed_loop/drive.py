@@ -69,13 +69,14 @@ class Drive:
     """Tags and comparisons, such as 'left,!stopping,length>=8',
     or the scenarios.json of another run. The default is all."""
     max_scenarios: int | None = None
-    """Largest number of scenarios; evenly spaced ones are chosen."""
+    """Largest number of scenarios; they are chosen at even spacing."""
     horizon: float = 3.0
     """Horizon of forecasts and plans in seconds."""
     dt: float = DEFAULT_DT_S
     """Duration of a tick in seconds."""
     part: PartChoice = "auto"
-    """Part of DATA; auto is all that no predictor was trained or selected on."""
+    """Part of DATA; auto is all of it that no predictor was
+    trained or selected on."""
     rules: str = DEFAULT_RULES
     """Driving rules that define the metrics: nuplan, pdms, waymax or strict."""
     jobs: int = 1

@@ -21,7 +21,7 @@ from asp_env.render.window import PlayerState, play
 
 SAME_PLACE_M = 1.0
 """Largest distance between the first position of a logged ego in its rollout and in DATA. Chosen by
-hand: it tells recordings of the same name apart."""
+hand: it distinguishes recordings of the same name."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -45,7 +45,7 @@ class Watch:
     speed: float = 1.0
     """Playback speed: seconds of the episode per second."""
     data: str | None = None
-    """DATA that was driven on, if it has been moved since."""
+    """DATA of the drive, if it has been moved since."""
 
     def run(self) -> None:
         """Plays the rollouts, writes the video, or prints the list.

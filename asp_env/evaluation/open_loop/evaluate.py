@@ -66,7 +66,8 @@ class Evaluate:
     dt: float = DEFAULT_DT_S
     """Duration of a tick in seconds."""
     part: PartChoice = "auto"
-    """Part of DATA; auto is all that no predictor was trained or selected on."""
+    """Part of DATA; auto is all of it that no predictor was
+    trained or selected on."""
     history: Literal["recorded", "causal"] = "recorded"
     """Histories that predictors observe: as recorded (smoothed
     with later frames), or filtered again without later frames.
