@@ -1,7 +1,7 @@
 """PPO on small rasters, 12 channels of 90 by 60 pixels, with the ego's state and route.
 
-`python -m examples.train_ppo_raster` makes traffic of eight places, trains there for some minutes,
-and scores PPO, zero actions and random actions at other places.
+`python -m examples.train_ppo_raster` generates traffic of eight locations, trains there for
+some minutes, and scores PPO, zero actions and random actions at other locations.
 """
 
 import sys

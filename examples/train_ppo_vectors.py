@@ -1,7 +1,7 @@
 """PPO on vectors: the nearest agents, the ego's state and its route.
 
-`python -m examples.train_ppo_vectors` makes traffic of eight places, trains there for some minutes,
-and scores PPO, zero actions and random actions at other places.
+`python -m examples.train_ppo_vectors` generates traffic of eight locations, trains there for
+some minutes, and scores PPO, zero actions and random actions at other locations.
 """
 
 import sys

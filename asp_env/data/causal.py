@@ -201,7 +201,7 @@ def _measure(
 def _cached_states(recording: Recording) -> Float[np.ndarray, "rows 4"]:
     """The causal states, read-only, from the cache if they are there.
 
-    If the cache cannot be written, a warning says so and tracks are filtered every time.
+    If the cache cannot be written, there is a warning, and the tracks are filtered every time.
     """
     content = _digest(recording)
     stamp = [["causal", VERSION, content]]

@@ -1,4 +1,4 @@
-"""Recordings: the tracks measured at one place, and ticks as a whole number of their frames."""
+"""Recordings: the tracks measured at one location, and ticks as a whole number of their frames."""
 
 import math
 from dataclasses import dataclass
@@ -60,7 +60,7 @@ def ticks(duration_s: float, dt_s: float) -> int:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Background:
-    """An aerial image of the place, for display only."""
+    """An aerial image of the location, for display only."""
 
     path: Path
     metres_per_pixel: float
@@ -69,7 +69,7 @@ class Background:
 
 @dataclass(frozen=True, kw_only=True)
 class Recording:
-    """Tracks of agents at one place. The arrays are read-only and may be memory-mapped.
+    """Tracks of agents at one location. The arrays are read-only and may be memory-mapped.
 
     Rows are sorted by track, then frame. A track has a row for every frame from its first to its
     last, so that the row of a frame is `starts[track] + frame - first_frames[track]`.
@@ -78,7 +78,7 @@ class Recording:
     name: str
     """The recording's id in its files, such as `00`."""
     location: str
-    """The place where it was made, as named in its files."""
+    """Name of the location in the files."""
     frame_rate_hz: float
     num_frames: int
     speed_limit_mps: float | None

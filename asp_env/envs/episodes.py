@@ -300,7 +300,7 @@ class ReplayEpisodes:
         }
 
     def snapshot(self) -> Any:
-        """Returns the whole state for `restore`; it holds no recordings and no pictures."""
+        """Returns the whole state for `restore`; it holds no recordings and no rasters."""
         return self.simulation.snapshot()
 
     def restore(self, snapshot: Any) -> None:

@@ -25,7 +25,7 @@ class ReplayOptions:
 
     observations: Sequence[str] = ("raster", "actions", "state")
     """Components of the observation: some of `raster`, `vectors`, `actions`, `state`, `route` and
-    the names of views that draw pictures."""
+    the names of views that draw rasters."""
     view: str = "chauffeurnet"
     """The view that draws the `raster`."""
     raster_px: tuple[int, int] | None = None

@@ -396,7 +396,7 @@ all |
         return self.action_spaces[agent]
 
     def render(self) -> Any:
-        """Returns a picture of the whole place, uint8 (H, W, 3) RGB, or None without a mode."""
+        """Returns an image of the whole map, uint8 (H, W, 3) RGB, or None without a mode."""
         if self.render_mode is None:
             return None
         scene = self.scene((self.agents or self.possible_agents)[0])

@@ -78,13 +78,13 @@ class ReplayEnv(gymnasium.Env[dict[str, Any], Any]):
 
     | entry | shape | dtype | bounds | unit | content |
     |---|---|---|---|---|---|
-    | `raster` | (12, 360, 240) | uint8 | 0, 255 | | picture of `view`, heading up, in the \
+    | `raster` | (12, 360, 240) | uint8 | 0, 255 | | raster of `view`, heading up, in the \
 shape of the view and `raster_px` |
-    | `chauffeurnet` | (12, 360, 240) | uint8 | 0, 255 | | picture of this view |
-    | `mtp` | (3, 360, 360) | uint8 | 0, 255 | | picture of this view |
+    | `chauffeurnet` | (12, 360, 240) | uint8 | 0, 255 | | raster of this view |
+    | `mtp` | (3, 360, 360) | uint8 | 0, 255 | | raster of this view |
     | `actions` | (15, 2) | float32 | ±10, ±π/4 | m/s², rad | acceleration and steering, \
 inferred from the motion of the last 3 s, oldest first |
-    | `state` | (9,) | float32 | see below | | motion, place on the route, and size of the ego |
+    | `state` | (9,) | float32 | see below | | motion, position on the route, and size of the ego |
     | `route` | (30, 2) | float32 | ±1000 | m | points 2, 4, … 60 m ahead on the route, in a \
 straight line beyond its end |
     | `agents` | (16, 16, 12) | float32 | see below | | the ego and the nearest agents; \
@@ -166,7 +166,7 @@ each divided by 5 m/s² |
     |---|---|---|
     | `data` | `"sample:intersection"` | a folder in the inD/rounD or INTERACTION layout, \
 `sample:intersection`, `sample:roundabout`, `synthetic:…`, or `highway:…` with reacting traffic |
-    | `render_mode` | `None` | `rgb_array`: a picture of 80 m by 80 m from above; `human`: a \
+    | `render_mode` | `None` | `rgb_array`: an image of 80 m by 80 m from above; `human`: a \
 window that shows every tick (extra `render`) |
     | `observations` | `("raster", "actions", "state")` | components of the observation |
     | `view` | `"chauffeurnet"` | view that draws the `raster`, see `asp_env.views` |
@@ -330,10 +330,10 @@ table of drivers; `log` by default, `own` in a world with reacting traffic |
     def show(
         self, *, forecast: Forecast | None = None, plan: Shaped[np.ndarray, "..."] | None = None
     ) -> None:
-        """Sets the overlay of the pictures, until the next call or `reset`.
+        """Sets the overlay of the images, until the next call or `reset`.
 
         Args:
-            forecast: a forecast of `scene()`; later pictures show its remaining ticks.
+            forecast: a forecast of `scene()`; later images show its remaining ticks.
             plan: (steps, 2 or more) positions of the ego at the next ticks, x and y in metres.
 
         Raises:

@@ -93,16 +93,16 @@ class ReplayVecEnv(VecEnv):
         self.envs.close()
 
     def get_images(self) -> Sequence[np.ndarray | None]:
-        """Returns a picture of each environment in mode `rgb_array`."""
+        """Returns an image of each environment in mode `rgb_array`."""
         if self.render_mode != "rgb_array":
             warnings.warn(
                 f"render mode {self.render_mode}: make the environment with "
-                "render_mode='rgb_array' to get pictures",
+                "render_mode='rgb_array' to get images",
                 stacklevel=2,
             )
             return [None] * self.num_envs
-        pictures: Any = self.envs.render()
-        return list(pictures)
+        images: Any = self.envs.render()
+        return list(images)
 
     def get_attr(self, attr_name: str, indices: VecEnvIndices = None) -> list[Any]:
         """Returns an attribute of each environment; all share one object for most attributes.
@@ -138,7 +138,7 @@ class ReplayVecEnv(VecEnv):
         indices: VecEnvIndices = None,
         **method_kwargs: Any,
     ) -> list[Any]:
-        """Returns the scene or the picture of each environment.
+        """Returns the scene or the image of each environment.
 
         Raises:
             AttributeError: the method is neither `scene` nor `render`, or has arguments.
@@ -149,8 +149,8 @@ class ReplayVecEnv(VecEnv):
         if method_name == "scene":
             scene: Scene = self._find_attribute("scene")()
             return [scene.situation(b) for b in rows]
-        pictures: Any = self.envs.render()
-        return [None if pictures is None else pictures[b] for b in rows]
+        images: Any = self.envs.render()
+        return [None if images is None else images[b] for b in rows]
 
     def env_is_wrapped(
         self, wrapper_class: type[gymnasium.Wrapper], indices: VecEnvIndices = None

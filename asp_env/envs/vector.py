@@ -29,7 +29,7 @@ Infos = dict[str, Any]
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class VectorSnapshot:
-    """The whole state of a vector environment; a pickle holds no recordings and no pictures."""
+    """The whole state of a vector environment; a pickle holds no recordings and no rasters."""
 
     episodes: Any
     generators: tuple[Mapping[str, Any], ...]
@@ -230,7 +230,7 @@ class ReplayVectorEnv(VectorEnv[Observation, Any, np.ndarray]):
         return recorded_future(self._episodes.simulation.world, scene, horizon)
 
     def render(self) -> tuple[Any, ...] | None:
-        """Returns the picture of each environment, see `ReplayEnv.render`; None without a mode.
+        """Returns the image of each environment, see `ReplayEnv.render`; None without a mode.
 
         Raises:
             gymnasium.error.ResetNeeded: an episode has not begun.

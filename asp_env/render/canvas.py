@@ -1,4 +1,4 @@
-"""An image with a place in the world: subpixel drawing in metres, y up, and translucent lines."""
+"""An image that covers an area of the world: subpixel drawing in metres, y up, translucent lines."""
 
 from dataclasses import dataclass
 from typing import no_type_check

@@ -1,4 +1,4 @@
-"""Observations: pictures, vectors, action history, state and route, in any combination.
+"""Observations: rasters, vectors, action history, state and route, in any combination.
 
 An `Observer` consists of one `ObservationComponent` per name; each writes one or several arrays.
 They read an `ObservationContext`: the last ticks of some episodes from the view of their egos.
@@ -162,7 +162,7 @@ class ObservationComponent(Protocol):
 
 @final
 class RasterComponent:
-    """The picture of a view: uint8 (channels, height, width)."""
+    """The raster of a view: uint8 (channels, height, width)."""
 
     def __init__(self, name: str, view: RasterView) -> None:
         self._name, self._view = name, view
@@ -170,7 +170,7 @@ class RasterComponent:
         self.spaces: Spaces = {name: spaces.Box(0, 255, view.shape, dtype=np.uint8)}
 
     def write(self, context: ObservationContext, events: Events, out: Observation) -> None:
-        """Draws the pictures."""
+        """Draws the rasters."""
         del events
         self._view.render(context, out[self._name])
 
@@ -225,7 +225,7 @@ class ActionsComponent:
 
 @final
 class StateComponent:
-    """The ego's motion and its place on its route: float32, the fields of `STATE_FIELDS`."""
+    """The ego's motion and its position on its route: float32, the fields of `STATE_FIELDS`."""
 
     history = 1
 

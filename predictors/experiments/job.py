@@ -46,7 +46,7 @@ class EvaluationJob:
     data_hash: str
     """Hash of the content of the data."""
     chainings: tuple[str, ...] = ()
-    """Ways of chaining segments that are evaluated besides the predictor's own, if it chains."""
+    """Rules for chaining segments that are evaluated besides the predictor's own, if it chains."""
 
     @property
     def stamp(self) -> str:

@@ -34,7 +34,7 @@ from predictors.experiments.tables import PAGE_WIDTH, export, read_findings, row
 from predictors.training.command import Train
 
 CHAININGS = ("top1", ORACLE)
-"""Ways of chaining segments that are evaluated besides a predictor's own."""
+"""Rules for chaining segments that are evaluated besides a predictor's own."""
 
 PLAN, LOCK = "plan.json", ".lock"
 

@@ -89,8 +89,8 @@ def save_trained(
         view: The view that it was trained on.
         weights: The network's state.
         temperature: Divisor of the logits.
-        provenance: What it was trained on (`trained_on`) and how (`config`, with its `preset` if it
-            has one); no times of day.
+        provenance: What it was trained on (`trained_on`) and how (`config`, with the recipe as
+            `preset`, if any); no times of day.
     """
     config = {
         "format": FORMAT,

@@ -174,7 +174,7 @@ def _limits(config: dict[str, Any]) -> Iterator[str]:
         f"{config['dt_s']:g} s; bicycles, pedestrians, animals and trailers are not forecast."
     )
     yield (
-        "- Trained on the places, traffic and sensors named above. Its errors elsewhere are "
+        "- Trained on the locations, traffic and sensors named above. Its errors elsewhere are "
         "unknown: evaluate it there first."
     )
     yield (

@@ -51,7 +51,7 @@ class TrainedPredictor:
             network: The trained network.
             view: The view that it was trained on.
             trained_on: The recordings that it was trained on.
-            metadata: Source of the training data, view, preset and hash of the weights.
+            metadata: Source of the training data, view, recipe and hash of the weights.
             temperature: Divisor of the logits, fitted on validation data.
             chaining: How segments are chained, for a network that chains any; with `oracle` the
                 predictor is privileged.
@@ -74,7 +74,7 @@ class TrainedPredictor:
 
     @property
     def metadata(self) -> Mapping[str, str]:
-        """Source of the training data, view, preset, and a hash of the weights."""
+        """Source of the training data, view, recipe, and a hash of the weights."""
         return self._metadata
 
     def predict(self, scene: Scene, future: Future | None = None) -> Forecast:

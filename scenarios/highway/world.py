@@ -189,7 +189,7 @@ class HighwayWorld(World):
                 self._add_arrivals(run, {int(self.episodes.tracks[b, slot]) for slot in away})
 
     def _add_arrivals(self, run: _Run, away: set[int]) -> None:
-        """Adds the vehicles recorded to appear at this frame, unless their place is occupied."""
+        """Adds the vehicles recorded to appear at this frame, unless their position is occupied."""
         arrivals = run.history.coming(run.frame)
         for row in arrivals[~np.isin(arrivals["track"], [*away])]:
             place = np.array([row["x"], row["y"]])

@@ -24,7 +24,7 @@ EVERY_FRAMES = 5
 """Overlaps are checked at every fifth frame, 5 Hz."""
 
 WARM_UP_S = 80.0
-"""Simulated before the recording starts, so that traffic fills the place by then."""
+"""Simulated before the recording starts, so that traffic fills the location by then."""
 
 _AFTER_S = 4.0
 
@@ -96,7 +96,7 @@ def overlapping(motions: dict[str, Motion], users: dict[str, RoadUser]) -> set[t
 def record(
     rng: np.random.Generator, place: Place, *, num_frames: int
 ) -> tuple[dict[str, Motion], dict[str, RoadUser]]:
-    """Simulates traffic at a place without overlapping agents.
+    """Simulates traffic at a location without overlapping agents.
 
     SUMO moves the front bumpers of vehicles along their lanes; the reconstructed boxes may still
     overlap. The agent of each such pair that departs later is removed and the same traffic is
@@ -104,7 +104,7 @@ def record(
 
     Args:
         rng: draws the demand and SUMO's seed.
-        place: the place.
+        place: the location.
         num_frames: length of the recording.
 
     Returns:
@@ -154,10 +154,10 @@ def tracks_in_view(
     num_frames: int,
     noise: np.random.Generator | None = None,
 ) -> list[Track]:
-    """The tracks that a camera above the place sees, in the order of appearance.
+    """The tracks that a camera above the location sees, in the order of appearance.
 
     Args:
-        place: the place.
+        place: the location.
         motions: of all agents, by name; frame 0 is the start of the simulation.
         users: class and size, by the same names.
         num_frames: length of the recording.

@@ -1,4 +1,4 @@
-"""A place: the roads of a site in a recording's frame, with its map and its background image."""
+"""A location: the roads of a site in a recording's frame, with its map and its background image."""
 
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -51,7 +51,7 @@ def draw(
     """Renders the background image: grass, pavements, kerbs, asphalt and markings.
 
     Args:
-        lanelets: of the place.
+        lanelets: of the location.
         corners: outlines of the pavement at junctions.
         parking: (lots, 4, 2) corners of parking lots, m.
         trees: (trees, 3) [x, y, radius], m.

@@ -46,7 +46,7 @@ CURB_TYPES = frozenset(
 
 FAR_M = 100_000.0
 """A map whose median node is farther than this from its recordings' origin belongs to another
-place. Chosen by hand."""
+location. Chosen by hand."""
 
 MEETS_WITHIN_M = 0.5
 """Two lanelets that share no nodes are connected if both corners of their ends are within this
@@ -227,7 +227,7 @@ def read_lanelet2(path: Path, origin: Origin) -> RoadMap:
         origin: the recording's frame.
 
     Raises:
-        DataError: the file is not a map, a map without lanelets, or one of another place.
+        DataError: the file is not a map, a map without lanelets, or lies at another location.
     """
     osm = read_osm(path)
     if not any(relation.tags.get("type") == "lanelet" for relation in osm.relations):

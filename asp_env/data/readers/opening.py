@@ -36,7 +36,7 @@ _MAP_COLUMNS = ("line_types", "successors", "two_way", "limits_mps", "limited")
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class ReaderState:
-    """Results shared by the recordings of one DATA: one map per place, and one search per folder.
+    """Results shared by the recordings of one DATA: a map per location and a search per folder.
 
     Keys of recordings are their names.
     """
@@ -183,7 +183,7 @@ def _cached(
 ) -> CacheEntry:
     """The result of `make`, from the cache if it is there and no source has changed since.
 
-    If the cache cannot be written, a warning says so and `make` is called every time.
+    If the cache cannot be written, there is a warning, and `make` is called every time.
     """
     current = cache.stamp(sources)
     try:

@@ -18,7 +18,7 @@ in either direction.
 `following`: at more than half of the ticks at which the ego drives at 0.5 m/s or more, there is a
     leader, and the gap to it is at most 3 s at the ego's speed, or at most 5 m.
 `yielding`: an agent enters the route from the side at most 20 m ahead of the ego's front, with no
-    leader in between, and the ego's front reaches that place up to 5 s after the agent was last on
+    leader in between, and the ego's front reaches that point up to 5 s after the agent was last on
     the route at an angle of at least 20° to it. Between 3 s before the agent entered and the ego's
     arrival, the ego is slowest no later than 1 s after the agent was last on the route. Its speed
     is then below 0.5 m/s or at most 0.6 of its highest speed in the 5 s before, and it arrives at
@@ -525,7 +525,7 @@ def _yields(speeds, arcs, place_m, entered, cleared, dt_s):
     Args:
         speeds: (ticks,) of the ego, m/s.
         arcs: (ticks,) arc length of the ego, m.
-        place_m: arc length of the ego's centre when its front is at the place of the crossing.
+        place_m: arc length of the ego's centre when its front is at the point of the crossing.
         entered: tick at which the agent enters the route.
         cleared: tick at which the agent is last on the route.
         dt_s: seconds per tick.

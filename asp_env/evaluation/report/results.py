@@ -327,7 +327,7 @@ METRIC_NOTES = {
         "On map",
         "%",
         "higher",
-        "As on road, but without the allowance for places where the recorded ego is outside.",
+        "As on road, but without the allowance for positions where the recorded ego is outside.",
     ),
     "progress": _note(
         "Progress",

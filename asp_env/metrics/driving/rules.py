@@ -1,4 +1,4 @@
-"""The rules by which drives are judged: named sets of thresholds and definitions."""
+"""The rules by which drives are evaluated: named sets of thresholds and definitions."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass

@@ -119,7 +119,7 @@ class IDMDriver(BaseDriver):
 
     A vehicle desires the highest speed of its track. It leaves at the end of its path; a vehicle
     whose track ends with it standing stops there, and leaves when the track has ended. A vehicle
-    appears where and when it was recorded, unless its place is blocked (`spawn_blocked`).
+    appears where and when it was recorded, unless its position is blocked (`spawn_blocked`).
     """
 
     name = "idm"
@@ -222,7 +222,7 @@ def _resized(progress: PathProgress, shape: tuple[int, ...]) -> PathProgress:
 
 
 def spawn_blocked(world: World, agent_mask: Bool[np.ndarray, "b a"]) -> Bool[np.ndarray, "b a"]:
-    """Mask of agents that would appear at the next tick, but whose recorded place is blocked.
+    """Mask of agents that would appear at the next tick, but whose recorded position is blocked.
 
     It is blocked if an agent is there, or if the vehicle could not stop behind a slower agent ahead
     with 5 m/s². Such a vehicle never appears: later its recorded positions are among the traffic.
@@ -417,7 +417,7 @@ class _Zone(NamedTuple):
     """Of the other agent, along its own path."""
     exit_o: float
     lead_o: float
-    """By how much the other agent's arc length is larger at the same place."""
+    """By how much the other agent's arc length is larger at the same point."""
     first: bool
     """Whether it is the agent's turn."""
 

@@ -43,7 +43,7 @@ PAIR_KEY_BASE = 2**31
 ENTRY_A, EXIT_A, ENTRY_B, EXIT_B, SAME_DIRECTION, LEAD_B, A_FIRST = range(7)
 """Columns of a zone of paths a < b: the arc lengths m of the vehicles' centres, on path a and on
 path b, between which their boxes can touch; whether the paths have the same direction at either
-end; by how much the arc length on b exceeds that on a at the same place, m; whether the track of a
+end; by how much the arc length on b exceeds that on a at the same point, m; whether the track of a
 enters first."""
 
 ZONE_COLUMNS = 7
