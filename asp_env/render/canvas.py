@@ -1,4 +1,4 @@
-"""An image that covers an area of the world: subpixel drawing in metres, y up, translucent lines."""
+"""An image that covers an area of the world: subpixel drawing in metres, and translucent lines."""
 
 from dataclasses import dataclass
 from typing import no_type_check

@@ -227,7 +227,7 @@ def read_lanelet2(path: Path, origin: Origin) -> RoadMap:
         origin: the recording's frame.
 
     Raises:
-        DataError: the file is not a map, a map without lanelets, or lies at another location.
+        DataError: the file is not a map, has no lanelets, or lies at another location.
     """
     osm = read_osm(path)
     if not any(relation.tags.get("type") == "lanelet" for relation in osm.relations):
