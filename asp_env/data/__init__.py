@@ -1,5 +1,6 @@
 """Data: recordings, road maps, scenarios, scenes, forecasts and rollouts."""
 
+from asp_env.data.causal import causal_histories
 from asp_env.data.classes import AgentClass
 from asp_env.data.predictor import (
     Forecast,
@@ -12,7 +13,12 @@ from asp_env.data.predictor import (
 from asp_env.data.recording import Recording
 from asp_env.data.road_map import RoadMap
 from asp_env.data.rollout import Rollout
-from asp_env.data.scenarios import Scenario, ScenarioFilter, ScenarioSet, find_scenarios
+from asp_env.data.scenarios import (
+    Scenario,
+    ScenarioFilter,
+    ScenarioSet,
+    find_scenarios,
+)
 from asp_env.data.scene import Scene
 from asp_env.data.snippets import Future, SnippetIndex, gather_future, gather_scene, index_snippets
 from asp_env.data.source import Recordings, open_data
@@ -34,6 +40,7 @@ __all__ = [
     "Scene",
     "SnippetIndex",
     "TrainedOn",
+    "causal_histories",
     "fill_missing",
     "find_scenarios",
     "gather_future",

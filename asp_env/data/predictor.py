@@ -87,7 +87,7 @@ class Predictor(Protocol):
 
     @property
     def metadata(self) -> Mapping[str, str]:
-        """Entries for tables and manifests: `trained_on`, `view`, `preset` (recipe) and `weights`."""
+        """Entries for tables and manifests: `trained_on`, `view`, `preset` (recipe), `weights`."""
         ...
 
     def predict(self, scene: Scene, future: Future | None = None) -> Forecast:

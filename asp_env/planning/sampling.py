@@ -44,7 +44,7 @@ MAX_CHANGE_MPS2 = 5.0
 """A larger step in acceleration costs no more than this one. Chosen by hand."""
 
 NO_CONTACT, EXCUSED = -1, -2
-"""In place of the step of a contact."""
+"""Values instead of the step of a contact: there is none, or it is not the ego's fault."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

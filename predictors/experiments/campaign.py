@@ -72,7 +72,7 @@ class Campaign:
     """
 
     def __init__(self, jobs: Mapping[Cell, Job], out: Path, console: Console) -> None:
-        """Runs nothing yet.
+        """Stores the jobs; `run` starts them.
 
         Args:
             jobs: the work of every cell; each cell comes after the one that it starts from.
@@ -136,7 +136,7 @@ class Campaign:
         return cell not in self._failed
 
     def _start(self, waiting: Sequence[Cell], processes: int) -> list[Cell]:
-        """Starts cells as far as possible; the cells that still wait."""
+        """Starts as many cells as possible and returns those that still wait."""
         left = []
         for cell in waiting:
             if cell.start is not None and cell.start in self._failed:
@@ -158,7 +158,7 @@ class Campaign:
         return _Running(pool=pool, result=result, log=log, start_s=time.monotonic())
 
     def _collect(self) -> list[Cell]:
-        """Waits until a cell has ended; all cells that have."""
+        """Waits until a cell has ended and returns all cells that have ended."""
         wait([running.result for running in self._running.values()], return_when=FIRST_COMPLETED)
         ended = [cell for cell, running in self._running.items() if running.result.done()]
         for cell in ended:

@@ -23,9 +23,10 @@ _GOLDEN = (np.sqrt(5.0) - 1) / 2
 def calibrate(network: AbstractNetwork, batches: Iterable[tuple[Batch, Labels]]) -> float:
     """Fits the temperatures of a network on validation data.
 
-    First the merging temperature, if the network merges chains, which it stores; then the
-    temperature of its forecasts. The network ends in evaluation, on the CPU. A GPU is used if there
-    is one: at full size a CPU would take longer than the training.
+    The merging temperature is fitted first, if the network merges chains, and stored in the
+    network; the temperature of its forecasts is fitted next. A GPU is used if there is one: at full
+    size a CPU would take longer than the training. Afterwards the network is on the CPU, in
+    evaluation mode.
 
     Args:
         network: The trained network.

@@ -36,7 +36,7 @@ class PretrainedWeights:
 
         Args:
             path: The folder or the file.
-            spec: The kind of predictor that starts.
+            spec: The kind of predictor that is trained.
             view: Its view.
             dt_s: Its time step.
 

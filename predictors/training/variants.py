@@ -78,7 +78,7 @@ def causal(config: TrainingConfig) -> TrainingConfig:
 
 
 def long(config: TrainingConfig) -> TrainingConfig:
-    """Trains three times the epochs."""
+    """Multiplies the number of epochs by three."""
     return dataclasses.replace(
         config, epochs=3 * config.epochs, pretraining_epochs=3 * config.pretraining_epochs
     )

@@ -137,7 +137,7 @@ class _Rows:
     track: Int[np.ndarray, " rows"]
     time_ms: Float[np.ndarray, " rows"]
     kind: Int[np.ndarray, " rows"]
-    """`AgentClass`."""
+    """`AgentClass` of the track."""
     positions: Float[np.ndarray, "rows 2"]
     heading: Float[np.ndarray, " rows"]
     """Radians; NaN where the file has none."""

@@ -115,7 +115,7 @@ class Osm:
 class _Lanelet:
     """A lanelet whose bounds run in its direction of travel, the left one on the left.
 
-    Its `start` and `end` are the left and the right corner there.
+    `start` and `end` are the left and the right corner at its two ends.
     """
 
     id: str

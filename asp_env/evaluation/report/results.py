@@ -54,7 +54,7 @@ class MethodResult:
     planner: str
     predictor: str
     details: tuple[str, ...] = ()
-    """Distinguish it from methods of the same name."""
+    """Texts that distinguish methods of the same name."""
     privileged: bool = False
     """Whether its planner or predictor is given the recorded future."""
 

@@ -27,7 +27,7 @@ HORIZON_S = 3.0
 """Horizon of predictors that can forecast any number of ticks, if the interval is not longer."""
 
 NO_FORECAST = -1
-"""In place of the tick of an agent's latest forecast."""
+"""Tick of the latest forecast of an agent without a forecast."""
 
 _USAGE = "expected predictor:[every=TICKS:][mode=sampled:]NAME[:RUN]"
 
