@@ -42,9 +42,9 @@ class Lanelet:
     """Consecutive sections; each starts at the end of the one before."""
     right: tuple[Border, ...]
     centre: Polyline | None = None
-    """None: midway between the sides."""
+    """Centre line; None for the middle between the sides."""
     speed_limit_mps: float | None = None
-    """Written in whole km/h; None: no limit is written."""
+    """Written in whole km/h; None for no limit."""
 
     @property
     def left_line(self) -> Polyline:

@@ -1,4 +1,4 @@
-"""Causal histories: the states that a tracker would know, from noisy measurements up to now.
+"""Causal histories: states that are estimated from noisy measurements up to the present frame.
 
 Recorded tracks are smoothed with look-ahead, so that a recorded state contains up to half a second
 of what follows. Here white noise (0.08 m, 1.5°) is added to each recorded position and heading, and

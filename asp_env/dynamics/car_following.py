@@ -49,11 +49,11 @@ class IDM:
     time_gap_s: float = 1.2
     standstill_gap_m: float = 2.0
     max_lateral_acceleration_mps2: float = 2.5
-    """Limits the speed in bends."""
+    """Lateral acceleration that limits the speed in bends."""
     look_ahead_s: float = 5.0
-    """The path is searched for a leader over the distance driven in this time,"""
+    """The path is searched for a leader over the distance driven in this time."""
     min_look_ahead_m: float = 15.0
-    """but at least over this distance."""
+    """Smallest distance over which the path is searched for a leader."""
 
     def as_row(self) -> Float[np.ndarray, " 6"]:
         """The parameters as kernels take them.

@@ -29,7 +29,7 @@ class Window:
     """
 
     def __init__(self, title: str, size_px: tuple[int, int]) -> None:
-        """Does not open the window.
+        """Creates a window that is not open yet.
 
         Args:
             title: Title of the window.

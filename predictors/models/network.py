@@ -51,9 +51,9 @@ class Features(NamedTuple):
     """Features at the end of the first segment, for diagnosis."""
 
     encoded: Float[Tensor, "n z"]
-    """Encoded from the inputs at that time."""
+    """Features encoded from the inputs at that time."""
     predicted: Float[Tensor, "n z"]
-    """Predicted from the inputs now."""
+    """Features predicted from the inputs at the present tick."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -65,12 +65,12 @@ class NetworkShape:
     packed: bool
     """Whether rasters are packed to bits."""
     history: int
-    """Past ticks."""
+    """Number of past ticks."""
     horizon: int
-    """Ticks ahead."""
+    """Number of ticks ahead."""
     dt_s: float
     action_range: tuple[float, float]
-    """Scale of actions (m/s², rad): outputs in [-1, 1] are multiplied by it. The normaliser."""
+    """Scale of actions (m/s², rad): outputs in [-1, 1] are multiplied by it. It is the normaliser."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -100,7 +100,7 @@ class NetworkConfig:
         self.check_positive("features", "modes")
 
     def check_positive(self, *fields: str) -> None:
-        """Refuses values below one.
+        """Checks that fields are at least one.
 
         Raises:
             AspEnvError: One of the fields is not positive.

@@ -8,9 +8,9 @@ features to the past actions (equation 13), and γ runs on the encoded and on th
 A forecast has only the predicted ones, so validation uses those. The loss is L_SSP (equation 20).
 Longer horizons chain segments, see `predictors.models.chaining`.
 
-Choices that the paper leaves open: the future observation is rendered in the target's pose at the end of
-the segment; features pass a LayerNorm before ψ and γ; a linear layer follows ψ, since features are
-unbounded; the loss is the mean over both branches and over the segments; a later segment is
+Choices that the paper leaves open: the future observation is rendered in the target's pose at the
+end of the segment; features pass a LayerNorm before ψ and γ; a linear layer follows ψ, since
+features are unbounded; the loss is the mean over both branches and over the segments; a later segment is
 predicted from what is available at inference, the predicted features and the actions of the matched
 mode.
 

@@ -81,7 +81,7 @@ ORIGIN_UTM_M = (294_000.0, 5_628_000.0)
 location, but lanelet2 maps are written in degrees."""
 
 ORIGIN_LAT_LON_DEG = (50.767140, 6.078601)
-"""The same in degrees."""
+"""`ORIGIN_UTM_M` as latitude and longitude in degrees."""
 
 
 def mirror_points(points: Float[np.ndarray, "*batch 2"]) -> Float[np.ndarray, "*batch 2"]:

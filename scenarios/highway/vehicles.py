@@ -52,7 +52,7 @@ class TrafficVehicle(IDMVehicle):
     """Whether the vehicle is controlled."""
 
     def __init__(self, *given: Any, **named: Any) -> None:
-        """As of `IDMVehicle`."""
+        """Creates a vehicle from the arguments of `IDMVehicle`."""
         super().__init__(*given, **named)
         self._coming: list[Pose] = []
         self._predicted: tuple[int, Any] = (-1, None)
@@ -147,7 +147,7 @@ class Network(RoadNetwork):
     """
 
     def __init__(self, given: RoadNetwork) -> None:
-        """The same lanes."""
+        """Copies the lanes of a network."""
         super().__init__()
         self.graph = given.graph
         self.indices: list[Any] = [*self.lanes_dict()]

@@ -89,7 +89,7 @@ class HighwayWorld(World):
         self._slots: list[dict[int, int]] = [{} for _ in range(num_episodes)]
         """Per episode, the slot of each track."""
         self._histories: dict[int, HiddenHistory] = {}
-        """By the number of the recording."""
+        """Internal states by the number of the recording."""
 
     def reset(
         self,

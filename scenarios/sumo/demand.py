@@ -49,7 +49,7 @@ class Demand:
     """All agents of a simulation."""
 
     users: dict[str, "RoadUser"]
-    """By name."""
+    """Agents by name."""
     entries: tuple[tuple[float, str, str], ...]
     """(departure s, name, XML element), by departure."""
 

@@ -38,7 +38,7 @@ class Motion:
     first_frame: int
     xy: Float[np.ndarray, "frames 2"]
     heading_rad: Float[np.ndarray, " frames"]
-    """Continuous: not wrapped."""
+    """Not wrapped: it may exceed π."""
 
 
 def gaussian(values: np.ndarray, sigma: float) -> np.ndarray:

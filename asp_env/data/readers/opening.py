@@ -181,7 +181,7 @@ def _map_entry(path: Path, origin: Origin) -> CacheEntry:
 def _cached(
     path: Path, sources: Sequence[Path], make: Callable[[], CacheEntry], salt: object
 ) -> CacheEntry:
-    """The result of `make`, from the cache if it is there and no source has changed since.
+    """The result of `make`, from the cache if it is stored there and no source has changed since.
 
     If the cache cannot be written, there is a warning, and `make` is called every time.
     """

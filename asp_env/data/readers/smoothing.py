@@ -219,7 +219,7 @@ def _median(values, first, end, axis, buffer):
 @njit(cache=True, nogil=True)
 @no_type_check
 def _mark_jumps(steps, limit_m, jumps):
-    """See `find_jumps`.
+    """Writes the mask of `find_jumps`.
 
     Args:
         steps: (n, 2) differences of consecutive positions, metres.

@@ -28,7 +28,7 @@ from asp_env.errors import AspEnvError, DataError
 from asp_env.files import atomic_file
 
 SUFFIX = ".json"
-"""Ending of scenario files."""
+"""Suffix of scenario files."""
 
 FORMAT = 1
 """Version of the file format."""

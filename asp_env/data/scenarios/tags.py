@@ -330,7 +330,7 @@ def _describe_all(tracks, drives, stride, dt_s, ring, tags, values):
 @njit(cache=True)
 @no_type_check
 def _tag_motion(ego, dt_s, tags, values):
-    """Turns, standing, stopping, and the measures of the ego alone.
+    """Writes turns, standing, stopping, and the measures of the ego alone.
 
     Args:
         ego: (ticks, 4) states.
@@ -365,7 +365,7 @@ def _tag_motion(ego, dt_s, tags, values):
 @njit(cache=True)
 @no_type_check
 def _tag_roundabout(ego, ring, tags):
-    """Roundabouts that the ego drives along, enters and leaves.
+    """Tags roundabouts that the ego drives along, enters and leaves.
 
     Args:
         ego: (ticks, 4) states.
@@ -436,7 +436,7 @@ def _place(rows, first, frame, stride, ego, arcs, route, placed):
 @njit(cache=True)
 @no_type_check
 def _tag_following(ego, arcs, size, sizes, roles, placed, tags):
-    """Following a leader.
+    """Tags a scenario in which the ego follows a leader.
 
     Args:
         ego: (ticks, 4) states.
@@ -484,7 +484,7 @@ def _moves_across(placed, least_rad):
 @njit(cache=True)
 @no_type_check
 def _tag_crossing(ego, arcs, front, route_end, reach, vulnerable, placed, leader, dt_s, tags):
-    """Crossing and yielding, for one other agent.
+    """Tags crossing and yielding, for one other agent.
 
     Args:
         ego: (ticks, 4) states.

@@ -214,7 +214,7 @@ class ComparisonScores:
     """
 
     def __init__(self, methods: int, rules: Rules) -> None:
-        """Contains no scores yet.
+        """Creates an empty collection.
 
         Args:
             methods: number of methods.

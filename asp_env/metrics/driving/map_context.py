@@ -29,15 +29,15 @@ class MapContext:
     outside_m: Float[np.ndarray, "b t"]
     """Distance of the outermost corner to the drivable area, without the log's allowance."""
     several_lanes: Bool[np.ndarray, "b t"]
-    """`in_several_lanes`."""
+    """Values of `in_several_lanes`."""
     at_crossing: Bool[np.ndarray, "b t"]
-    """`at_crossing`."""
+    """Values of `at_crossing`."""
     against_traffic_m: Masked
-    """`against_traffic_m` (b, t); missing on maps without areas of lanes."""
+    """Values (b, t) of `against_traffic_m`; missing on maps without areas of lanes."""
     speed_limits_mps: Masked
-    """(b, t)."""
+    """Values (b, t) of `speed_limits`."""
     distance_to_route_lanes_m: Float[np.ndarray, "b t"]
-    """`distance_to_route_lanes_m`."""
+    """Values of `distance_to_route_lanes_m`."""
 
 
 def map_context(

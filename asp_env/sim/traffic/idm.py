@@ -181,7 +181,7 @@ class IDMDriver(BaseDriver):
         )
 
     def control_some(self, world: World, agent_mask: Bool[np.ndarray, "b a"]) -> Control:
-        """The same for some of the driver's agents, without agents that are yet to appear.
+        """The actions for some of the driver's agents, without agents that are yet to appear.
 
         Args:
             world: the world of the last `reset`.
@@ -401,11 +401,11 @@ class _Mover(NamedTuple):
     """An agent on its path."""
 
     arc: float
-    """m"""
+    """Arc length, m."""
     speed: float
-    """m/s"""
+    """Present speed, m/s."""
     desired: float
-    """m/s"""
+    """Desired speed, m/s."""
 
 
 class _Zone(NamedTuple):
@@ -414,7 +414,7 @@ class _Zone(NamedTuple):
     entry: float
     exit: float
     entry_o: float
-    """Of the other agent, along its own path."""
+    """Entry of the other agent, along its own path."""
     exit_o: float
     lead_o: float
     """By how much the other agent's arc length is larger at the same point."""
@@ -501,19 +501,19 @@ class _Agents(NamedTuple):
     """The agents of one episode at one tick, for the kernels of right of way."""
 
     states: np.ndarray
-    """(A, 4) [x m, y m, heading rad, speed m/s]"""
+    """(A, 4) [x m, y m, heading rad, speed m/s]."""
     sizes: np.ndarray
-    """(A, 2) length and width, m"""
+    """(A, 2) length and width, m."""
     arcs: np.ndarray
-    """(A,) m"""
+    """(A,) arc lengths, m."""
     desired: np.ndarray
-    """(A,) m/s"""
+    """(A,) desired speeds, m/s."""
     follows: np.ndarray
-    """(A,) mask of agents on their path"""
+    """(A,) mask of agents on their path."""
     stood: np.ndarray
-    """(A,) mask of agents that have stood for `PATIENCE_S`"""
+    """(A,) mask of agents that have stood for `PATIENCE_S`."""
     yields: np.ndarray
-    """(A,) mask of agents that are expected to give way"""
+    """(A,) mask of agents that are expected to give way."""
 
 
 @njit(cache=True, error_model="numpy")

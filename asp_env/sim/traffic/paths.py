@@ -281,7 +281,7 @@ class UpcomingConflicts(NamedTuple):
 
 
 def no_conflicts() -> UpcomingConflicts:
-    """Conflicts of no agents."""
+    """Empty conflicts, for no agents."""
     return UpcomingConflicts(
         own_zones=np.zeros((0, 0, 0), dtype=np.int32),
         other_agents=np.zeros((0, 0, 0), dtype=np.int32),
