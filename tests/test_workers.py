@@ -44,7 +44,7 @@ def test_results_are_in_the_order_of_the_tasks(processes: int) -> None:
     ]
 
 
-def test_tasks_run_in_other_processes_that_are_gone_afterwards() -> None:
+def test_tasks_run_in_other_processes_that_end_afterwards() -> None:
     processes = set(results(2, [partial(_slowly, os.getpid)] * 4))
     assert len(processes) == 2
     assert os.getpid() not in processes

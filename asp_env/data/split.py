@@ -47,8 +47,8 @@ class TrainedOn:
     def continued_from(self, earlier: "TrainedOn") -> "TrainedOn":
         """The data of a predictor that continues training from one trained on `earlier`.
 
-        A recording that was split by blocks in both runs stays so. A recording that either run used for
-        training or validation in any other way is not available for evaluation.
+        A recording that was split by blocks in both runs stays so. A recording that either run used
+        for training or validation in any other way is not available for evaluation.
         """
         parts = dict(self.parts)
         for content, part in earlier.parts.items():

@@ -359,7 +359,7 @@ all |
         return returned
 
     def scene(self, agent: str) -> Scene:
-        """Returns everything that an agent may know now, for predictors; it is slot 0.
+        """Returns the scene from the view of an agent, which is slot 0, for predictors.
 
         Raises:
             gymnasium.error.ResetNeeded: no episode has begun.

@@ -27,7 +27,7 @@ RECIPE = "ours"
 TRAINING = {"recordings": 30, "minutes": 2.5, "seed": 0, "locations": 6}
 """Options of `asp-env synthesize` for the traffic that the predictor is trained on."""
 HELD_OUT = {"recordings": 9, "minutes": 2.0, "seed": 48_271}
-"""The same for the traffic that it is evaluated on: another seed, so other locations."""
+"""Recordings to evaluate on; another seed gives other locations."""
 SCENARIOS = 48
 """Number of scenarios that each method drives."""
 

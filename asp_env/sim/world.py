@@ -185,7 +185,7 @@ class World(ABC):
                 agents are read.
             controlled: mask of the agents that execute their action. The others are moved by the
                 world. An agent that is controlled before it appears stays absent.
-            leaving: mask of the agents that depart for good, none by default.
+            leaving: mask of the agents that leave the episode, none by default.
         """
         episodes = self.episodes
         rows = np.flatnonzero(episodes.elapsed < episodes.length)

@@ -70,7 +70,7 @@ class NetworkShape:
     """Number of ticks ahead."""
     dt_s: float
     action_range: tuple[float, float]
-    """Scale of actions (m/s², rad): outputs in [-1, 1] are multiplied by it. It is the normaliser."""
+    """Normaliser, the scale of actions (m/s², rad): outputs in [-1, 1] are multiplied by it."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

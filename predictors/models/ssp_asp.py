@@ -10,9 +10,9 @@ Longer horizons chain segments, see `predictors.models.chaining`.
 
 Choices that the paper leaves open: the future observation is rendered in the target's pose at the
 end of the segment; features pass a LayerNorm before ψ and γ; a linear layer follows ψ, since
-features are unbounded; the loss is the mean over both branches and over the segments; a later segment is
-predicted from what is available at inference, the predicted features and the actions of the matched
-mode.
+features are unbounded; the loss is the mean over both branches and over the segments; a later
+segment is predicted from what is available at inference, the predicted features and the actions of
+the matched mode.
 
 Options that differ from the paper; the recipe `paper` leaves them off: `normalise`,
 `stop_gradient`, `ema`, `skip`, `hidden`, `scheduled`, `annealed`, `kept`, and, for an ablation,

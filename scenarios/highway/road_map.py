@@ -129,7 +129,7 @@ def all_lanes(network: RoadNetwork) -> Lanes:
 def links(network: RoadNetwork) -> list[Link]:
     """Pairs of lanes of which the first leads to the second, where the graph connects their roads.
 
-    highway-env knows the followers of roads, and its vehicles take the lane that begins nearest.
+    highway-env stores the followers of roads, and its vehicles take the lane that begins nearest.
     Here a lane leads to that lane too, but only if no other lane of its road ends nearer to it,
     since the others reach it by changing lanes. No lane leads back in the opposite direction.
     """

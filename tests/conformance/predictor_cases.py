@@ -1,6 +1,6 @@
 """The predictors under test, and the situations that they forecast.
 
-All registered predictors are tested. Trained ones have random weights and read pictures or vectors;
+All registered predictors are tested. Trained ones have random weights and read rasters or vectors;
 those that chain segments are tested with every chaining at 6 s. The recipes `ours` are tested on
 vectors.
 """

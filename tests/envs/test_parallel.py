@@ -236,7 +236,7 @@ def test_copies_and_pickles_continue_in_the_same_way(crossing):
 
 
 def test_renders_the_whole_place(crossing):
-    """The same state gives the same picture; without a render mode there is none."""
+    """The same state gives the same image; without a render mode there is none."""
     env = _make(crossing, render_mode="rgb_array")
     env.reset(seed=0)
     picture = env.render()

@@ -1,4 +1,4 @@
-"""Rendering of the single environment: pictures, the window, forecasts and plans."""
+"""Rendering of the single environment: images, the window, forecasts and plans."""
 
 import copy
 import subprocess
@@ -148,8 +148,8 @@ def test_invalid_overlays_are_rejected(crossing):
         ReplayEnv(crossing, observations=("state",)).show()
 
 
-def test_rgb_array_list_collects_pictures(crossing):
-    """`gymnasium.make` provides this mode: all pictures since the last call."""
+def test_rgb_array_list_collects_images(crossing):
+    """`gymnasium.make` provides this mode: all images since the last call."""
     env = gymnasium.make(
         "asp_env/Replay-v0", data=crossing, observations=("state",), render_mode="rgb_array_list"
     )

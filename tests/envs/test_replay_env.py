@@ -110,7 +110,7 @@ def test_scene_behind_wrappers(crossing):
 
 
 def test_renders_an_rgb_array(crossing):
-    """The same state gives the same picture; without a render mode there is none."""
+    """The same state gives the same image; without a render mode there is none."""
     env = _make(crossing, render_mode="rgb_array")
     env.reset(seed=0)
     picture = env.render()

@@ -112,7 +112,7 @@ def test_attributes_and_methods_of_each_environment(crossing):
         one.set_attr("label", "second", indices=[1])
 
 
-def test_pictures_are_those_of_single_environments(crossing):
+def test_images_are_those_of_single_environments(crossing):
     one, other = (make(crossing, render_mode="rgb_array") for make in (_adapter, _dummy))
     for envs in (one, other):
         envs.seed(5)

@@ -53,7 +53,7 @@ def test_a_snapshot_restores_every_bit(crossing, traffic):
 
 @pytest.mark.parametrize("traffic", TRAFFIC)
 def test_a_pickled_snapshot_is_small_and_restores_every_bit(crossing, traffic):
-    """It holds no recording, no picture and no state of the drivers: less than 10 kB."""
+    """It holds no recording, no raster and no state of the drivers: less than 10 kB."""
     env = _make(crossing, traffic=traffic)
     env.reset(seed=2)
     for _ in range(4):

@@ -11,7 +11,7 @@ SITES = ("intersection", "roundabout")
 
 @pytest.fixture(scope="session", params=SITES)
 def site(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Two recordings of two minutes, one at each kind of place of a site."""
+    """Two recordings of two minutes, one for each kind of location of a site."""
     out = tmp_path_factory.mktemp("synthetic") / request.param
     synthesize(out, site=request.param, recordings=2, minutes=2.0, seed=4, locations=2)
     return out

@@ -99,7 +99,7 @@ def test_parked_cars_span_the_recording(site: Path) -> None:
         assert all(recording.classes[i] == AgentClass.CAR for i in still)
 
 
-def test_the_picture_shows_asphalt_under_the_cars(site: Path) -> None:
+def test_the_background_shows_asphalt_under_the_cars(site: Path) -> None:
     """Pixels at moving vehicles' middles are grey (grass is green); not so if y were flipped."""
     for recording in open_data(site):
         assert recording.background is not None

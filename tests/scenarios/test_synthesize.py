@@ -158,7 +158,7 @@ def test_the_source_is_made_once(tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 def test_the_slower_of_two_processes_uses_the_folder_of_the_faster(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """If the folder appears meanwhile, it is kept and used."""
+    """If the folder appears meanwhile, it stays and is used."""
     monkeypatch.setenv("ASP_ENV_CACHE", str(tmp_path))
 
     def overtaken(out: Path, **_: object) -> None:

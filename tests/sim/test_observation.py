@@ -212,7 +212,7 @@ def test_given_arrays_are_returned_and_their_content_does_not_matter():
 
 
 def test_only_chosen_components_are_computed(monkeypatch):
-    """Without the raster no picture is drawn; vectors and route infer no actions."""
+    """Without the raster no raster is drawn; vectors and route infer no actions."""
 
     def refuse(*_: object) -> None:
         raise AssertionError("not needed")

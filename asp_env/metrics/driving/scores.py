@@ -39,7 +39,7 @@ class EpisodeRecord:
     states: Float[np.ndarray, "b t 4"]
     """[x m, y m, heading rad, speed m/s] of the ego."""
     log_states: Float[np.ndarray, "b t 4"]
-    """The same of the logged ego at the same ticks."""
+    """States of the logged ego at the same ticks."""
     contacts: Int[np.ndarray, "b t a"]
     """`Contact` of the ego with each agent."""
     off_road_m: Float[np.ndarray, "b t"]

@@ -60,7 +60,7 @@ IN_TURN_GAP_S = 0.5
 """Time between an agent that leaves a zone and one that enters it afterwards. Chosen by hand."""
 
 OUT_OF_TURN_GAP_S = 2.5
-"""The same for an agent that goes before one whose turn it is. Chosen by hand."""
+"""`IN_TURN_GAP_S` for an agent that goes first although it is not its turn. Chosen by hand."""
 
 COMMITTED_MPS2 = 2.5
 """An agent that must brake harder than this to stop before a zone is expected to enter it. Chosen

@@ -50,7 +50,7 @@ def test_areas(tmp_path: Path) -> None:
     ],
 )
 def test_two_way(tmp_path: Path, tags: dict[str, str], two_way: bool) -> None:
-    """Lanes are one-way unless a tag of Lanelet2 or OSM says otherwise."""
+    """Lanes are one-way unless a tag of Lanelet2 or OSM differs."""
     assert road_with(tmp_path, **tags).two_way.tolist() == [two_way]
 
 

@@ -183,7 +183,7 @@ def test_chaining_follows_the_last_at(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("predictor", ["ffw-asp", "ssp-asp"])
 def test_chaining_of_a_single_segment_is_refused(predictor: str, tmp_path: Path) -> None:
-    """ssp-asp, too, forecasts 3 s at once; the error says how to name the run."""
+    """ssp-asp, too, forecasts 3 s at once; the error states how to name the run."""
     run = save_random(tmp_path / "run", predictor)
     with pytest.raises(AspEnvError, match=f"nothing to chain: .* as {predictor}:{run}$"):
         load_predictor(f"{predictor}:{run}@top1", horizon=15, dt_s=0.2)

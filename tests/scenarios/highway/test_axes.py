@@ -26,7 +26,7 @@ def test_headings_are_wrapped() -> None:
     assert mirror_states(np.array([0.0, 0.0, -np.pi, 1.0]))[2] == -np.pi
 
 
-def test_the_dtype_is_kept() -> None:
+def test_the_dtype_is_unchanged() -> None:
     """Of float32 float32 is made, and what is given stays as it is."""
     states = np.ones((2, 3, 4), dtype=np.float32)
     assert mirror_states(states).dtype == np.float32

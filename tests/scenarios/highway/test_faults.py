@@ -76,7 +76,7 @@ def _reference_alone(speed_mps: float, **config: Any) -> tuple[Any, Vehicle]:
 
 
 def test_time_and_motion_agree():
-    """(d) At 25 and 10 Hz highway-env moves vehicles by 0.08 s and says that it was 0.1 s.
+    """(d) At 25 and 10 Hz highway-env moves vehicles by 0.08 s and reports 0.1 s.
 
     Ours moves one of constant speed by 0.2 s times it in a step of 0.2 s, and by 0.6 s in one of
     0.6 s.

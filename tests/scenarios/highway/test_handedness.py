@@ -22,7 +22,7 @@ from tests.sim.worlds import drive, replay, simulate
 
 STEP_S, FRAMES = 1 / 15, 3
 TRAIL = 2
-"""Channel of the picture."""
+"""Channel of the raster."""
 
 
 @pytest.mark.parametrize("seed", range(4))

@@ -20,7 +20,7 @@ from scenarios.lanelet2 import to_degrees
 from tests.scenarios.highway.maps import Place
 
 
-def test_the_origin_is_told_twice() -> None:
+def test_both_forms_of_the_origin_agree() -> None:
     """In degrees it is where it is in UTM, to a decimetre."""
     degrees = to_degrees(np.array([ORIGIN_UTM_M]))[0]
     np.testing.assert_allclose(degrees, ORIGIN_LAT_LON_DEG, atol=1e-6)
@@ -40,7 +40,7 @@ def test_every_lane_is_there(place: Place) -> None:
 
 
 def test_successors_are_those_of_the_road(place: Place) -> None:
-    """The reader finds by the lanes' ends what the graph says."""
+    """The reader finds by the lanes' ends the successors of the graph."""
     number = {index: i for i, index in enumerate(all_lanes(place.network))}
     wanted = {(number[leader], number[follower]) for leader, follower in links(place.network)}
     assert {(a, b) for a, b in place.road_map.successors.tolist()} == wanted

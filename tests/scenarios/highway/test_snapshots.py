@@ -32,7 +32,7 @@ def histories(site: str) -> list[HiddenHistory]:
 
 @pytest.mark.parametrize("site", SITE_NAMES)
 def test_vehicles_that_are_brought_back_are_the_same(site):
-    """At all 400 kept moments of four rounds what is read of them is what they were made of."""
+    """At all 400 stored times of four rounds, restored vehicles give the stored internal states."""
     for history in histories(site):
         assert len(history.steps) == 200
         for time in range(len(history.steps)):
