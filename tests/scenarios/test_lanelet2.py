@@ -18,7 +18,7 @@ def border(marking: Marking, *points: tuple[float, float]) -> Border:
 
 
 def read_back(folder: Path, *lanelets: Lanelet, areas: Sequence[Area] = ()) -> RoadMap:
-    """The map that these give."""
+    """The map after writing and reading these lanelets."""
     path = folder / "place.osm"
     write_map(path, list(lanelets), list(areas), origin_utm_m=ORIGIN_UTM_M, join_m=0.05)
     lat, lon = to_degrees(np.array([ORIGIN_UTM_M]))[0]
@@ -79,7 +79,7 @@ def test_each_lane_has_its_own_limit(tmp_path: Path) -> None:
 
 
 def test_ground_beside_a_lane(tmp_path: Path) -> None:
-    """A triangle with a kerb on one side: drivable, no lane; its other sides are no lines."""
+    """A triangle with a kerb on one side is drivable and no lane; its other sides are no lines."""
     lane = Lanelet(
         subtype="road",
         left=(border("virtual", (0, 3), (10, 3)),),
@@ -102,7 +102,7 @@ def test_ground_beside_a_lane(tmp_path: Path) -> None:
 
 
 def test_a_given_centre_line_is_used(tmp_path: Path) -> None:
-    """A strip whose left side makes a detour: its lane is straight all the same."""
+    """The left side of a strip makes a detour; its lane is straight nevertheless."""
     lane = Lanelet(
         subtype="road",
         left=(border("curb", (0, 3), (5, 8), (10, 3)),),

@@ -1,4 +1,4 @@
-"""What is written is the inD layout, to the column."""
+"""Synthetic traffic is written in the inD layout."""
 
 from pathlib import Path
 
@@ -42,7 +42,7 @@ def table(site: Path, name: str) -> pd.DataFrame:
     ],
 )
 def test_columns_are_the_formats_in_order(site: Path, name: str, columns: str) -> None:
-    """Column names as the format's text lists them, nothing more, nothing less."""
+    """The columns are exactly those that the description of the format lists."""
     with (site / "data" / f"{name}.csv").open() as lines:
         assert next(lines) == columns + "\n"
 
@@ -91,7 +91,7 @@ def test_velocities_are_those_of_the_positions(site: Path) -> None:
 
 
 def test_parked_cars_span_the_recording(site: Path) -> None:
-    """Some cars stand from the first frame to the last, at exactly one place."""
+    """Some cars stand at one position from the first frame to the last."""
     for recording in open_data(site):
         parked = np.flatnonzero(recording.parked)
         still = [i for i in parked if np.ptp(recording.track(int(i)), axis=0).max() == 0.0]

@@ -1,4 +1,4 @@
-"""Two axles behind a point: laws of the reconstruction."""
+"""Reconstruction of the motion of two axles from a point."""
 
 import numpy as np
 from hypothesis import given
@@ -15,7 +15,7 @@ def straight(speeds: np.ndarray, *, heading: float = 0.0) -> np.ndarray:
 
 
 def test_a_circle_is_followed_with_the_rear_axle_inside() -> None:
-    """On a circle of R the body lags the front axle's way by asin(wheelbase / R)."""
+    """On a circle of radius R the body lags the front axle's path by asin(wheelbase / R)."""
     radius, length = 20.0, 5.0
     angle = np.arange(0.0, 4.0 * np.pi, 0.03)
     way = radius * np.stack([np.cos(angle), np.sin(angle)], axis=1)
@@ -66,7 +66,7 @@ def test_a_lane_change_is_spread_over_the_path() -> None:
 
 
 def test_opposite_lane_changes_while_standing_cancel() -> None:
-    """Two opposite jumps at one place cancel."""
+    """Two opposite jumps at one position cancel."""
     points = straight(np.concatenate([np.full(30, 10.0), np.zeros(20), np.full(30, 10.0)]))
     points[40:45, 1] += 3.5
     assert np.abs(ease_lane_changes(points)[45:] - points[45:]).max() < 1e-9

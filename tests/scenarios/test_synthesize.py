@@ -40,7 +40,7 @@ def test_same_seed_same_bytes_in_another_process(short: Path, tmp_path: Path) ->
     assert len(contents(short)) == 5
 
 
-def test_another_seed_is_another_place(short: Path, tmp_path: Path) -> None:
+def test_another_seed_gives_another_location(short: Path, tmp_path: Path) -> None:
     """Map, image and tracks of seed 8 differ from those of seed 7."""
     synthesize(tmp_path / "b", site="intersection", recordings=1, minutes=0.1, seed=8)
     own, reference = contents(tmp_path / "b"), contents(short)
@@ -48,8 +48,8 @@ def test_another_seed_is_another_place(short: Path, tmp_path: Path) -> None:
     assert not set(own.values()) & set(reference.values())
 
 
-def test_noise_keeps_the_truth(short: Path, tmp_path: Path) -> None:
-    """With noise the truth is what comes without, and the measured tracks are centimetres off."""
+def test_true_tracks_do_not_depend_on_noise(short: Path, tmp_path: Path) -> None:
+    """`truth/` has the tracks without noise; measured tracks differ by centimetres."""
     Synthesize(
         out=tmp_path / "n", site="intersection", recordings=1, minutes=0.1, seed=7, noise=True
     ).run()
@@ -62,7 +62,7 @@ def test_noise_keeps_the_truth(short: Path, tmp_path: Path) -> None:
     assert len(open_data(tmp_path / "n")) == 1
 
 
-def test_recordings_share_places(tmp_path: Path) -> None:
+def test_recordings_share_locations(tmp_path: Path) -> None:
     """Three recordings share one location, which has one map and one image."""
     synthesize(tmp_path / "c", site="roundabout", recordings=3, minutes=0.05, seed=0)
     files = contents(tmp_path / "c")
@@ -81,7 +81,7 @@ def test_an_unknown_site_lists_those_known(tmp_path: Path) -> None:
     assert not list(tmp_path.iterdir())
 
 
-def test_a_folder_with_something_in_it_is_refused(tmp_path: Path) -> None:
+def test_a_folder_that_is_not_empty_is_refused(tmp_path: Path) -> None:
     """The existing content is unchanged."""
     (tmp_path / "mine.txt").write_text("mine")
     with pytest.raises(AspEnvError, match="not an empty folder"):
@@ -91,8 +91,8 @@ def test_a_folder_with_something_in_it_is_refused(tmp_path: Path) -> None:
     assert contents(tmp_path).keys() == {"mine.txt"}
 
 
-def test_an_unwritable_place_is_refused(tmp_path: Path) -> None:
-    """A file in the way of the folder: one line."""
+def test_an_unwritable_folder_is_refused(tmp_path: Path) -> None:
+    """A file has the path of the folder: the error has one line."""
     (tmp_path / "file").touch()
     with pytest.raises(AspEnvError, match="cannot be written") as caught:
         synthesize(tmp_path / "file" / "out", site="roundabout", recordings=1, minutes=1.0, seed=0)
@@ -113,7 +113,7 @@ def test_an_unwritable_place_is_refused(tmp_path: Path) -> None:
 def test_impossible_numbers_are_refused(
     tmp_path: Path, recordings: int, minutes: float, seed: int, locations: int | None
 ) -> None:
-    """No recordings, no time, a negative seed, or more locations than recordings: one line."""
+    """No recordings, no time, a negative seed, or more locations than recordings give one line."""
     with pytest.raises(AspEnvError, match="cannot be made"):
         synthesize(
             tmp_path / "x",
@@ -126,7 +126,7 @@ def test_impossible_numbers_are_refused(
     assert not list(tmp_path.iterdir())
 
 
-def test_nothing_half_written_stays(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_no_incomplete_folder_remains(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Without SUMO the error names the extra, and no folder is left."""
     monkeypatch.setitem(sys.modules, "sumo", None)
     with pytest.raises(MissingExtraError, match=r"asp-env\[synthetic\]"):
@@ -145,7 +145,7 @@ def stand_in(marker: str) -> Callable[..., None]:
 
 
 def test_the_source_is_made_once(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """The second call finds what the first one made; nothing else is left in the cache."""
+    """The second call finds what the first one made; nothing else remains in the cache."""
     monkeypatch.setenv("ASP_ENV_CACHE", str(tmp_path))
     monkeypatch.setattr(dataset, "synthesize", stand_in("first"))
     folder = open_source("roundabout")
@@ -172,7 +172,7 @@ def test_the_slower_of_two_processes_uses_the_folder_of_the_faster(
 
 
 def test_the_command_and_the_source_are_registered() -> None:
-    """`asp-env synthesize` and DATA `synthetic:` lead here."""
+    """`asp-env synthesize` and DATA `synthetic:` call this package."""
     assert registry.find("commands", "synthesize") is Synthesize
     assert registry.find("sources", "synthetic") is open_source
 

@@ -1,4 +1,4 @@
-"""How synthetic road users move."""
+"""Motion of synthetic agents."""
 
 from pathlib import Path
 
@@ -95,7 +95,7 @@ def test_all_turns_occur(site: Path) -> None:
 
 
 def test_the_demand_has_all_classes() -> None:
-    """An hour's demand has every class, cars most, and from every arm to every other."""
+    """The demand of an hour has every class, mostly cars, and all pairs of arms."""
     rng = np.random.default_rng(0)
     place = crossroads(rng)
     wanted = demand(rng, place, 3600.0)
@@ -108,7 +108,7 @@ def test_the_demand_has_all_classes() -> None:
 
 
 def test_removing_an_agent_leaves_the_others_unchanged() -> None:
-    """Demand without a road user is the same but for its line."""
+    """Only the agent's entry is missing in the demand."""
     rng = np.random.default_rng(1)
     wanted = demand(rng, crossroads(rng), 300.0)
     fewer = wanted.without({"v3"})

@@ -1,4 +1,4 @@
-"""Run in a process of its own, in which highway-env may spoil its classes."""
+"""Prints hashes of episodes; run in a process of its own, since highway-env changes its classes."""
 
 import hashlib
 import json
@@ -21,7 +21,7 @@ def parameters() -> list[float]:
 
 
 def reference() -> str:
-    """A hash of where vehicles are in an episode of highway-env's roundabout."""
+    """A hash of the vehicles' positions in an episode of highway-env's roundabout."""
     env = RoundaboutEnv()
     env.reset(seed=8)
     seen = []
@@ -32,7 +32,7 @@ def reference() -> str:
 
 
 def own() -> str:
-    """The same of our roundabout."""
+    """A hash of the vehicles' positions in an episode of this package's roundabout."""
     road = populated_road(SITES["roundabout"], np.random.default_rng(8))
     for _ in range(75):
         step_road(road)
@@ -40,12 +40,12 @@ def own() -> str:
 
 
 def observed() -> list:
-    """What may not change."""
+    """Everything that must not change."""
     return [parameters(), reference(), own()]
 
 
 def main() -> None:
-    """Before anything, after our intersection, after highway-env's."""
+    """Prints hashes at first, after this package's intersection, and after highway-env's."""
     out = [observed()]
     simulate_round(SITES["intersection"], np.random.default_rng(0), frames=60)
     env = make(sys.argv[1])

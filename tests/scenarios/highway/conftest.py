@@ -13,7 +13,7 @@ from tests.scenarios.highway.maps import Place, read_back
 
 @pytest.fixture(autouse=True)
 def _as_highway_env_begins(monkeypatch: pytest.MonkeyPatch) -> None:
-    """highway-env's vehicles as they are in a new process: its intersection changes their class."""
+    """Restores highway-env's vehicle class as in a new process: its intersection changes it."""
     for name, value in (
         ("DISTANCE_WANTED", 5.0 + IDMVehicle.LENGTH),
         ("COMFORT_ACC_MAX", 3.0),
@@ -29,17 +29,17 @@ def _place(env: AbstractEnv, folder: Path) -> Place:
 
 @pytest.fixture(scope="session")
 def intersection(tmp_path_factory: pytest.TempPathFactory) -> Place:
-    """Four arms of one lane each way, all turns."""
+    """Four arms with one lane in each direction, and all turns."""
     return _place(IntersectionEnv(), tmp_path_factory.mktemp("intersection"))
 
 
 @pytest.fixture(scope="session")
 def roundabout(tmp_path_factory: pytest.TempPathFactory) -> Place:
-    """A ring of two lanes with four ways in and four out."""
+    """A ring of two lanes with four entries and four exits."""
     return _place(RoundaboutEnv(), tmp_path_factory.mktemp("roundabout"))
 
 
 @pytest.fixture(scope="session", params=["intersection", "roundabout"])
 def place(request: pytest.FixtureRequest) -> Place:
-    """Each of them."""
+    """Each of the two."""
     return request.getfixturevalue(request.param)

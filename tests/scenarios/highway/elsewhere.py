@@ -28,14 +28,14 @@ def open_world(recordings: Recordings, episodes: int) -> Simulation:
 
 
 def drive(simulation: Simulation, tick: int) -> None:
-    """One tick; the egos are controlled in two ticks of three."""
+    """Steps one tick; the egos are controlled in two ticks of three."""
     count = len(simulation.world)
     actions = np.random.default_rng(tick).uniform((-2.0, -0.1), (2.0, 0.1), (count, 2))
     simulation.step(actions.astype(np.float32), np.full(count, tick % 3 > 0))
 
 
 def go_on(simulation: Simulation, snapshot: Any, first: int, last: int) -> str:
-    """A hash of all states of all ticks, the last ones of which come after a snapshot."""
+    """Continues from a snapshot up to a tick and returns a hash of the states at all ticks."""
     simulation.world.restore(snapshot)
     for tick in range(first, last):
         drive(simulation, tick)

@@ -1,4 +1,4 @@
-"""Environments in highway-env's traffic that observe little."""
+"""Environments with highway-env's traffic and small observations."""
 
 from typing import Any
 
@@ -8,7 +8,7 @@ from asp_env.envs.replay import ReplayEnv
 
 
 def make(data: str, **options: Any) -> ReplayEnv:
-    """With the ego's state and its past actions."""
+    """An environment that observes the ego's state and its past actions."""
     return ReplayEnv(data, **{"observations": ("state", "actions"), **options})
 
 

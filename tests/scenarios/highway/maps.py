@@ -1,4 +1,4 @@
-"""Roads of highway-env beside the maps that are made of them."""
+"""Roads of highway-env with the maps that are written for them."""
 
 from dataclasses import dataclass
 from pathlib import Path
@@ -12,14 +12,14 @@ from scenarios.highway.road_map import ORIGIN_LAT_LON_DEG, ORIGIN_UTM_M, write_r
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Place:
-    """A road, and its map as it is read."""
+    """A road, and its map after writing and reading."""
 
     network: RoadNetwork
     road_map: RoadMap
 
 
 def read_back(folder: Path, network: RoadNetwork) -> RoadMap:
-    """The map of a road, written and read."""
+    """The map of a road after writing and reading."""
     path = folder / "place.osm"
     write_road_map(path, network, origin_utm_m=ORIGIN_UTM_M)
     latitude_deg, longitude_deg = ORIGIN_LAT_LON_DEG

@@ -1,4 +1,4 @@
-"""From one pair of axes to the other."""
+"""Conversion between highway-env's axes and those of this package."""
 
 import numpy as np
 import pytest
@@ -12,7 +12,7 @@ from tests.dynamics.motions import Motion, motions
 
 
 def test_by_hand() -> None:
-    """Below the origin there is below it here, and what steers right there does so here."""
+    """A point below highway-env's origin is below it here, and right steering stays right."""
     np.testing.assert_array_equal(mirror_points(np.array([[3.0, 4.0]])), [[3.0, -4.0]])
     down_there = np.array([3.0, 4.0, 0.5 * np.pi, 7.0])
     np.testing.assert_array_equal(mirror_states(down_there), [3.0, -4.0, -0.5 * np.pi, 7.0])
@@ -20,14 +20,14 @@ def test_by_hand() -> None:
 
 
 def test_headings_are_wrapped() -> None:
-    """highway-env's headings are not: 1.75 turns one way are a quarter of a turn that way."""
+    """highway-env's headings are not: 1.75 turns become a quarter turn the other way."""
     turned = mirror_states(np.array([0.0, 0.0, 3.5 * np.pi, 1.0]))
     assert turned[2] == pytest.approx(0.5 * np.pi)
     assert mirror_states(np.array([0.0, 0.0, -np.pi, 1.0]))[2] == -np.pi
 
 
 def test_the_dtype_is_unchanged() -> None:
-    """Of float32 float32 is made, and what is given stays as it is."""
+    """float32 gives float32, and the argument does not change."""
     states = np.ones((2, 3, 4), dtype=np.float32)
     assert mirror_states(states).dtype == np.float32
     assert mirror_points(states[..., :2]).dtype == np.float32
@@ -37,7 +37,6 @@ def test_the_dtype_is_unchanged() -> None:
 
 @given(motions())
 def test_mirroring_is_its_own_inverse(motion: Motion) -> None:
-    """Each is its own inverse."""
     again = mirror_states(mirror_states(motion.states))
     np.testing.assert_array_equal(again[:, [0, 1, 3]], motion.states[:, [0, 1, 3]])
     np.testing.assert_allclose(wrap_angle(again[:, 2] - motion.states[:, 2]), 0, atol=1e-12)

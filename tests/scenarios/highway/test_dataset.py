@@ -59,9 +59,9 @@ def test_it_reads_back_without_a_fault(site, capsys):
 
 @every_site
 def test_the_written_velocity_leads_to_the_next_position(site):
-    """In each of highway-env's steps, since it points where a vehicle goes, not where it faces.
+    """The written velocity points along the course, not along the heading, in each step.
 
-    Vehicles that are pushed move further, in less than one step of twenty.
+    Vehicles that are pushed after a collision move further, in less than one step of twenty.
     """
     tracks = pd.read_csv(highway_folder(site) / "data" / "00_tracks.csv")
     following = tracks.trackId.diff().shift(-1) == 0
@@ -74,8 +74,8 @@ def test_the_written_velocity_leads_to_the_next_position(site):
     assert (away[slides] < 2e-3).mean() > 0.9
 
 
-def test_the_command_makes_what_the_source_opens(short, tmp_path, capsys):
-    """A tenth of a minute is a whole round; progress goes to stderr."""
+def test_the_source_opens_what_the_command_writes(short, tmp_path, capsys):
+    """A tenth of a minute becomes a whole round; progress is written to stderr."""
     capsys.readouterr()
     out = tmp_path / "out"
     assert main(command(out, minutes=0.1)) == 0
@@ -87,7 +87,7 @@ def test_the_command_makes_what_the_source_opens(short, tmp_path, capsys):
 
 
 def test_same_seed_same_bytes_in_another_process(short, tmp_path):
-    """Another process writes the same files, another seed other ones."""
+    """Another process writes the same files; another seed writes other files."""
     again, other = tmp_path / "again", tmp_path / "other"
     script = "import sys; from asp_env.cli import main; sys.exit(main(sys.argv[1:]))"
     subprocess.run([sys.executable, "-c", script, *command(again)], check=True, capture_output=True)
@@ -111,7 +111,7 @@ def test_same_seed_same_bytes_in_another_process(short, tmp_path):
     ],
 )
 def test_invalid_options_are_refused(tmp_path, options, what, capsys):
-    """One line, status 2, and nothing is written."""
+    """The error has one line, the status is 2, and nothing is written."""
     assert main(command(tmp_path / "out", **options)) == 2
     observed = capsys.readouterr()
     assert what in observed.err
@@ -119,7 +119,7 @@ def test_invalid_options_are_refused(tmp_path, options, what, capsys):
     assert not list(tmp_path.iterdir())
 
 
-def test_a_folder_with_something_in_it_is_refused(short, capsys):
+def test_a_folder_that_is_not_empty_is_refused(short, capsys):
     """The existing content is unchanged."""
     before = contents(short)
     assert main(command(short)) == 2
@@ -170,7 +170,7 @@ DAMAGE: dict[str, tuple[Callable[[Path], object], str]] = {
 
 @pytest.mark.parametrize("kind", DAMAGE)
 def test_damage_is_reported_in_one_line(short, tmp_path, kind):
-    """Which file, what is wrong, what was expected."""
+    """The line names the file, the fault and what was expected."""
     path = tmp_path / "00_hidden.npz"
     shutil.copy(short / "hidden" / path.name, path)
     harm, what = DAMAGE[kind]
@@ -182,7 +182,7 @@ def test_damage_is_reported_in_one_line(short, tmp_path, kind):
 
 @pytest.mark.parametrize("harm", [_truncate, lambda path: _npz(path, rows=_rows(path)[::-1])])
 def test_an_environment_reports_damage(short, tmp_path, harm):
-    """When an episode begins: a file that cannot be read, and one with the vehicles mixed up."""
+    """No episode begins with an unreadable file, or with one whose vehicles are mixed up."""
     shutil.copytree(short, tmp_path / "copy")
     harm(tmp_path / "copy" / "hidden" / "00_hidden.npz")
     env = make(f"highway:{tmp_path / 'copy'}")
@@ -191,7 +191,7 @@ def test_an_environment_reports_damage(short, tmp_path, harm):
 
 
 def test_the_history_of_another_recording_is_refused(tmp_path):
-    """Two hidden histories have changed places."""
+    """The hidden histories of two recordings are exchanged."""
     shutil.copytree(highway_folder("roundabout"), tmp_path / "copy")
     hidden = tmp_path / "copy" / "hidden"
     (hidden / "00_hidden.npz").rename(hidden / "aside")
@@ -205,7 +205,7 @@ def test_the_history_of_another_recording_is_refused(tmp_path):
 
 
 def test_foreign_data_are_refused(short, tmp_path):
-    """Unknown names, folders without `hidden`, recordings in memory: one line each."""
+    """Unknown names, folders without `hidden` and recordings in memory give one line each."""
     for name in ("nowhere", "", str(tmp_path / "nothing"), str(short / "data" / "00_tracks.csv")):
         with pytest.raises(AspEnvError, match=r"^unknown highway site or folder [^\n]*roundabout$"):
             open_data(f"highway:{name}")
@@ -218,7 +218,7 @@ def test_foreign_data_are_refused(short, tmp_path):
 
 
 def test_the_source_is_made_once(tmp_path, monkeypatch):
-    """The second call finds what the first one made, whose name holds the version."""
+    """The second call finds the folder that the first one made; its name contains the version."""
     assert registry.find("sources", "highway") is dataset.open_source
     monkeypatch.setenv("ASP_ENV_CACHE", str(tmp_path))
     monkeypatch.setattr(dataset, "synthesize", stand_in("first"))
@@ -230,9 +230,9 @@ def test_the_source_is_made_once(tmp_path, monkeypatch):
 
 
 def test_with_noise_episodes_hold_the_true_states(short, tmp_path):
-    """Measured tracks are centimetres off; episodes hold the truth, before their start and after.
+    """Measured tracks are off by centimetres; episodes hold the true states at all ticks.
 
-    Left to themselves they go on as they truly did, and progress is measured on the noisy log.
+    Without control they continue as the true tracks; progress is measured on the noisy log.
     """
     out = tmp_path / "noisy"
     assert main([*command(out), "--noise"]) == 0
@@ -259,7 +259,7 @@ def test_with_noise_episodes_hold_the_true_states(short, tmp_path):
 
 
 def test_a_recording_can_be_replayed_as_any_other():
-    """The folder without the scheme is a recording in which no agent reacts."""
+    """Without the scheme, the folder is a recording in which no agent reacts."""
     folder = str(highway_folder("intersection"))
     assert world_class(folder).traffic == "log"
     simulation = simulate(open_data(folder), scenario(18, start=150, length=10))
@@ -271,7 +271,7 @@ def test_a_recording_can_be_replayed_as_any_other():
 
 
 def test_a_recording_may_end_when_the_last_vehicle_has_left():
-    """Its frames then end before its last round does, and what follows are times without rows."""
+    """Its frames then end before its last round, and the history has times without rows."""
     recordings = highway_recordings("roundabout")
     history = load_history(hidden_path(recordings.tracks_path(0)))
     assert history.fits(recordings[0])

@@ -30,12 +30,12 @@ FOLLOWED = scenario(11, start=55, length=40)
 
 
 def begin(site: str, scenarios: list[Scenario] | Scenario, traffic: str = "own") -> Simulation:
-    """Episodes that have just begun."""
+    """Starts episodes."""
     return simulate(highway_recordings(site), scenarios, traffic, world_class("highway:"))
 
 
 def step(world: HighwayWorld | ReplayWorld, driven: np.ndarray, tick: int) -> None:
-    """One tick in which some agents carry out actions of that tick."""
+    """Steps one tick in which some agents execute actions."""
     shape = (*driven.shape, 2)
     actions = np.random.default_rng(tick).uniform((-3.0, -0.2), (3.0, 0.2), shape)
     world.step(actions.astype(np.float32), driven)
@@ -43,7 +43,7 @@ def step(world: HighwayWorld | ReplayWorld, driven: np.ndarray, tick: int) -> No
 
 @every_site
 def test_controlled_agents_move_as_in_a_replay(site):
-    """Bit for bit from the same states, all agents at once, through collisions and off the road."""
+    """The bits are equal from equal states, for all agents, in collisions and off the road."""
     scenarios = list(highway_scenarios(site))[::16]
     count, recordings = len(scenarios), highway_recordings(site)
     worlds = [
@@ -71,7 +71,7 @@ def test_controlled_agents_move_as_in_a_replay(site):
 
 @every_site
 def test_released_agents_continue_on_their_own(site):
-    """Egos that drive in two ticks of three anywhere, then not any more: all stays finite."""
+    """Egos are controlled in two ticks of three, then released: all states stay finite."""
     scenarios = list(highway_scenarios(site))[2::12]
     simulation = begin(site, scenarios)
     for tick in range(14):
@@ -84,7 +84,7 @@ def test_released_agents_continue_on_their_own(site):
 
 
 def test_a_released_agent_returns_to_its_lane():
-    """Driven to the left by 1.5 m on its arm, the ego is back within 0.2 m some 4 s later."""
+    """After a shift of 1.5 m to the left, the ego is within 0.2 m of its lane about 4 s later."""
     simulation = begin("intersection", FOLLOWED)
     lane = network("intersection").get_lane(("o1", "ir1", 0))
     drive(simulation, [(0.0, 0.25)] * 3 + [(0.0, -0.25)] * 3)
@@ -102,9 +102,9 @@ def _aside(simulation: Simulation, lane) -> float:
 
 
 def test_a_released_agent_plans_a_route_from_its_position():
-    """Driven across the junction where it was to turn left, it stays on the eastern arm.
+    """Driven straight across the junction instead of left, it stays on the eastern arm.
 
-    So it does from a snapshot that was taken before it was released.
+    The same holds after a snapshot that was taken before the release.
     """
     simulation = begin("intersection", scenario(19, start=115, length=60))
     drive(simulation, [(1.0, 0.0)] * 35)
@@ -129,7 +129,7 @@ def test_a_released_agent_plans_a_route_from_its_position():
 
 
 def test_other_vehicles_react_to_a_controlled_ego():
-    """It halts on its lane: its follower halts behind it. Left alone neither does."""
+    """The ego stops on its lane and its follower stops behind it. Without control neither stops."""
     alone, driven = (begin("intersection", FOLLOWED) for _ in range(2))
     replay(alone, 25)
     drive(driven, [(-5.0, 0.0)] * 25)
@@ -145,7 +145,7 @@ def test_other_vehicles_react_to_a_controlled_ego():
 
 
 def test_a_predictor_controls_its_agents():
-    """13 keeps its speed and heading whatever stands before it, until it stands in the ego."""
+    """Vehicle 13 continues at its speed and heading until it hits the ego."""
     simulation = begin("intersection", FOLLOWED, "default=own,13=predictor:constant-velocity")
     first = now(simulation, 13)
     assert first is not None
@@ -158,9 +158,9 @@ def test_a_predictor_controls_its_agents():
 
 
 def test_vehicles_do_not_appear_near_others_and_blocked_ones_never_appear():
-    """On the southern arm 20 comes at tick 120 and halts there: 23, 26 and 29 never come.
+    """Vehicle 20 appears on the southern arm at tick 120 and stops: 23, 26 and 29 never appear.
 
-    Left alone they come behind it at ticks 140, 160 and 180.
+    Without control they appear behind it at ticks 140, 160 and 180.
     """
     long = scenario(13, start=115, length=75, recording=1)
     left_alone, disturbed = (begin("intersection", long).world for _ in range(2))
@@ -182,7 +182,7 @@ def test_vehicles_do_not_appear_near_others_and_blocked_ones_never_appear():
 
 
 def _nearest_comer(world: World) -> float:
-    """Least distance between an agent that has just appeared and any other agent, m."""
+    """Smallest distance between an agent that has just appeared and any other agent, m."""
     valid, states, nearest = world.episodes.valid[0], world.episodes.states[0], np.inf
     for tick in range(HISTORY + 1, len(valid)):
         for slot in np.flatnonzero(valid[tick] & ~valid[tick - 1]).tolist():
@@ -198,7 +198,7 @@ def _nearest_comer(world: World) -> float:
     ("site", "traffic"), [("intersection", "idm"), ("roundabout", "own"), ("roundabout", "idm")]
 )
 def test_departed_agents_never_return(site, traffic):
-    """Presence has one beginning and one end; the ego is there all the while."""
+    """Each agent is present in one interval; the ego is present throughout."""
     scenarios = list(highway_scenarios(site))[2 :: 12 if site == "intersection" else 3]
     simulation = begin(site, scenarios, traffic)
     replay(simulation, 75)
@@ -237,7 +237,7 @@ class Short(Vehicle):
 
 @pytest.mark.parametrize("steering_rad", [0.0, 0.2, -0.5])
 def test_right_of_way_predicts_controlled_vehicles_along_their_curve(steering_rad):
-    """At each quarter of a second, where highway-env expects its plain vehicle, without a copy."""
+    """The predicted poses are those of highway-env's plain vehicle, every 0.25 s, without copies."""
     site = SITES["intersection"]
     road, times = empty_road(site), np.arange(0.25, 3.0, 0.25)
     given = (road, [-50.0, 2.0], 0.1, 7.0)
@@ -254,7 +254,7 @@ def test_right_of_way_predicts_controlled_vehicles_along_their_curve(steering_ra
 
 
 def test_agents_without_a_driver_are_left_to_the_world():
-    """A table without a default refuses nothing here: it is `own`, not `log`."""
+    """In this world a table without a default has the default `own`, not `log`."""
     env = make(highway_data("intersection"), traffic="13=policy")
     env.reset(options={"scenario": 11})
     twin = make(highway_data("intersection"), traffic="default=own,13=policy")

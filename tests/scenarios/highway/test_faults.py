@@ -1,4 +1,4 @@
-"""Faults of highway-env 1.12.1: each shown in it first, then its absence here."""
+"""Faults of highway-env 1.12.1: each is shown in highway-env first, then its absence here."""
 
 import copy
 import json
@@ -24,9 +24,9 @@ every_site = pytest.mark.parametrize("site", SITE_NAMES)
 
 
 def test_an_intersection_does_not_change_a_roundabout():
-    """(a) highway-env's writes parameters into the class of all vehicles, ours into one of its own.
+    """(a) highway-env's intersection writes parameters into the class of all vehicles.
 
-    5 m between bumpers at the roundabout become 2 m, and its episodes others: only highway-env's.
+    At its roundabout gaps of 5 m then become 2 m. The intersection here has its own class.
     """
     done = subprocess.run(
         [
@@ -59,7 +59,7 @@ def test_the_same_seed_gives_the_same_info(site):
 
 @every_site
 def test_spaces_stay_the_same_objects(site):
-    """(c) highway-env replaces both in each reset."""
+    """(c) highway-env replaces both spaces in each reset."""
     for env, stays in ((RoundaboutEnv(), False), (make(highway_data(site)), True)):
         action_space, observation_space = env.action_space, env.observation_space
         env.reset(seed=0)
@@ -68,7 +68,7 @@ def test_spaces_stay_the_same_objects(site):
 
 
 def _reference_alone(speed_mps: float, **config: Any) -> tuple[Any, Vehicle]:
-    """A single vehicle that drives straight on, on highway-env's empty roundabout."""
+    """A single vehicle that drives straight ahead on highway-env's empty roundabout."""
     env = RoundaboutEnv(config=config)
     vehicle = Vehicle(env.road, [0.0, -200.0], heading=0.0, speed=speed_mps)
     env.road.vehicles = env.controlled_vehicles = [vehicle]
@@ -76,10 +76,10 @@ def _reference_alone(speed_mps: float, **config: Any) -> tuple[Any, Vehicle]:
 
 
 def test_time_and_motion_agree():
-    """(d) At 25 and 10 Hz highway-env moves vehicles by 0.08 s and reports 0.1 s.
+    """(d) At 25 and 10 Hz highway-env moves vehicles by 0.08 s and counts 0.1 s.
 
-    Ours moves one of constant speed by 0.2 s times it in a step of 0.2 s, and by 0.6 s in one of
-    0.6 s.
+    Here a vehicle at constant speed moves by 0.2 s times its speed in a step of 0.2 s, and by 0.6 s
+    times its speed in one of 0.6 s.
     """
     reference, vehicle = _reference_alone(10.0, simulation_frequency=25, policy_frequency=10)
     reference.step(None)
@@ -99,13 +99,13 @@ def test_time_and_motion_agree():
 
 @pytest.mark.parametrize("dt_s", [1 / 15, 1 / 3])
 def test_other_time_steps_are_refused(dt_s):
-    """(d) In one line that names what can be chosen; they are whole frames, but not of 0.2 s."""
+    """(d) The error has one line with the valid steps; these are whole frames, but not of 0.2 s."""
     with pytest.raises(AspEnvError, match=r"^time step 0\.[^\n]* choose a multiple of that$"):
         make(highway_data("roundabout"), dt_s=dt_s)
 
 
 def _copies(monkeypatch: pytest.MonkeyPatch) -> list[str]:
-    """The names of the classes of what is copied from now on."""
+    """The names of the classes of all objects that are copied from now on."""
     copied, deepcopy = [], copy.deepcopy
 
     def count(value: Any, *given: Any) -> Any:
@@ -118,7 +118,7 @@ def _copies(monkeypatch: pytest.MonkeyPatch) -> list[str]:
 
 @every_site
 def test_nothing_is_copied_in_a_step(site, monkeypatch):
-    """(e) highway-env copies the road with all vehicles to foresee where a steered one goes."""
+    """(e) highway-env copies the road with all vehicles to predict a controlled vehicle."""
     reference: Any = IntersectionEnv(config={"action": {"type": "ContinuousAction"}})
     own = make(highway_data(site))
     own.reset(seed=0)
@@ -143,7 +143,7 @@ def test_the_roundabout_takes_continuous_actions():
 
 @every_site
 def test_no_vehicle_is_a_dynamical_bicycle(site):
-    """(g) highway-env's newer intersection drives its ego by another model than all others."""
+    """(g) The ego of highway-env's newer intersection has another model than the other vehicles."""
     assert isinstance(ContinuousIntersectionEnv().vehicle, BicycleVehicle)
     road = populated_road(SITES[site], np.random.default_rng(0))
     assert len(road.vehicles) > 3
@@ -152,7 +152,7 @@ def test_no_vehicle_is_a_dynamical_bicycle(site):
 
 
 def test_vehicles_leave_the_roundabout():
-    """(h) highway-env's drive on behind the end of the road, 170 m from the centre, for ever."""
+    """(h) highway-env's vehicles continue beyond the end of the road, 170 m from the centre."""
     reference = RoundaboutEnv()
     reference.reset(seed=1)
     for _ in range(25):
@@ -166,7 +166,7 @@ def test_vehicles_leave_the_roundabout():
 
 @every_site
 def test_braking_ends_at_standstill(site):
-    """(h) highway-env's plain vehicle goes backwards after it, at 6 m/s after 2 s of -4 m/s²."""
+    """(h) highway-env's plain vehicle reverses: at 6 m/s after 2 s of -4 m/s²."""
     _, vehicle = _reference_alone(2.0)
     vehicle.act({"acceleration": -4.0, "steering": 0.0})
     for _ in range(30):

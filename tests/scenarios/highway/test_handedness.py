@@ -62,7 +62,7 @@ def _turning(tag: str) -> Scenario:
 
 
 @SIDES
-def test_left_is_what_highway_env_calls_left(tag, side):
+def test_left_turns_are_those_of_highway_env(tag, side):
     """Its arms are numbered clockwise, so a left turn from arm c leads to arm c + 1."""
     compared, roads = 0, network("intersection").roads
     for scenario in highway_scenarios("intersection"):
@@ -78,10 +78,10 @@ def test_left_is_what_highway_env_calls_left(tag, side):
 
 
 @SIDES
-def test_a_turn_is_seen_to_go_its_way(tag, side):
-    """Under its logged actions the heading turns by a quarter, steering and way to its side.
+def test_the_path_turns_to_the_side_of_the_steering(tag, side):
+    """Under the logged actions the heading turns by 90° to the side of the steering.
 
-    After a left turn the path lies to the left of the vehicle; before it, too.
+    Before a left turn the route ahead is to the left of the vehicle, after it the trail.
     """
     scenario = _turning(tag)
     recording = highway_recordings("intersection")[scenario.recording]
@@ -110,14 +110,14 @@ def test_a_turn_is_seen_to_go_its_way(tag, side):
 
 
 def _side(layer: np.ndarray) -> float:
-    """How far to the left of the middle column what is drawn reaches, metres; negative: right."""
+    """Distance of the drawn pixels from the middle column to the left, metres; negative: right."""
     columns = 0.2 * (120 - np.flatnonzero(layer.any(axis=0)))
     return float(columns[np.argmax(np.abs(columns))]) if len(columns) else 0.0
 
 
 @SIDES
 def test_an_observed_vehicle_turns_the_same_way(tag, side):
-    """As a target of another agent: its inferred steering, its heading, and its own raster."""
+    """It is a target of another agent: inferred steering, heading and its own raster agree."""
     turner = _turning(tag)
     scenario = next(
         each

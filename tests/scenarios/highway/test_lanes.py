@@ -1,4 +1,4 @@
-"""Lanes as strips: sides, ends, and which leads to which."""
+"""Lanes as strips: sides, ends and successors."""
 
 import math
 from typing import Any
@@ -24,7 +24,7 @@ def straight(*lanes: tuple[str, str, list[float], list[float]]) -> RoadNetwork:
 
 
 def turned_rad(strip: Strip) -> float:
-    """By how much a lane turns, to the left positive."""
+    """Change of a lane's heading, left positive."""
     steps = np.diff(strip.centre, axis=0)
     return float(wrap_angle(np.diff(np.arctan2(steps[:, 1], steps[:, 0]))).sum())
 
@@ -39,7 +39,7 @@ def test_a_lane_alone() -> None:
     assert strip.speed_limit_mps == 20.0
 
 
-def test_left_is_left(place: Place) -> None:
+def test_left_borders_are_to_the_left(place: Place) -> None:
     """Seen along any lane, its left border lies to the left and its right border to the right."""
     for strip in strips(place.network).values():
         along = np.diff(strip.centre, axis=0)
@@ -49,7 +49,7 @@ def test_left_is_left(place: Place) -> None:
 
 
 def test_traffic_keeps_to_the_right(intersection: Place) -> None:
-    """The way in from the south heads north on the right of x = 0, the way out is on the left."""
+    """The southern entry leads north to the right of x = 0; the exit is to the left."""
     found = strips(intersection.network)
     way_in, way_out = found["o0", "ir0", 0], found["il0", "o0", 0]
     np.testing.assert_allclose(way_in.centre, [[2, -116], [2, -111], [2, -11]], atol=1e-9)
@@ -59,7 +59,7 @@ def test_traffic_keeps_to_the_right(intersection: Place) -> None:
 
 
 def test_turns_of_the_intersection(intersection: Place) -> None:
-    """From the south to the west it goes left on 13 m radius, to the east right on 9 m."""
+    """The left turn from the south has a radius of 13 m, the right turn one of 9 m."""
     found = strips(intersection.network)
     left, right = found["ir0", "il1", 0], found["ir0", "il3", 0]
     assert turned_rad(left) == pytest.approx(0.5 * np.pi, abs=math.radians(2.1))
@@ -70,7 +70,7 @@ def test_turns_of_the_intersection(intersection: Place) -> None:
     np.testing.assert_allclose(right.centre[-1], [11, -2], atol=1e-9)
 
 
-def test_the_ring_goes_round_to_the_left(roundabout: Place) -> None:
+def test_the_ring_runs_counter_clockwise(roundabout: Place) -> None:
     """Its lanes turn counter-clockwise, by one turn each."""
     ring = [f"{a}{b}" for a, b in ("se", "ex", "ee", "nx", "ne", "wx", "we", "sx")]
     found = strips(roundabout.network)
@@ -100,7 +100,7 @@ def test_polylines_follow_the_lanes(place: Place) -> None:
 
 
 def test_links_of_the_intersection(intersection: Place) -> None:
-    """Each way in leads to three turns, each turn to one way out; no way out leads back in."""
+    """Each entry leads to three turns, each turn to one exit; no exit leads to an entry."""
     found = links(intersection.network)
     assert len(found) == len(set(found)) == 4 * 3 + 12
     assert (("o0", "ir0", 0), ("ir0", "il1", 0)) in found
@@ -108,7 +108,7 @@ def test_links_of_the_intersection(intersection: Place) -> None:
 
 
 def test_links_of_the_roundabout(roundabout: Place) -> None:
-    """Ways in and out join the outer lane of the ring alone; its lanes lead to themselves."""
+    """Entries and exits join the outer lane of the ring only; its lanes lead to themselves."""
     found = links(roundabout.network)
     assert len(found) == len(set(found)) == 2 * 8 + 4 * 4
     assert (("ses", "se", 0), ("se", "ex", 1)) in found
@@ -128,13 +128,13 @@ def test_lanes_meet(place: Place) -> None:
 
 
 def test_only_gaps_have_mouths(intersection: Place, roundabout: Place) -> None:
-    """The intersection's lanes all meet; the roundabout's four ways in and four out do not."""
+    """The intersection's lanes all meet; the roundabout's four entries and exits do not."""
     assert mouths(intersection.network) == []
     assert len(mouths(roundabout.network)) == 8
 
 
 def test_a_gap_between_forks_is_refused() -> None:
-    """Two ways lead to m and two away, 3 m further on: the gap belongs to none of them."""
+    """Two lanes lead to a node and two start 3 m further: the gap cannot be assigned."""
     network = straight(
         ("a", "m", [0.0, 0.0], [10.0, 0.0]),
         ("b", "m", [0.0, 5.0], [10.0, 0.0]),

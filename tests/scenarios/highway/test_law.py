@@ -1,4 +1,4 @@
-"""The law of the world: results equal those of highway-env."""
+"""The results of the world equal those of highway-env."""
 
 import numpy as np
 import pytest
@@ -47,7 +47,7 @@ def warm_starts_from_3s(site: str, scenarios: list[Scenario], dt_s: float, histo
 
 
 @every_site
-def test_left_to_itself_everything_goes_on_as_recorded(site):
+def test_without_control_episodes_continue_as_recorded(site):
     """Without control, presence equals the log's, and states agree within its rounding."""
     scenarios = list(highway_scenarios(site))[1 :: 8 if site == "intersection" else 2]
     assert warm_starts_from_3s(site, scenarios, DT_S, HISTORY) > 2000
@@ -55,13 +55,13 @@ def test_left_to_itself_everything_goes_on_as_recorded(site):
 
 @every_site
 def test_a_tick_may_be_longer(site):
-    """The same with 0.4 s, in the middle of which vehicles come and leave."""
+    """The same holds at 0.4 s, where vehicles appear and leave within a tick."""
     found = find_scenarios(highway_recordings(site), source=site, dt_s=0.4, history=5)
     assert warm_starts_from_3s(site, list(found)[::15], 0.4, 5) > 200
 
 
 class _AsTraffic:
-    """highway-env's ego as one of its vehicles that drive themselves."""
+    """highway-env's ego as one of its uncontrolled vehicles."""
 
     vehicle_class = IDMVehicle
 
@@ -120,10 +120,10 @@ def _observed(road) -> list[tuple]:
 
 
 @pytest.mark.parametrize(("site", "seed"), [("intersection", 5), ("roundabout", 8)])
-def test_a_round_is_what_highway_env_makes_of_the_same_generator(site, seed):
-    """Bit for bit, with nearest lanes found faster and predictions remembered.
+def test_a_round_equals_highway_envs_episode(site, seed):
+    """The bits are equal although lanes are found faster and predictions are stored.
 
-    Amid it vehicles give way at the intersection, and crash at the roundabout.
+    Vehicles give way at the intersection and crash at the roundabout meanwhile.
     """
     reference, own = _reference(site, seed, seconds=12), _own(site, seed, seconds=12)
     assert reference == own
@@ -131,8 +131,8 @@ def test_a_round_is_what_highway_env_makes_of_the_same_generator(site, seed):
 
 
 @every_site
-def test_the_nearest_lane_is_the_one_that_all_lanes_are_asked_for(site):
-    """At 2000 poses anywhere and along the lanes: on, beside, before and behind them."""
+def test_the_nearest_lane_equals_that_of_a_full_search(site):
+    """At 2000 poses, on lanes and beside, before and behind them."""
     fast, slow, rng = network(site), RoadNetwork(), np.random.default_rng(0)
     slow.graph, lanes = fast.graph, fast.lanes_list()
     for number in range(2000):
@@ -147,8 +147,8 @@ def test_the_nearest_lane_is_the_one_that_all_lanes_are_asked_for(site):
 
 
 @every_site
-def test_of_equally_near_lanes_it_is_the_first(site):
-    """Where lanes begin or end together, and in the middle between two."""
+def test_of_equally_near_lanes_the_first_is_chosen(site):
+    """Poses where lanes begin or end together, and in the middle between two."""
     fast, slow = network(site), RoadNetwork()
     slow.graph, lanes, ties = fast.graph, fast.lanes_list(), 0
     for lane in lanes:

@@ -1,4 +1,4 @@
-"""What borders become."""
+"""Markings of lanes as lines of the map."""
 
 from pathlib import Path
 from typing import Any
@@ -18,7 +18,7 @@ FIRM: Any = LineType.CONTINUOUS
 
 
 def kinds_at(road_map: RoadMap, x: float) -> dict[float, Kind]:
-    """By y, the kinds of the lines along x that are there at some x."""
+    """The kinds, by y, of the lines along x at a position x."""
     found = {}
     for number, kind in enumerate(road_map.line_types):
         line = road_map.lines[number]
@@ -28,7 +28,7 @@ def kinds_at(road_map: RoadMap, x: float) -> dict[float, Kind]:
 
 
 def test_lines_of_two_lanes_side_by_side(tmp_path: Path) -> None:
-    """Continuous lines are kerbs outside and solid in between; the others are what they are."""
+    """Continuous lines are kerbs outside and solid between lanes; other lines are unchanged."""
     network = RoadNetwork()
     for y, types in ((0.0, (FIRM, FIRM)), (4.0, (FIRM, NONE)), (8.0, (DASHED, FIRM))):
         network.add_lane("a", "b", StraightLane([0.0, y], [30.0, y], line_types=types))
@@ -37,7 +37,7 @@ def test_lines_of_two_lanes_side_by_side(tmp_path: Path) -> None:
 
 
 def test_a_line_ends_where_lanes_cross_it(tmp_path: Path) -> None:
-    """A road to the east with kerbs, and one to the north across it between x = 18 and 22."""
+    """A road to the east with kerbs is crossed by a road to the north between x = 18 and 22."""
     network = RoadNetwork()
     types = (FIRM, FIRM)
     network.add_lane("w", "e", StraightLane([0.0, 0.0], [40.0, 0.0], line_types=types))
@@ -74,7 +74,7 @@ def crossings(first: np.ndarray, second: np.ndarray) -> np.ndarray:
 
 
 def side(of: np.ndarray, ends: np.ndarray) -> np.ndarray:
-    """Below 0 where the two ends of pieces lie on different sides of others."""
+    """Negative where the two ends of pieces lie on different sides of other pieces."""
     along = of[..., 1, :] - of[..., 0, :]
     offset = ends - of[..., :1, :]
     cross = along[..., None, 0] * offset[..., 1] - along[..., None, 1] * offset[..., 0]

@@ -1,4 +1,4 @@
-"""The map as it is read back."""
+"""The map of a road after writing and reading."""
 
 import math
 
@@ -21,13 +21,13 @@ from tests.scenarios.highway.maps import Place
 
 
 def test_both_forms_of_the_origin_agree() -> None:
-    """In degrees it is where it is in UTM, to a decimetre."""
+    """Degrees and UTM agree to a decimetre."""
     degrees = to_degrees(np.array([ORIGIN_UTM_M]))[0]
     np.testing.assert_allclose(degrees, ORIGIN_LAT_LON_DEG, atol=1e-6)
 
 
 def test_every_lane_is_there(place: Place) -> None:
-    """The same lanes in the same order, to a centimetre, with nothing to mend, and one-way."""
+    """The lanes are equal, in the same order, to a centimetre, one-way and without repairs."""
     road_map, found = place.road_map, strips(place.network)
     assert road_map.repairs == ()
     assert len(road_map.lanes) == len(found) == len(all_lanes(place.network))
@@ -40,7 +40,7 @@ def test_every_lane_is_there(place: Place) -> None:
 
 
 def test_successors_are_those_of_the_road(place: Place) -> None:
-    """The reader finds by the lanes' ends the successors of the graph."""
+    """The reader finds by the lanes' ends the successors in the graph."""
     number = {index: i for i, index in enumerate(all_lanes(place.network))}
     wanted = {(number[leader], number[follower]) for leader, follower in links(place.network)}
     assert {(a, b) for a, b in place.road_map.successors.tolist()} == wanted
@@ -57,7 +57,7 @@ def test_limits(intersection: Place, roundabout: Place) -> None:
 
 
 def test_lanes_lie_on_the_road(place: Place) -> None:
-    """Every point of every centre line, and a car anywhere on one that keeps its heading."""
+    """Every point of each centre line is on the road, and a car anywhere on the line as well."""
     field = drivable_field(place.road_map)
     for number in range(len(place.road_map.lanes)):
         assert field.distance_m(resample(place.road_map.lanes[number], 0.2)).max() == 0.0
@@ -69,7 +69,7 @@ def test_lanes_lie_on_the_road(place: Place) -> None:
 
 
 def test_beside_the_road(intersection: Place, roundabout: Place) -> None:
-    """3 m beside a way in; 3 m beyond a road's end, which is 5 m from the lane's; on the island."""
+    """3 m beside an entry, 3 m beyond a road's end (5 m from the lane's), and on the island."""
     field = drivable_field(intersection.road_map)
     points = np.array([[4.0 + 3.0, -60.0], [2.0, -111.0 - 5.0 - 3.0]])
     np.testing.assert_allclose(field.distance_m(points), 3.0, atol=0.15)
@@ -88,7 +88,7 @@ def test_the_intersection_has_no_hole(intersection: Place) -> None:
 
 
 def test_traffic_of_the_roundabout_stays_on_the_road(roundabout: Place) -> None:
-    """Boxes of highway-env's own vehicles, up to where its lanes end; some leave the ring."""
+    """Boxes of highway-env's vehicles, up to the ends of their lanes; some leave the ring."""
     states, sizes, left = [], [], 0
     env = RoundaboutEnv(config={"policy_frequency": 5})
     for seed in (0, 1, 2):

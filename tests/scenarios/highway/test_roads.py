@@ -1,4 +1,4 @@
-"""What is left undone on these roads changes nothing: highway-env's own do the same."""
+"""Roads without redundant work give the same results as highway-env's own."""
 
 from typing import Any
 
@@ -11,7 +11,7 @@ from scenarios.highway.vehicles import CACHED_POSITIONS, Network
 
 
 class IntersectionCar(IDMVehicle):
-    """highway-env's own vehicle as its intersection wants it."""
+    """highway-env's vehicle with the parameters of its intersection."""
 
     DISTANCE_WANTED = 7
     COMFORT_ACC_MAX = 6
@@ -27,7 +27,7 @@ def their_road(site: Site) -> Any:
 
 
 def fill(site: Site, road: Any, kind: type[IDMVehicle], seed: int) -> None:
-    """A crowd anywhere on the road, some of it beside its lane and on its way into others."""
+    """Vehicles anywhere on the road, some beside their lane and changing into others."""
     rng = np.random.default_rng(seed)
     lanes = road.network.lanes_dict()
     exits = [end for start, end, _ in lanes if site.is_exit(start, end)]
@@ -43,7 +43,7 @@ def fill(site: Site, road: Any, kind: type[IDMVehicle], seed: int) -> None:
 
 
 def observed(road: Any) -> list[tuple[Any, ...]]:
-    """All that the vehicles of a road differ in."""
+    """Everything in which the vehicles of a road may differ."""
     return [
         (*v.position.tolist(), v.heading, v.speed, v.crashed, v.target_lane_index, v.target_speed)
         for v in road.vehicles
@@ -52,8 +52,8 @@ def observed(road: Any) -> list[tuple[Any, ...]]:
 
 @pytest.mark.parametrize("name", SITES)
 @pytest.mark.parametrize("seed", range(3))
-def test_a_crowd_goes_on_as_on_highway_envs_own_road(name: str, seed: int) -> None:
-    """Through 3 s of giving way, changing lanes and hitting each other, bit for bit."""
+def test_dense_traffic_moves_as_on_highway_envs_road(name: str, seed: int) -> None:
+    """The bits are equal through 3 s of giving way, lane changes and collisions."""
     site = SITES[name]
     own, reference = empty_road(site), their_road(site)
     fill(site, own, site.vehicle, seed)
@@ -74,8 +74,8 @@ def test_a_crowd_goes_on_as_on_highway_envs_own_road(name: str, seed: int) -> No
 
 
 @pytest.mark.parametrize("name", SITES)
-def test_nobody_on_a_lane_is_left_out_of_those_near_it(name: str) -> None:
-    """By highway-env's own word for being on it, 1 m beside it included."""
+def test_vehicles_near_a_lane_include_all_on_it(name: str) -> None:
+    """All vehicles that are on a lane by highway-env's definition are found, 1 m beside it, too."""
     road = empty_road(SITES[name])
     rng = np.random.default_rng(0)
     vehicle = SITES[name].vehicle
@@ -91,8 +91,8 @@ def test_nobody_on_a_lane_is_left_out_of_those_near_it(name: str) -> None:
     assert left_out > 100 * len(road.network.indices)
 
 
-def test_what_a_lane_remembers_is_of_the_place_and_not_of_the_array() -> None:
-    """The array of a vehicle's position changes in place."""
+def test_stored_coordinates_depend_on_the_position_not_the_array() -> None:
+    """The array of a vehicle's position is changed in place."""
     known: Network = network("roundabout")
     lane: Any = known.get_lane(known.indices[0])
     fresh: Any = their_road(SITES["roundabout"]).network.get_lane(known.indices[0])

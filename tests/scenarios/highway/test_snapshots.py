@@ -1,4 +1,4 @@
-"""The internal state of vehicles survives on disk and in a snapshot."""
+"""Internal states of vehicles after storing and in snapshots."""
 
 import pickle
 import subprocess
@@ -25,13 +25,13 @@ TAKEN, LAST = (1, 3, 8, 15), 20
 
 
 def histories(site: str) -> list[HiddenHistory]:
-    """Of both recordings of a site."""
+    """The hidden histories of both recordings of a site."""
     recordings = highway_recordings(site)
     return [load_history(hidden_path(recordings.tracks_path(number))) for number in (0, 1)]
 
 
 @pytest.mark.parametrize("site", SITE_NAMES)
-def test_vehicles_that_are_brought_back_are_the_same(site):
+def test_restored_vehicles_are_the_same(site):
     """At all 400 stored times of four rounds, restored vehicles give the stored internal states."""
     for history in histories(site):
         assert len(history.steps) == 200
@@ -54,8 +54,8 @@ def changing_lanes(site: str, rows: np.ndarray) -> int:
     return found
 
 
-def test_every_field_was_put_to_the_test():
-    """Somewhere in those rounds each holds something that only it can bring back."""
+def test_every_field_occurs_with_other_values():
+    """Each field has a value in those rounds that differs from the default."""
     rows = {site: np.concatenate([each.rows for each in histories(site)]) for site in SITE_NAMES}
     every = np.concatenate(list(rows.values()))
     assert changing_lanes("roundabout", rows["roundabout"]) > 3
@@ -73,8 +73,8 @@ def test_every_field_was_put_to_the_test():
     assert not every["steered"].any(), "no vehicle is controlled in recordings"
 
 
-def test_the_future_comes_back_bit_for_bit_in_another_process(tmp_path: Path):
-    """From pickled snapshots of both sites, amid lane changes, yielding, crashes and drives."""
+def test_episodes_continue_bit_for_bit_in_another_process(tmp_path: Path):
+    """Snapshots of both sites are pickled amid lane changes, yielding, crashes and control."""
     requests, expected, kept = [], [], {}
     for site in SITE_NAMES:
         scenarios = WORLD_CASES[f"highway {site}"].scenarios()
