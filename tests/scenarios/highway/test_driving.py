@@ -237,7 +237,7 @@ class Short(Vehicle):
 
 @pytest.mark.parametrize("steering_rad", [0.0, 0.2, -0.5])
 def test_right_of_way_predicts_controlled_vehicles_along_their_curve(steering_rad):
-    """The predicted poses are those of highway-env's plain vehicle, every 0.25 s, without copies."""
+    """The predicted poses every 0.25 s are those of highway-env's plain vehicle."""
     site = SITES["intersection"]
     road, times = empty_road(site), np.arange(0.25, 3.0, 0.25)
     given = (road, [-50.0, 2.0], 0.1, 7.0)
