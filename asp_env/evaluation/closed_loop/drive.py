@@ -162,11 +162,7 @@ def drive(config: Drive) -> ClosedLoopResult:
                 *(name for name, p in predictors.items() if p.privileged),
             ],
             "traffic": config.traffic,
-            "metrics": {
-                "preset": rules.name,
-                "version": rules.version,
-                "about": rules.description,
-            },
+            "metrics": {"preset": rules.name, "version": rules.version, "about": rules.description},
             "horizon_s": config.horizon,
             "dt_s": config.dt,
             "part": part,

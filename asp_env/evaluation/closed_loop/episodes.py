@@ -83,7 +83,7 @@ def drive_episodes(
     predictor: Predictor,
     settings: EpisodeSettings,
 ) -> DrivenEpisodes:
-    """Drives every scenario to its end, all side by side: one forecast and one plan per tick.
+    """Drives all scenarios to their ends, side by side: one forecast and one plan per tick.
 
     If the planner is privileged, the world replays the logged egos instead. Contacts and the
     drivable area end episodes, so they are measured at every tick; all else is measured at the
@@ -238,9 +238,10 @@ def traffic_realism(world: World, active: Bool[np.ndarray, "b t"]) -> dict[str, 
             simulated,
             world.dt_s,
         )
-        logged = realism_features(log_states, log_valid, *shared)
         sample = realism_features(states, valid, *shared)
-        for name, each in realism(logged, [sample]).items():
+        for name, each in realism(
+            realism_features(log_states, log_valid, *shared), [sample]
+        ).items():
             by_name.setdefault(name, []).append(each)
     return {
         name: Masked(
