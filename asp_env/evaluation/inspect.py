@@ -87,7 +87,7 @@ class Drifts:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Findings:
+class RecordingSummary:
     """What the tables show of one recording."""
 
     recording: Recording
@@ -117,22 +117,22 @@ class Inspect:
         console = Console()
         if not console.is_terminal:
             console = Console(width=PIPED_WIDTH)
-        found, faults = self._examine(recordings, console)
-        if found:
-            maps = {id(each.recording.road_map): each.recording.road_map for each in found}
-            console.print(_recording_table(self.data, found))
+        summaries, faults = self._examine(recordings, console)
+        if summaries:
+            maps = {id(each.recording.road_map): each.recording.road_map for each in summaries}
+            console.print(_recording_table(self.data, summaries))
             console.print(_map_table(list(maps.values())))
-            console.print(_drift_table(found, self.dt))
-            console.print(_scenario_table(found))
-            _print_lines(console, "Repairs", _repairs(found, list(maps.values())))
+            console.print(_drift_table(summaries, self.dt))
+            console.print(_scenario_table(summaries))
+            _print_lines(console, "Repairs", _repairs(summaries, list(maps.values())))
         _print_lines(console, "Faults", list(faults.values()))
         if faults:
             raise DataError(_summary(recordings, faults))
 
     def _examine(
         self, recordings: Recordings, console: Console
-    ) -> tuple[list[Findings], dict[str, str]]:
-        found: list[Findings] = []
+    ) -> tuple[list[RecordingSummary], dict[str, str]]:
+        summaries: list[RecordingSummary] = []
         faults: dict[str, str] = {}
         numbers = track(
             range(len(recordings)),
@@ -148,8 +148,8 @@ class Inspect:
                 faults[recordings.names[number]] = str(error)
                 continue
             frames_per_tick(recording.frame_rate_hz, self.dt)
-            found.append(
-                Findings(
+            summaries.append(
+                RecordingSummary(
                     recording=recording,
                     on_road=_on_road(recording),
                     drifts=_drifts(recording, self.dt),
@@ -161,7 +161,7 @@ class Inspect:
                     ),
                 )
             )
-        return found, faults
+        return summaries, faults
 
 
 def _drifts(recording: Recording, dt_s: float) -> Drifts:
@@ -188,7 +188,7 @@ def _on_road(recording: Recording) -> float:
     return float((field.distance_m(points) <= 0).mean())
 
 
-def _recording_table(data: str, found: list[Findings]) -> Table:
+def _recording_table(data: str, summaries: list[RecordingSummary]) -> Table:
     table = Table(
         title=f"Recordings of {data}",
         title_justify="left",
@@ -203,7 +203,7 @@ def _recording_table(data: str, found: list[Findings]) -> Table:
     for name in ("parked", "on road %", "3+3 s", "3+6 s"):
         table.add_column(name, justify="right")
     table.add_column("image")
-    for each in found:
+    for each in summaries:
         recording = each.recording
         table.add_row(
             recording.name,
@@ -218,20 +218,21 @@ def _recording_table(data: str, found: list[Findings]) -> Table:
             *(f"{len(each.drifts.metres[horizon_s]):,}" for horizon_s in HORIZONS_S),
             "yes" if recording.background else "no",
         )
-    if len(found) > 1:
+    if len(summaries) > 1:
         table.add_section()
         sums = [
-            sum(len(each.drifts.metres[horizon_s]) for each in found) for horizon_s in HORIZONS_S
+            sum(len(each.drifts.metres[horizon_s]) for each in summaries)
+            for horizon_s in HORIZONS_S
         ]
         table.add_row(
-            f"all {len(found)}",
+            f"all {len(summaries)}",
             "",
             "",
-            f"{sum(each.recording.duration_s for each in found):.1f}",
-            f"{sum(len(each.recording.states) for each in found):,}",
-            str(sum(len(each.recording) for each in found)),
+            f"{sum(each.recording.duration_s for each in summaries):.1f}",
+            f"{sum(len(each.recording.states) for each in summaries):,}",
+            str(sum(len(each.recording) for each in summaries)),
             "",
-            str(sum(int(each.recording.parked.sum()) for each in found)),
+            str(sum(int(each.recording.parked.sum()) for each in summaries)),
             "",
             *(f"{count:,}" for count in sums),
             "",
@@ -262,19 +263,19 @@ def _map_table(maps: list[RoadMap]) -> Table:
     return table
 
 
-def _drift_table(found: list[Findings], dt_s: float) -> Table:
+def _drift_table(summaries: list[RecordingSummary], dt_s: float) -> Table:
     title = f"Drift of inferred actions (Heun, {dt_s:g} s) in metres: median / 90 % / 99 %"
     table = Table(title=title, title_justify="left")
     table.add_column("name")
     for horizon_s in HORIZONS_S:
         for name in (f"n {horizon_s:g} s", "all", "n moving", "moving"):
             table.add_column(name, justify="right")
-    with_snippets = [each for each in found if len(each.drifts.metres[HORIZONS_S[0]])]
+    with_snippets = [each for each in summaries if len(each.drifts.metres[HORIZONS_S[0]])]
     for each in with_snippets:
         table.add_row(each.recording.name, *_drift_cells([each.drifts]))
     if len(with_snippets) != 1:
         table.add_section()
-        table.add_row("all", *_drift_cells([each.drifts for each in found]))
+        table.add_row("all", *_drift_cells([each.drifts for each in summaries]))
     return table
 
 
@@ -288,12 +289,12 @@ def _drift_cells(drifts: list[Drifts]) -> list[str]:
     return cells
 
 
-def _scenario_table(found: list[Findings]) -> Table:
+def _scenario_table(summaries: list[RecordingSummary]) -> Table:
     table = Table(title="Scenarios by tag, with medians of their measures", title_justify="left")
     for name in ("tag", "n", *COLUMNS):
         table.add_column(name, justify="left" if name == "tag" else "right")
-    values = np.concatenate([each.scenarios.values for each in found])
-    tags = np.concatenate([each.scenarios.tags for each in found])
+    values = np.concatenate([each.scenarios.values for each in summaries])
+    tags = np.concatenate([each.scenarios.tags for each in summaries])
     rows = {"all": np.ones(len(tags), dtype=bool)} | dict(zip(TAGS, tags.T, strict=True))
     for tag, member in rows.items():
         medians = np.median(values[member], axis=0).tolist() if member.any() else []
@@ -308,11 +309,11 @@ def _percentiles(metres: Float[np.ndarray, " n"]) -> str:
     return " / ".join(f"{value:.2f}" for value in np.percentile(metres, PERCENTILES))
 
 
-def _repairs(found: list[Findings], maps: list[RoadMap]) -> list[str]:
+def _repairs(summaries: list[RecordingSummary], maps: list[RoadMap]) -> list[str]:
     of_maps = [f"map {road_map.name}: {line}" for road_map in maps for line in road_map.repairs]
     return of_maps + [
         f"recording {each.recording.name}: {line}"
-        for each in found
+        for each in summaries
         for line in each.recording.repairs
     ]
 

@@ -400,7 +400,7 @@ def rows(findings: Findings, sites: Mapping[str, Site], recipe: str) -> list[Row
         sites: sites by name.
         recipe: the table's recipe.
     """
-    found: list[Row] = []
+    lines: list[Row] = []
     for key in findings.sums:
         site = sites[key.site]
         common: dict[str, Any] = {
@@ -416,13 +416,13 @@ def rows(findings: Findings, sites: Mapping[str, Site], recipe: str) -> list[Row
         others = [(f" less {each.predictor}", each) for each in findings.references(key)]
         others += [] if base is None else [(" less the recipe", base)]
         for choice in CHOICES:
-            found += _rows(common, choice, findings.means(key, choice))
+            lines += _rows(common, choice, findings.means(key, choice))
             for suffix, other in others:
-                found += _rows(common, choice, findings.differences(key, other, choice), suffix)
+                lines += _rows(common, choice, findings.differences(key, other, choice), suffix)
         for name, values in _features_by_name(findings, key).items():
             value = sum(values) / len(values)
-            found.append(Row(**common, metric=name, value=value, n=len(values)))
-    return found
+            lines.append(Row(**common, metric=name, value=value, n=len(values)))
+    return lines
 
 
 def _rows(

@@ -21,7 +21,7 @@ from asp_env.render.window import PlayerState, play
 
 SAME_PLACE_M = 1.0
 """Largest distance between the first position of a logged ego in its rollout and in DATA. Chosen by
-hand: it distinguishes recordings of the same name."""
+hand, to distinguish recordings of the same name."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
