@@ -208,7 +208,7 @@ def fill_missing(forecast: Forecast, scene: Scene) -> Forecast:
 def _accept_about(predictor: object) -> None:
     """Defines `metadata` for predictors that still have it under its former name, `about`."""
     kind: Any = type(predictor)
-    inherited = getattr(kind, "metadata", None) is Predictor.metadata  # not defined
+    inherited = getattr(kind, "metadata", None) is vars(Predictor)["metadata"]  # not defined
     if (not inherited and hasattr(predictor, "metadata")) or not hasattr(predictor, "about"):
         return
     warnings.warn(
