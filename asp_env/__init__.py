@@ -72,9 +72,14 @@ _MODULES = {
 }
 _MODULE_OF = {name: module for module, names in _MODULES.items() for name in names}
 
+_SUBMODULES = frozenset({"data", "dynamics", "envs", "errors", "metrics", "registry", "sim"})
+"""Sub-modules that `import asp_env` alone makes available as attributes, imported on first use."""
+
 
 def __getattr__(name: str) -> Any:
-    """Imports a public name on first use."""
+    """Imports a public name or a sub-module on first use."""
+    if name in _SUBMODULES:
+        return import_module(f"{__name__}.{name}")
     if name not in _MODULE_OF:
         raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
     value = getattr(import_module(_MODULE_OF[name]), name)
@@ -84,7 +89,7 @@ def __getattr__(name: str) -> Any:
 
 def __dir__() -> list[str]:
     """Lists the public names, imported or not."""
-    return sorted({*globals(), *__all__})
+    return sorted({*globals(), *__all__, *_SUBMODULES})
 
 
 for _name, _kwargs in (

@@ -207,9 +207,10 @@ def fill_missing(forecast: Forecast, scene: Scene) -> Forecast:
 
 def _accept_about(predictor: object) -> None:
     """Defines `metadata` for predictors that still have it under its former name, `about`."""
-    if hasattr(predictor, "metadata") or not hasattr(predictor, "about"):
-        return
     kind: Any = type(predictor)
+    inherited = getattr(kind, "metadata", None) is vars(Predictor)["metadata"]  # not defined
+    if (not inherited and hasattr(predictor, "metadata")) or not hasattr(predictor, "about"):
+        return
     warnings.warn(
         f"{kind.__name__}.about is deprecated and will be ignored from the next release on: rename "
         "it to `metadata`",

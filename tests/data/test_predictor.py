@@ -66,12 +66,17 @@ class FormerPredictor:
         raise NotImplementedError
 
 
-def test_former_name_of_metadata_still_works(monkeypatch: pytest.MonkeyPatch) -> None:
-    """The first load warns; the predictor then satisfies the protocol."""
-    monkeypatch.setattr(registry, "find", lambda *_: FormerPredictor)
-    with pytest.warns(
-        DeprecationWarning, match=r"FormerPredictor\.about .* rename it to `metadata`"
-    ):
+@pytest.mark.parametrize("bases", [(FormerPredictor,), (FormerPredictor, Predictor)])
+def test_former_name_of_metadata_still_works(
+    bases: tuple[type, ...], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The first load warns; the predictor then satisfies the protocol.
+
+    A class with the protocol as a base inherits a `metadata` without content.
+    """
+    kind = type("Former", bases, {})
+    monkeypatch.setattr(registry, "find", lambda *_: kind)
+    with pytest.warns(DeprecationWarning, match=r"Former\.about .* rename it to `metadata`"):
         predictor = load_predictor("former", horizon=5, dt_s=0.2)
     assert isinstance(predictor, Predictor)
     assert predictor.metadata == {"weights": "abc"}

@@ -92,6 +92,19 @@ def test_editors_see_the_public_names():
     assert sorted(asp_env._MODULE_OF) == sorted(asp_env.__all__)
 
 
+def test_importing_the_package_makes_its_sub_modules_available():
+    """`import asp_env` alone is enough for `asp_env.data` and others, as it was before."""
+    code = (
+        "import asp_env\n"
+        "assert asp_env.data.source.open_data is asp_env.open_data\n"
+        "assert asp_env.errors.AspEnvError is asp_env.AspEnvError\n"
+        "assert {'data', 'errors'} <= set(dir(asp_env))\n"
+        "for name in asp_env._SUBMODULES:\n"
+        "    assert getattr(asp_env, name).__name__ == f'asp_env.{name}'"
+    )
+    subprocess.run([sys.executable, "-c", code], check=True)
+
+
 def test_importing_the_package_imports_no_environment():
     """Registration needs only Gymnasium; public names are imported on first use."""
     code = (
