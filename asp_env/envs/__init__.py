@@ -1,4 +1,8 @@
-"""The Gymnasium, PettingZoo and stable-baselines3 environments, and their wrappers."""
+"""The Gymnasium, PettingZoo and stable-baselines3 environments, and their wrappers.
+
+`ParallelReplayEnv` and `ReplayVecEnv` need PettingZoo and stable-baselines3. They are not part of
+`from asp_env.envs import *`.
+"""
 
 from typing import TYPE_CHECKING, Any
 
@@ -15,11 +19,9 @@ if TYPE_CHECKING:
 __all__ = [
     "EnvSnapshot",
     "FlatParts",
-    "ParallelReplayEnv",
     "PredictionFeatures",
     "ReplayEnv",
     "ReplayOptions",
-    "ReplayVecEnv",
     "ReplayVectorEnv",
     "UnknownOptionError",
     "VectorPredictionFeatures",

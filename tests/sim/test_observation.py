@@ -218,7 +218,7 @@ def test_only_chosen_components_are_computed(monkeypatch):
         raise AssertionError("not needed")
 
     simulation = simulate(on_road(), scenario())
-    monkeypatch.setattr(type(VIEW), "draw", refuse)
+    monkeypatch.setattr(type(VIEW), "render", refuse)
     monkeypatch.setattr("asp_env.sim.world.World.scene", refuse)
     _observe(simulation, "actions", "state")
     monkeypatch.setattr("asp_env.sim.observation.infer_actions", refuse)
