@@ -13,8 +13,8 @@ from asp_env.envs.vector import ReplayVectorEnv, VectorSnapshot
 from asp_env.envs.wrappers import FlatParts, PredictionFeatures, VectorPredictionFeatures
 
 if TYPE_CHECKING:
-    from asp_env.envs.parallel import ParallelReplayEnv
-    from asp_env.envs.sb3 import ReplayVecEnv
+    from asp_env.envs.parallel import ParallelReplayEnv as ParallelReplayEnv
+    from asp_env.envs.sb3 import ReplayVecEnv as ReplayVecEnv
 
 __all__ = [
     "EnvSnapshot",
