@@ -6,10 +6,9 @@ from typing import ClassVar
 import numpy as np
 
 from asp_env import Forecast, ReplayEnv, Scene, normalize_actions
-from asp_env.data.predictor import fill_missing, make_forecast
-from asp_env.data.snippets import Future
+from asp_env.data import Future, fill_missing, make_forecast
 from asp_env.dynamics import rollout
-from asp_env.planning.sampling import SamplingPlanner
+from asp_env.planning import SamplingPlanner
 
 
 class Braking:

@@ -7,8 +7,8 @@ import numpy as np
 from jaxtyping import UInt8
 
 from asp_env import ReplayEnv
-from asp_env.data.predictor import load_predictor
-from asp_env.render.frames import draw_frame
+from asp_env.data import load_predictor
+from asp_env.render import draw_frame
 
 ROAD, AGENTS, TRAIL, EGO = (150, 150, 150), (235, 120, 60), (250, 220, 90), (80, 200, 120)
 
