@@ -64,7 +64,7 @@ def snippet_parts(
 ) -> tuple[Shaped[np.ndarray, " n"], TrainedOn]:
     """Assigns snippets to parts.
 
-    Recordings are assigned by their number of snippets with a horizon of 3 s, whatever the horizon
+    Recordings are assigned by their number of snippets with a horizon of 3 s, for every horizon
     of `index`, so that a run for 6 s that continues from one for 3 s uses the same recordings.
 
     Returns:
