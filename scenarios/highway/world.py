@@ -150,8 +150,8 @@ class HighwayWorld(World):
     ) -> None:
         states, held, lengths = gather_controlled(self.episodes, rows, now, actions, acting)
         times_s = [*((k + 1) * STEP_S for k in range(self._stride - 1)), self.dt_s]
-        ways = np.stack([forward(states, held, lengths, each) for each in times_s])
-        poses = mirror_states(ways.astype(np.float64)).swapaxes(0, 1).tolist()
+        states_at = np.stack([forward(states, held, lengths, each) for each in times_s])
+        poses = mirror_states(states_at.astype(np.float64)).swapaxes(0, 1).tolist()
         commands = mirror_actions(held.astype(np.float64)).tolist()
         at = 0
         for i, b in enumerate(rows.tolist()):
@@ -161,7 +161,7 @@ class HighwayWorld(World):
                 acceleration, steering = commands[number]
                 self._vehicle(b, slot).steer(acceleration, steering, poses[number])
             self._advance(b, controlled[i], commanded)
-            self._write(b, int(now[i]) + 1, acting[i], ways[-1, at : at + len(steered)])
+            self._write(b, int(now[i]) + 1, acting[i], states_at[-1, at : at + len(steered)])
             at += len(steered)
 
     def _vehicle(self, b: int, slot: int) -> TrafficVehicle:

@@ -175,7 +175,7 @@ def _measure(
     contacts = np.stack([each.contacts for each in events], axis=1)
     off_road_m = np.stack([each.off_road_m for each in events], axis=1)
     limits = [world.recordings[int(i)].speed_limit_mps for i in episodes.recording]
-    on_map = map_context(
+    context = map_context(
         *world.maps(),
         states[:, :, EGO],
         episodes.sizes[:, EGO],
@@ -185,6 +185,7 @@ def _measure(
             valid=np.array([limit is not None for limit in limits]),
         ),
     )
+    lane_is_ambiguous = context.several_lanes | context.at_crossing
     return EpisodeRecord(
         states=states[:, :, EGO],
         log_states=episodes.log_states[:, ticks, EGO],
@@ -196,7 +197,7 @@ def _measure(
             episodes.sizes,
             contacts=contacts,
             ignored=episodes.own_trailer,
-            wide_sector=on_map.several_lanes | on_map.at_crossing | (off_road_m > rules.off_road_m),
+            wide_sector=lane_is_ambiguous | (off_road_m > rules.off_road_m),
             num_ticks=active.sum(axis=1),
             rule=rules.ttc,
             dt_s=world.dt_s,
@@ -204,7 +205,7 @@ def _measure(
         route_m=np.stack([each.route_m for each in events], axis=1),
         route_offset_m=np.stack([each.route_offset_m for each in events], axis=1),
         goal_m=events[0].goal_m,
-        map_context=on_map,
+        map_context=context,
         active=active,
         dt_s=world.dt_s,
     )
