@@ -14,10 +14,10 @@ from asp_env.errors import AspEnvError, unknown_name
 from asp_env.files import atomic_folder
 from asp_env.geometry import boxes_overlap
 from scenarios.noise import measure
-from scenarios.sumo.demand import RoadUser, demand
+from scenarios.sumo.demand import RoadUser, Traffic, demand
 from scenarios.sumo.motion import FRAME_RATE_HZ, Motion, reconstruct
 from scenarios.sumo.network import Movements, simulate
-from scenarios.sumo.place import METRES_PER_ORTHO_PIXEL, SITES, Place, make_place
+from scenarios.sumo.place import DENSE_SITES, METRES_PER_ORTHO_PIXEL, SITES, Place, make_place
 from scenarios.tables import Meta, Track, write_recording_meta, write_tracks, write_tracks_meta
 
 EVERY_FRAMES = 5
@@ -94,7 +94,7 @@ def overlapping(motions: dict[str, Motion], users: dict[str, RoadUser]) -> set[t
 
 
 def record(
-    rng: np.random.Generator, place: Place, *, num_frames: int
+    rng: np.random.Generator, place: Place, *, num_frames: int, traffic: Traffic = "normal"
 ) -> tuple[dict[str, Motion], dict[str, RoadUser]]:
     """Simulates traffic at a location without overlapping agents.
 
@@ -106,17 +106,24 @@ def record(
         rng: draws the demand and SUMO's seed.
         place: the location.
         num_frames: length of the recording.
+        traffic: `normal` or `dense`.
 
     Returns:
         All motions in the recording's frame and all agents, both by name.
     """
     seconds = WARM_UP_S + num_frames / FRAME_RATE_HZ + _AFTER_S
-    wanted = demand(rng, place.site, seconds)
+    wanted = demand(rng, place.site, seconds, traffic)
     seed = int(rng.integers(1, 2**31 - 1))
     motions: dict[str, Motion] = {}
     late: set[str] = set()
     for _ in range(_MOST_ATTEMPTS):
-        moved = simulate(place.folder, wanted.routes, seconds=seconds, seed=seed)
+        moved = simulate(
+            place.folder,
+            wanted.routes,
+            seconds=seconds,
+            seed=seed,
+            impatient=traffic == "dense",
+        )
         motions = _motions(moved, place, wanted.users)
         departs = {name: depart for depart, name, _ in wanted.entries}
         late = {
@@ -253,6 +260,7 @@ def synthesize(
     seed: int,
     noise: bool = False,
     locations: int | None = None,
+    traffic: Traffic = "normal",
     compress: bool = False,
     progress: bool = False,
 ) -> None:
@@ -268,6 +276,7 @@ def synthesize(
         noise: whether to write measured instead of true tracks; the true tracks go to
             `truth/XX_trueTracks.csv`, which readers ignore.
         locations: number of locations; by default one for three recordings.
+        traffic: `normal` or `dense`.
         compress: whether to write tracks as `.csv.gz`.
         progress: whether to show a progress bar.
 
@@ -294,7 +303,9 @@ def synthesize(
         ):
             location = recording * places // recordings
             if location not in made:
-                made[location] = _make_location(folder, Path(scratch), site, seed, location)
+                made[location] = _make_location(
+                    folder, Path(scratch), site, seed, location, traffic
+                )
             _write_recording(
                 folder,
                 made[location],
@@ -303,6 +314,7 @@ def synthesize(
                 location=location,
                 num_frames=round(minutes * 60.0 * FRAME_RATE_HZ),
                 noise=noise,
+                traffic=traffic,
                 suffix=".csv.gz" if compress else ".csv",
             )
 
@@ -311,9 +323,11 @@ def _rng(seed: int, site: str, purpose: int, number: int) -> np.random.Generator
     return np.random.default_rng([seed, list(SITES).index(site), purpose, number])
 
 
-def _make_location(folder: Path, scratch: Path, site: str, seed: int, location: int) -> Place:
+def _make_location(
+    folder: Path, scratch: Path, site: str, seed: int, location: int, traffic: Traffic
+) -> Place:
     rng = _rng(seed, site, 0, location)
-    kinds = SITES[site]
+    kinds = SITES[site] if traffic == "normal" else DENSE_SITES[site]
     place = make_place(rng, kinds[location % len(kinds)](rng), scratch / str(location))
     maps = folder / "maps" / "lanelets" / f"{location:02d}_{place.site.kind}"
     maps.mkdir(parents=True)
@@ -331,9 +345,10 @@ def _write_recording(
     location: int,
     num_frames: int,
     noise: bool,
+    traffic: Traffic,
     suffix: str,
 ) -> None:
-    motions, users = record(rng, place, num_frames=num_frames)
+    motions, users = record(rng, place, num_frames=num_frames, traffic=traffic)
     parked = parked_cars(rng, place, num_frames)
     true = parked + tracks_in_view(place, motions, users, num_frames=num_frames)
     seen = true
