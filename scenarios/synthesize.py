@@ -64,6 +64,7 @@ class Synthesize:
         traffic: `normal`, or `dense`: vehicles follow each other after 3 to 6 s on the main road,
             more of them turn left across oncoming traffic, drivers differ in whether they yield,
             and vehicles leave two-lane roundabouts from both lanes. Sites of SUMO only.
+        jobs: Number of processes; the bytes do not depend on it. Sites of SUMO only.
     """
 
     out: Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="OUT")]
@@ -74,6 +75,7 @@ class Synthesize:
     noise: bool = False
     locations: int | None = None
     traffic: Traffic = "normal"
+    jobs: int = 1
 
     def run(self) -> None:
         """Writes the folder.
@@ -94,6 +96,7 @@ class Synthesize:
             noise=self.noise,
             locations=self.locations,
             traffic=self.traffic,
+            jobs=self.jobs,
             progress=True,
         )
 
