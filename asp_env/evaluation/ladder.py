@@ -138,6 +138,16 @@ def headroom(
         return interval((scores - baseline) / (oracle - baseline), n=n)
 
 
+def is_under_test(predictor: str, *, privileged: bool) -> bool:
+    """Whether a predictor is compared for its own sake, and not a control.
+
+    Args:
+        predictor: name of the predictor as given; empty for a method without forecasts.
+        privileged: whether the method is given the recorded future.
+    """
+    return bool(predictor) and not privileged and predictor not in CONTROLS
+
+
 def missing_controls(predictors: Sequence[str]) -> tuple[str, ...]:
     """The controls that a comparison lacks, in the order of `CONTROLS`.
 

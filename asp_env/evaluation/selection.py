@@ -106,30 +106,37 @@ def short_names(names: Sequence[str]) -> dict[str, str]:
     the folder is added (`mtp 1`), and where that is ambiguous too, the whole path (`mtp a-1`).
     Numbers are always part of the label (`blend 0.25`, `delayed 2 mtp`).
     """
-    labels = {name: _without_folder(name) for name in names}
-    labels = _lengthen(labels, lambda name: PurePath(_folder(name)).name)
-    return _lengthen(labels, lambda name: _folder(name).strip("/").replace("/", "-"))
+    labels = {name: without_folder(name) for name in names}
+    labels = _lengthen(labels, lambda name: PurePath(run_folder(name)).name)
+    return _lengthen(labels, lambda name: run_folder(name).strip("/").replace("/", "-"))
 
 
-def _without_folder(name: str) -> str:
-    """The words of a name up to its run folder: registered names and numbers."""
+def without_folder(name: str) -> str:
+    """The words of a predictor's name up to its run folder: registered names and numbers.
+
+    Args:
+        name: the name as given, such as `delayed:2:ffw-asp:runs/a`.
+
+    Returns:
+        The words, such as `delayed 2 ffw-asp`.
+    """
     kind, _, argument = name.partition(":")
     number, _, rest = argument.partition(":")
     if not re.fullmatch(r"\d*\.?\d+", number):
         return kind
-    return " ".join(part for part in (kind, number, _without_folder(rest)) if part)
+    return " ".join(part for part in (kind, number, without_folder(rest)) if part)
 
 
-def _folder(name: str) -> str:
-    """The run folder in a name; a number is none."""
-    words = _without_folder(name).count(" ") + 1
+def run_folder(name: str) -> str:
+    """The run folder in a predictor's name, such as `runs/a`; empty if there is none."""
+    words = without_folder(name).count(" ") + 1
     return ":".join(name.split(":")[words:])
 
 
 def _lengthen(labels: dict[str, str], suffix: Callable[[str], str]) -> dict[str, str]:
     counts = Counter(labels.values())
     return {
-        name: f"{_without_folder(name)} {suffix(name)}".strip() if counts[label] > 1 else label
+        name: f"{without_folder(name)} {suffix(name)}".strip() if counts[label] > 1 else label
         for name, label in labels.items()
     }
 

@@ -5,9 +5,10 @@ from collections.abc import Collection, Iterator, Mapping, Sequence
 from rich import box
 from rich.table import Table
 
+from asp_env.evaluation.ladder import is_under_test
 from asp_env.evaluation.results import ORACLE_SHARE, Row, difference_of
 from asp_env.evaluation.selection import short_names
-from asp_env.evaluation.verdicts import share_text, verdict_text
+from asp_env.evaluation.verdicts import headline, share_text, verdict_text
 
 Headings = Mapping[str, str]
 """Column headings by metric."""
@@ -108,6 +109,26 @@ def driving_tables(
     return tables
 
 
+def headlines(rows: Sequence[Row], privileged: Collection[str]) -> list[str]:
+    """A sentence for each predictor under test, of the last of `SUBSETS` that occurs.
+
+    Args:
+        rows: closed-loop rows of `metrics.csv`.
+        privileged: names of the privileged planners and predictors.
+    """
+    subset = next((name for name in reversed(SUBSETS) if any(r.subset == name for r in rows)), "")
+    chosen = [row for row in rows if row.subset == subset]
+    shares = {(row.planner, row.predictor): row for row in chosen if row.metric == ORACLE_SHARE}
+    return [
+        f"{subset} scenarios: "
+        + headline(name, pair[1], _signed(row), row, shares.get((row.planner, row.predictor)))
+        for name, row in _by_method(chosen, privileged, with_planner=False)
+        if (pair := difference_of(row.metric)) is not None
+        and pair[0] == "score"
+        and is_under_test(row.predictor, privileged=row.predictor in privileged)
+    ]
+
+
 def driving_table(
     rows: Sequence[Row],
     privileged: Collection[str],
@@ -173,7 +194,7 @@ def _difference_table(metric: str, reference: str, lines: Mapping[str, Mapping[s
             name,
             _signed(row),
             "" if row.mde is None else f"{row.mde:.3f}",
-            verdict_text(row).replace(" (", "\n("),
+            verdict_text(row).replace(" (", "\n").replace(" needed)", "").rstrip(")"),
             *([share_text(share) if share else ""] if has_shares else []),
         )
     table.caption = "MDE: smallest difference that these scenarios resolve with 80 % power"

@@ -39,7 +39,7 @@ from asp_env.evaluation.selection import (
     short_names,
     ticks_to_evaluate,
 )
-from asp_env.evaluation.tables import driving_tables
+from asp_env.evaluation.tables import driving_tables, headlines
 from asp_env.files import atomic_folder
 from asp_env.metrics.driving.rules import DEFAULT_RULES, RULES, Rules
 from asp_env.sim.traffic.log import LogDriver
@@ -108,6 +108,8 @@ class Drive:
         shown = RULES[self.rules].shown
         for table in driving_tables(result.rows, result.manifest["privileged"], shown):
             console.print(table)
+        for sentence in headlines(result.rows, result.manifest["privileged"]):
+            console.print(sentence)
         console.print(f"wrote {self.out}/report.html")
 
 
