@@ -6,7 +6,7 @@ from rich import box
 from rich.table import Table
 
 from asp_env.evaluation.ladder import is_under_test
-from asp_env.evaluation.results import ORACLE_SHARE, Row, difference_of
+from asp_env.evaluation.results import ORACLE_SHARE, SCORE, Row, difference_of
 from asp_env.evaluation.selection import short_names
 from asp_env.evaluation.verdicts import headline, share_text, verdict_text
 
@@ -28,7 +28,7 @@ FORECAST_MORE = {
 }
 """Headings of the last open-loop table, by selection and metric."""
 
-DRIVING_INTERVALS: Headings = {"score": "score"}
+DRIVING_INTERVALS: Headings = {SCORE: "score"}
 DRIVING_VALUES: Headings = {
     "no collision": "no coll.",
     "no at-fault collision": "no fault",
@@ -124,7 +124,7 @@ def headlines(rows: Sequence[Row], privileged: Collection[str]) -> list[str]:
         + headline(name, pair[1], _signed(row), row, shares.get((row.planner, row.predictor)))
         for name, row in _by_method(chosen, privileged, with_planner=False)
         if (pair := difference_of(row.metric)) is not None
-        and pair[0] == "score"
+        and pair[0] == SCORE
         and is_under_test(row.predictor, privileged=row.predictor in privileged)
     ]
 
@@ -165,7 +165,7 @@ def _difference_tables(rows: Sequence[Row], privileged: Collection[str]) -> list
     differences = {
         row.metric: pair[1]
         for row in rows
-        if (pair := difference_of(row.metric)) is not None and pair[0] == "score"
+        if (pair := difference_of(row.metric)) is not None and pair[0] == SCORE
     }
     return [
         _difference_table(metric, reference, lines) for metric, reference in differences.items()

@@ -15,7 +15,7 @@ from asp_env.data.scenarios.scenario import ScenarioSet
 from asp_env.data.scenarios.tags import TAGS
 from asp_env.evaluation import ladder, statistics
 from asp_env.evaluation.closed_loop.comparison import EpisodeScores
-from asp_env.evaluation.results import HEADROOM, ORACLE_SHARE, Row, difference_name
+from asp_env.evaluation.results import HEADROOM, ORACLE_SHARE, SCORE, Row, difference_name
 from asp_env.evaluation.statistics import Difference, Estimate
 from asp_env.metrics.masked import Masked
 
@@ -57,9 +57,7 @@ class Comparison:
     common: Row
     """A row with the cells that all rows share."""
     compared: Sequence[str]
-    """Metrics of which differences are stated; the first is the score, if the rules have one."""
-    has_score: bool
-    """Whether the first compared metric is the score of the rules."""
+    """Metrics of which differences are stated, with the score if the rules have one."""
     reference: str | None
     """Predictor that differences refer to, None for no differences."""
     replayed: bool
@@ -132,7 +130,7 @@ def _table(comparison: Comparison, member: Bool[np.ndarray, " n"]) -> _Table:
             if estimate is not None:
                 table.estimates[number, metric] = estimate
     _add_differences(comparison, member, table)
-    if comparison.has_score and comparison.replayed:
+    if SCORE in comparison.compared and comparison.replayed:
         _add_ladder(comparison, member, table)
     return table
 
@@ -213,7 +211,7 @@ def _add_ladder(comparison: Comparison, member: Bool[np.ndarray, " n"], table: _
     rungs = {m.predictor: share for m in methods if (share := ladder.rung(m.predictor)) is not None}
     if ladder.BASELINE not in rungs or ladder.ORACLE not in rungs:
         return
-    means, n = _means(methods, "score", member, comparison.scenarios.recording)
+    means, n = _means(methods, SCORE, member, comparison.scenarios.recording)
     if not n:
         return
     of = dict(zip((m.predictor for m in methods), means.T, strict=True))

@@ -15,7 +15,7 @@ from asp_env.evaluation.report.results import (
     methods_of,
     metric_note,
 )
-from asp_env.evaluation.results import ORACLE_SHARE, difference_of
+from asp_env.evaluation.results import ORACLE_SHARE, SCORE, difference_of
 
 COLOURS = ("#e8590c", "#7048e8", "#0ca678", "#1c7ed6", "#d6336c", "#c99700", "#5c7cfa", "#74b816")
 PRIVILEGED_COLOUR = "#8a94a6"
@@ -151,7 +151,7 @@ def _compared(results: Sequence[Result]) -> set[str]:
     pairs = {r.metric: difference_of(r.metric) for r in results}
     return {
         ORACLE_SHARE,
-        *(metric for metric, pair in pairs.items() if pair and pair[0] == "score"),
+        *(metric for metric, pair in pairs.items() if pair and pair[0] == SCORE),
     }
 
 

@@ -16,10 +16,9 @@ from asp_env.evaluation.report.results import (
     methods_of,
     metric_note,
 )
-from asp_env.evaluation.results import HEADROOM, ORACLE_SHARE, difference_name, difference_of
+from asp_env.evaluation.results import HEADROOM, ORACLE_SHARE, SCORE, difference_name, difference_of
 from asp_env.evaluation.verdicts import NOT_RESOLVED, RESOLVED, headline, verdict_text
 
-SCORE = "score"
 COMPARISON = (ORACLE_SHARE, HEADROOM)
 """Metrics beside the difference of the score."""
 COMPARED_SUBSETS = ("all", "interactive")
