@@ -67,7 +67,7 @@ def open_loop_tables(rows: Sequence[Row], privileged: Collection[str] = ()) -> l
     for row in rows:
         if row.subset != subset:
             continue
-        name = short[row.predictor] + (MARK if row.predictor in privileged else "")
+        name = short[row.predictor] + _runs(row) + (MARK if row.predictor in privileged else "")
         if row.selection:
             lines = by_selection.setdefault(row.selection, {})
             lines.setdefault(name, {})[row.metric] = row
@@ -120,7 +120,7 @@ def headlines(rows: Sequence[Row], privileged: Collection[str]) -> list[str]:
     chosen = [row for row in rows if row.subset == subset]
     shares = {(row.planner, row.predictor): row for row in chosen if row.metric == ORACLE_SHARE}
     return [
-        f"{subset} scenarios: "
+        f"{_scenarios(subset, row.n)}: ".capitalize()
         + headline(name, pair[1], _signed(row), row, shares.get((row.planner, row.predictor)))
         for name, row in _by_method(chosen, privileged, with_planner=False)
         if (pair := difference_of(row.metric)) is not None
@@ -145,7 +145,8 @@ def driving_table(
         subset: `all` or a tag.
     """
     rules = " and ".join(dict.fromkeys(row.rules for row in rows))
-    table = _table(f"{_scenarios(subset)}: driving by {rules}, mean, 95 % interval over recordings")
+    count = max((row.n for row in rows if row.subset == subset), default=0)
+    table = _table(f"{_scenarios(subset, count)}: driving by {rules}, mean [95 % interval]")
     if len(shown) > MAX_PADDED_COLUMNS:
         table.padding = 0
     lines: dict[str, dict[str, Row]] = {}
@@ -159,25 +160,28 @@ def driving_table(
 
 def _difference_tables(rows: Sequence[Row], privileged: Collection[str]) -> list[Table]:
     """The differences of the score to the reference; none without a score or a reference."""
+    planners = list(dict.fromkeys(row.planner for row in rows if row.predictor))
     lines: dict[str, dict[str, Row]] = {}
-    for name, row in _by_method(rows, privileged, with_planner=False):
+    for name, row in _by_method(rows, privileged, with_planner=len(planners) > 1):
         lines.setdefault(name, {})[row.metric] = row
     differences = {
-        row.metric: pair[1]
+        row.metric: (pair[1], row)
         for row in rows
         if (pair := difference_of(row.metric)) is not None and pair[0] == SCORE
     }
     return [
-        _difference_table(metric, reference, lines) for metric, reference in differences.items()
+        _difference_table(
+            f"{_scenarios(row.subset, row.n)}, {' and '.join(planners)}: "
+            f"score less that of {reference}",
+            metric,
+            lines,
+        )
+        for metric, (reference, row) in differences.items()
     ]
 
 
-def _difference_table(metric: str, reference: str, lines: Mapping[str, Mapping[str, Row]]) -> Table:
-    one = next(row for metrics in lines.values() for row in metrics.values())
-    planners = {row.planner for each in lines.values() for row in each.values() if row.predictor}
-    table = _table(
-        f"{_scenarios(one.subset)}: score less that of {reference}, {' and '.join(planners)}"
-    )
+def _difference_table(title: str, metric: str, lines: Mapping[str, Mapping[str, Row]]) -> Table:
+    table = _table(title)
     has_shares = any(ORACLE_SHARE in metrics for metrics in lines.values())
     table.add_column("predictor", min_width=16)
     table.add_column("difference", justify="right", no_wrap=True)
@@ -207,8 +211,8 @@ def _signed(row: Row) -> str:
     return f"{row.value:+.3f} [{row.low:.3f}, {row.high:.3f}]"
 
 
-def _scenarios(subset: str) -> str:
-    return f"{subset} scenarios"
+def _scenarios(subset: str, count: int) -> str:
+    return f"all {count} scenarios" if subset == "all" else f"{count} {subset} scenarios"
 
 
 def _by_method(
@@ -221,9 +225,12 @@ def _by_method(
         name = " + ".join(part for part in parts if part)
         if not with_planner and row.predictor:
             name = short[row.predictor]
-        runs = f" ({row.runs} runs)" if row.runs is not None and row.runs > 1 else ""
         mark = MARK if row.planner in privileged or row.predictor in privileged else ""
-        yield f"{name}{runs}{mark}", row
+        yield f"{name}{_runs(row)}{mark}", row
+
+
+def _runs(row: Row) -> str:
+    return f" ({row.runs} runs)" if row.runs is not None and row.runs > 1 else ""
 
 
 def _table(title: str) -> Table:

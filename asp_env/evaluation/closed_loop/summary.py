@@ -16,6 +16,7 @@ from asp_env.data.scenarios.tags import TAGS
 from asp_env.evaluation import ladder, statistics
 from asp_env.evaluation.closed_loop.comparison import EpisodeScores
 from asp_env.evaluation.results import HEADROOM, ORACLE_SHARE, SCORE, Row, difference_name
+from asp_env.evaluation.selection import shared_metadata
 from asp_env.evaluation.statistics import Difference, Estimate
 from asp_env.metrics.masked import Masked
 
@@ -42,10 +43,9 @@ class MethodScores:
             valid=np.stack([metric.valid for metric in each]),
         )
 
-    def fact(self, key: str) -> str:
-        """An entry of the predictors' metadata; different ones of several runs are joined."""
-        metadata = [predictor.metadata for predictor in self.runs.values() if predictor]
-        return " | ".join(dict.fromkeys(each.get(key, "") for each in metadata))
+    def metadata(self, key: str) -> str:
+        """An entry of the predictors' metadata; empty without forecasts."""
+        return shared_metadata([each for each in self.runs.values() if each is not None], key)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -99,9 +99,9 @@ def _method_row(comparison: Comparison, method: MethodScores) -> Row:
         comparison.common,
         planner=method.planner,
         predictor=method.predictor,
-        trained_on=method.fact("trained_on"),
-        view=method.fact("view"),
-        recipe=method.fact("preset"),
+        trained_on=method.metadata("trained_on"),
+        view=method.metadata("view"),
+        recipe=method.metadata("preset"),
         runs=len(method.runs) if method.predictor else None,
     )
 
