@@ -1,5 +1,6 @@
 """Which predictors are evaluated, and which part of DATA they are evaluated on."""
 
+import re
 from collections import Counter
 from collections.abc import Callable, Sequence
 from pathlib import PurePath
@@ -53,20 +54,36 @@ def load_predictors(names: Sequence[str], *, horizon: int, dt_s: float) -> list[
 def short_names(names: Sequence[str]) -> dict[str, str]:
     """The shortest distinct labels of predictors, by their full names.
 
-    A label is the name without its run folder (`mtp`). Where that is ambiguous, the last part of
-    the folder is added (`mtp 1`), and where that is ambiguous too, the whole path (`mtp a-1`).
+    A label is the name without its run folder (`mtp`), as `split_name` cuts it off. Where that is
+    ambiguous, the last part of the folder is added (`mtp 1`), and where that is ambiguous too, the
+    whole path (`mtp a-1`).
     """
-    labels = {name: name.partition(":")[0] for name in names}
-    labels = _lengthen(labels, lambda name: PurePath(name.partition(":")[2]).name)
-    return _lengthen(labels, lambda name: name.partition(":")[2].strip("/").replace("/", "-"))
+    labels = {name: split_name(name)[0] for name in names}
+    labels = _lengthen(labels, lambda run: PurePath(run).name)
+    return _lengthen(labels, lambda run: run.strip("/").replace("/", "-"))
+
+
+def split_name(name: str) -> tuple[str, str]:
+    """The label of a predictor and its run folder, which is empty for a predictor without one.
+
+    Numbers in the name belong to the label: `noisy-oracle:2` is `noisy-oracle 2`, and
+    `delayed:2:mtp:runs/1` is `delayed 2 mtp` with the folder `runs/1`.
+    """
+    kind, _, argument = name.partition(":")
+    number, _, inner = argument.partition(":")
+    if not re.fullmatch(r"[0-9.]+", number):
+        return kind, argument
+    label, run = split_name(inner)
+    return f"{kind} {number} {label}".strip(), run
 
 
 def _lengthen(labels: dict[str, str], suffix: Callable[[str], str]) -> dict[str, str]:
     counts = Counter(labels.values())
-    return {
-        name: f"{name.partition(':')[0]} {suffix(name)}".strip() if counts[label] > 1 else label
-        for name, label in labels.items()
-    }
+    lengthened = {}
+    for name, label in labels.items():
+        short, run = split_name(name)
+        lengthened[name] = f"{short} {suffix(run)}".strip() if counts[label] > 1 else label
+    return lengthened
 
 
 def ticks_to_evaluate(

@@ -150,6 +150,29 @@ def test_a_scenario_that_does_not_fit_is_refused(unfit, message):
     assert "\n" not in str(caught.value)
 
 
+def test_a_history_of_over_3_s_suits_the_same_scenarios():
+    """The ego's track begins 3 s before the start, the recording as well; the world shows 4 s.
+
+    The first second is empty; all later ticks are those of a world that shows 3 s.
+    """
+    recordings, scenarios = on_road(car(-50, 5)), [scenario(start=15, length=4)]
+    scenes = []
+    for history in (15, 20):
+        simulation = Simulation(
+            recordings, make_traffic("log"), num_episodes=1, dt_s=DT_S, history=history
+        )
+        simulation.reset(scenarios, [np.random.default_rng(0)])
+        drive(simulation, [(1.0, 0.1)] * 2)
+        scenes.append(simulation.world.scene())
+    short, long = scenes
+    assert long.valid[0, :, :3].tolist() == [[False] * 3] * 2
+    for name in ("states", "valid"):
+        later = getattr(long, name)[:, :, 5:]
+        np.testing.assert_array_equal(later, getattr(short, name))
+    np.testing.assert_array_equal(long.actions[:, :, 5:], short.actions)
+    np.testing.assert_array_equal(long.tick, short.tick)
+
+
 def test_a_refused_reset_changes_nothing():
     """A scenario that does not fit leaves all episodes unchanged, also those before it."""
     simulation = simulate(on_road(), [scenario(), scenario()])
