@@ -151,17 +151,13 @@ def test_a_scenario_that_does_not_fit_is_refused(unfit, message):
 
 
 def test_a_history_of_over_3_s_suits_the_same_scenarios():
-    """The ego's track begins 3 s before the start, the recording as well; the world shows 4 s.
+    """The ego's track and the recording begin 3 s before the start; the world shows 4 s.
 
-    The first second is empty; all later ticks are those of a world that shows 3 s.
+    The ticks before are empty, all later ones are those of a world that shows 3 s.
     """
-    recordings, scenarios = on_road(car(-50, 5)), [scenario(start=15, length=4)]
     scenes = []
     for history in (15, 20):
-        simulation = Simulation(
-            recordings, make_traffic("log"), num_episodes=1, dt_s=DT_S, history=history
-        )
-        simulation.reset(scenarios, [np.random.default_rng(0)])
+        simulation = simulate(on_road(car(-50, 5)), scenario(length=4), history=history)
         drive(simulation, [(1.0, 0.1)] * 2)
         scenes.append(simulation.world.scene())
     short, long = scenes
