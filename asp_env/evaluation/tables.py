@@ -28,6 +28,8 @@ FORECAST_MORE = {
 }
 """Headings of the last open-loop table, by selection and metric."""
 
+REGRET_INTERVALS: Headings = {"regret": "regret", "regret removed": "removed"}
+REGRET_VALUES: Headings = {"log1p regret": "log1p"}
 DRIVING_INTERVALS: Headings = {SCORE: "score"}
 DRIVING_VALUES: Headings = {
     "no collision": "no coll.",
@@ -43,6 +45,9 @@ DRIVING_VALUES: Headings = {
     "comfort": "comf",
     "log divergence": "to log m",
 }
+
+SUBSETS = ("all", "interactive")
+"""Subsets of scenarios that are printed, as far as they occur."""
 
 MAX_PADDED_COLUMNS = 6
 """With more metrics than this, columns have no padding, so that a table fits 80 columns."""
@@ -86,8 +91,34 @@ def open_loop_tables(rows: Sequence[Row], privileged: Collection[str] = ()) -> l
     return tables
 
 
-SUBSETS = ("all", "interactive")
-"""Subsets of scenarios that are printed, as far as they occur."""
+def regret_tables(
+    rows: Sequence[Row], privileged: Collection[str] = (), *, planner: str
+) -> list[Table]:
+    """Planning regret by predictor, a table for each of `SUBSETS` that occurs.
+
+    Args:
+        rows: open-loop rows of `metrics.csv`.
+        privileged: full names of the privileged predictors, which are marked.
+        planner: name of the planner.
+    """
+    shown = {*REGRET_INTERVALS, *REGRET_VALUES}
+    short = short_names([row.predictor for row in rows])
+    tables = []
+    for subset in SUBSETS:
+        lines: dict[str, dict[str, Row]] = {}
+        for row in rows:
+            if row.subset == subset and row.metric in shown:
+                name = (
+                    short[row.predictor]
+                    + _runs(row)
+                    + (MARK if row.predictor in privileged else "")
+                )
+                lines.setdefault(name, {})[row.metric] = row
+        if lines:
+            title = f"planning regret, {planner}, {subset} scenarios"
+            tables.append(_table(title))
+            _fill(tables[-1], "predictor", lines, REGRET_INTERVALS, REGRET_VALUES)
+    return tables
 
 
 def driving_tables(

@@ -7,12 +7,13 @@ from typing import Annotated, Any, Literal
 
 import numpy as np
 import tyro
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Bool, Int
 from rich.console import Console
 
 from asp_env.data.causal import causal_histories
 from asp_env.data.predictor import Predictor
 from asp_env.data.recording import DEFAULT_DT_S, ticks
+from asp_env.data.scenarios.scenario import find_scenarios
 from asp_env.data.snippets import (
     HISTORY_S,
     SnippetIndex,
@@ -30,6 +31,7 @@ from asp_env.evaluation.open_loop.scoring import (
     complete_forecast,
     score_forecasts,
 )
+from asp_env.evaluation.regret import RegretScores, load_candidate_planner, score_regrets
 from asp_env.evaluation.report import ForecastExamples, check_report_possible, write_report
 from asp_env.evaluation.results import Row, write_manifest, write_metrics
 from asp_env.evaluation.selection import (
@@ -41,16 +43,20 @@ from asp_env.evaluation.selection import (
     ticks_to_evaluate,
 )
 from asp_env.evaluation.statistics import Estimate
-from asp_env.evaluation.tables import open_loop_tables
+from asp_env.evaluation.tables import open_loop_tables, regret_tables
 from asp_env.files import atomic_folder
 from asp_env.metrics.forecast.calibration import calibration_error, calibration_sums
 from asp_env.metrics.forecast.errors import MODE_RULES, ModeRule
+from asp_env.planning.planner import CandidatePlanner
 
 REFERENCE = "constant-velocity"
 """If this predictor takes part, the FDE of the others is also stated as a ratio to its FDE."""
 
 RATIO = "FDE / constant velocity"
 ECE = "ECE"
+
+NO_PLANNER = ("", "none")
+"""Values of `--planner` that measure no planning regret."""
 
 EXAMPLES = 6
 """Number of situations whose forecasts the report shows."""
@@ -84,6 +90,11 @@ class Evaluate:
     best_by: ModeRule = "fde"
     """How the best of 3 modes is chosen: lowest final error,
     lowest mean error, or the rule of the paper."""
+    planner: str = "sampling"
+    """Planner whose planning regret is measured with each
+    predictor at states of the logged ego; none for no regret."""
+    max_states: int = 2000
+    """Largest number of these states; chosen at even spacing."""
 
     def run(self) -> None:
         """Evaluates, writes the folder and prints the tables.
@@ -100,7 +111,11 @@ class Evaluate:
                 folder, title=f"Open loop on {Path(self.data).name}", examples=result.examples
             )
         console = Console()
-        for table in open_loop_tables(result.rows, result.manifest["privileged"]):
+        privileged = result.manifest["privileged"]
+        for table in (
+            *open_loop_tables(result.rows, privileged),
+            *regret_tables(result.rows, privileged, planner=self.planner),
+        ):
             console.print(table)
         console.print(f"wrote {self.out}/report.html")
 
@@ -126,6 +141,7 @@ def evaluate(config: Evaluate) -> OpenLoopResult:
     """
     recordings = open_data(config.data)
     horizon = ticks(config.horizon, config.dt)
+    planner = None if config.planner in NO_PLANNER else load_candidate_planner(config.planner)
     runs = expand_runs(config.predictors)
     names = [run for members in runs.values() for run in members]
     loaded = load_predictors(names, horizon=horizon, dt_s=config.dt)
@@ -145,8 +161,20 @@ def evaluate(config: Evaluate) -> OpenLoopResult:
         predictors, index, scenes=scenes, recorded=recordings, best_by=config.best_by
     )
     moving = scores.subsets["moving"]
+    regrets = (
+        None
+        if planner is None
+        else _regrets(config, planner, predictors, recordings, scenes, allowed)
+    )
     return OpenLoopResult(
-        rows=make_rows(scores, predictors, runs, data=config.data, horizon_s=config.horizon),
+        rows=make_rows(
+            scores,
+            predictors,
+            runs,
+            data=config.data,
+            horizon_s=config.horizon,
+            regrets=regrets,
+        ),
         manifest={
             "data": config.data,
             "data_hash": recordings.data_hash(),
@@ -160,6 +188,8 @@ def evaluate(config: Evaluate) -> OpenLoopResult:
             "recordings": len(np.unique(index.recording)),
             "snippets": len(index),
             "moving snippets": int(moving.sum()),
+            "planner": config.planner if regrets is not None else "none",
+            "states": 0 if regrets is None else len(regrets.recording),
             "best_by": config.best_by,
             "best-of-3": f"of the three most probable modes, {MODE_RULES[config.best_by]}",
             "intervals": "95 %, bootstrap over recordings and, with several, over training runs",
@@ -175,6 +205,35 @@ def evaluate(config: Evaluate) -> OpenLoopResult:
     )
 
 
+def _regrets(
+    config: Evaluate,
+    planner: CandidatePlanner[Any],
+    predictors: Mapping[str, Predictor],
+    recordings: Recordings,
+    scenes: Sequence[Any],
+    allowed: Sequence[Bool[np.ndarray, " _"]],
+) -> RegretScores | None:
+    """Planning regret at states of all scenarios within the allowed ticks; None without any."""
+    scenarios = find_scenarios(
+        recordings,
+        source=config.data,
+        dt_s=config.dt,
+        history=ticks(HISTORY_S, config.dt),
+        allowed=allowed,
+    )
+    if not len(scenarios):
+        return None
+    return score_regrets(
+        predictors,
+        scenarios,
+        planner,
+        scenes=scenes,
+        recorded=recordings,
+        horizon=ticks(config.horizon, config.dt),
+        max_states=config.max_states,
+    )
+
+
 def make_rows(
     scores: ForecastScores,
     predictors: Mapping[str, Predictor],
@@ -182,6 +241,7 @@ def make_rows(
     *,
     data: str,
     horizon_s: float,
+    regrets: RegretScores | None = None,
 ) -> list[Row]:
     """Means with intervals: a row for each predictor, selection, subset and metric that occurs.
 
@@ -191,6 +251,7 @@ def make_rows(
         runs: names of the runs that are averaged, by the name of the row.
         data: DATA as given.
         horizon_s: forecast horizon in seconds.
+        regrets: planning regret of the predictors, if it was measured.
     """
     reference = {
         each.selection: each
@@ -209,6 +270,8 @@ def make_rows(
         modes = [each for each in scores.modes if each.name in members]
         if modes:
             estimates += _calibration(modes, scores, stream)
+        if regrets is not None:
+            estimates += [(ALL_MODES, *each) for each in regrets.estimates(*members, stream=stream)]
         loaded = [predictors[run] for run in members]
         rows += [
             Row(
@@ -246,20 +309,14 @@ def _estimates(
     compared = metric == "FDE" and runs[0].name != REFERENCE
     for subset, rows in _subset_rows(scores, valid.any(axis=0)):
         groups, known = scores.recording[rows], valid[:, rows]
-        parts = np.stack([np.where(known, values[:, rows], 0), known], axis=-1)
-        yield selection, subset, metric, _ratio(parts, groups, stream)
+        sums = np.where(known, values[:, rows], 0)
+        mean = statistics.ratio_over_runs(sums, known, groups, stream=stream)
+        yield selection, subset, metric, mean
         if compared and reference is not None and reference.values[rows].any():
-            base = np.broadcast_to(reference.values[rows], known.shape)
-            parts = np.stack([values[:, rows], base], axis=-1)
-            yield selection, subset, RATIO, _ratio(parts, groups, stream)
-
-
-def _ratio(
-    parts: Float[np.ndarray, "runs n 2"], groups: Int[np.ndarray, " n"], stream: int
-) -> Estimate:
-    sums = statistics.resampled_sums(parts, groups, stream=stream)
-    with np.errstate(invalid="ignore", divide="ignore"):
-        return statistics.interval(sums[:, 0] / sums[:, 1], n=len(groups))
+            ratio = statistics.ratio_over_runs(
+                values[:, rows], reference.values[rows], groups, stream=stream
+            )
+            yield selection, subset, RATIO, ratio
 
 
 def _calibration(
