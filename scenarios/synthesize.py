@@ -64,7 +64,7 @@ class Synthesize:
         traffic: `normal`, or `dense`: vehicles follow each other after 3 to 6 s on the main road,
             more of them turn left across oncoming traffic, drivers differ in whether they yield,
             and vehicles leave two-lane roundabouts from both lanes. Sites of SUMO only.
-        jobs: Number of processes; the bytes do not depend on it. Sites of SUMO only.
+        jobs: Number of processes; the bytes do not depend on it.
     """
 
     out: Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="OUT")]
@@ -120,6 +120,7 @@ class Synthesize:
             minutes=self.minutes,
             seed=self.seed,
             noise=self.noise,
+            jobs=self.jobs,
             progress=True,
         )
 

@@ -2,21 +2,18 @@
 
 import shutil
 import tempfile
-from contextlib import nullcontext
 from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 from jaxtyping import Float
-from rich.console import Console
-from rich.progress import Progress
 
 from asp_env.data.cache import get_or_create
 from asp_env.errors import AspEnvError, unknown_name
 from asp_env.files import atomic_folder
 from asp_env.geometry import boxes_overlap
-from asp_env.workers import WorkerPool
 from scenarios.noise import measure
+from scenarios.processes import run_with_progress
 from scenarios.sumo.demand import RoadUser, Traffic, demand
 from scenarios.sumo.motion import FRAME_RATE_HZ, Motion, reconstruct
 from scenarios.sumo.network import Movements, simulate
@@ -268,8 +265,8 @@ class _Content:
     traffic: Traffic
     compress: bool
 
-    def write_location(self, location: int) -> int:
-        """Writes the map of a location and its recordings; returns their number."""
+    def write_location(self, location: int) -> None:
+        """Writes the map of a location and its recordings."""
         with tempfile.TemporaryDirectory() as scratch:
             place = self._place(location, Path(scratch))
             mine = [
@@ -280,7 +277,6 @@ class _Content:
             for recording in mine:
                 rng = self._rng(1, recording)
                 _write_recording(self, place, rng, recording=recording, location=location)
-        return len(mine)
 
     def _place(self, location: int, scratch: Path) -> Place:
         rng = self._rng(0, location)
@@ -340,8 +336,6 @@ def synthesize(
             "cannot be made: expected at least one recording of a second or more, at least one "
             "location and no more locations than recordings, and a seed of 0 or more"
         )
-    if jobs < 1:
-        raise AspEnvError(f"--jobs {jobs}: expected at least 1 process")
     with atomic_folder(out) as folder:
         content = _Content(
             folder=folder.absolute(),
@@ -354,16 +348,9 @@ def synthesize(
             traffic=traffic,
             compress=compress,
         )
-        processes = min(jobs, places)
-        work = content.write_location
-        with (
-            Progress(console=Console(stderr=True), disable=not progress) as bar,
-            WorkerPool(work, processes) if processes > 1 else nullcontext() as pool,
-        ):
-            task = bar.add_task(f"{site} traffic", total=recordings)
-            written = pool.map(range(places)) if pool is not None else map(work, range(places))
-            for count in written:
-                bar.advance(task, count)
+        run_with_progress(
+            content.write_location, places, f"{site} traffic", jobs=jobs, progress=progress
+        )
 
 
 def _write_recording(
