@@ -161,11 +161,12 @@ def _difference(suite: Suite, folder: Path) -> str:
     except (OSError, ValueError) as error:
         raise AspEnvError(f"{folder / MADE}: cannot be read; delete {folder}") from error
     frozen = frozen_facts(suite)
+    here, there = (str(each["data_hash"])[:HASH_DIGITS] for each in (made, frozen))
     return (
-        f"suite:{suite.name}: the traffic made here has the content hash {made['data_hash'][:HASH_DIGITS]} "
-        f"({_text(made['versions'])}), the frozen traffic {str(frozen['data_hash'])[:HASH_DIGITS]} "
-        f"({_text(frozen['versions'])}): rows are not comparable with those of others. Install the "
-        f"versions of the frozen traffic and delete {folder}"
+        f"suite:{suite.name}: the traffic made here has the content hash {here} "
+        f"({_text(made['versions'])}), the frozen traffic {there} ({_text(frozen['versions'])}): "
+        "rows are not comparable with those of others. Install the versions of the frozen traffic "
+        f"and delete {folder}"
     )
 
 
