@@ -24,7 +24,7 @@ from asp_env.dynamics.car_following import IDM, pursuit_steering
 from asp_env.geometry import project, turned_overlaps, wrap_scalar
 from asp_env.metrics.boxes import AT_REST_MPS, is_behind, touching_trailers
 from asp_env.metrics.drivable import OFF_ROAD_M, off_road_m
-from asp_env.planning.idm import RouteCache, Routes
+from asp_env.planning.idm import RouteCache
 from asp_env.planning.planner import Plan
 
 BRANCH_S = 1.0
@@ -231,12 +231,12 @@ class ContingencyPlanner:
             closeness=weights.closeness,
             later=weights.later,
         )
-        ttc_ticks = np.array([int(time / scene.dt_s + 1e-6) for time in TTC_S])
+        times = np.array([(int(time / scene.dt_s + 1e-6), time) for time in TTC_S])
         total = np.zeros(fixed.shape[:2])
         second = np.zeros(fixed.shape[:2], dtype=np.int64)
         _expected_costs(
             candidates.states, scene.sizes[:, EGO].astype(np.float64), fixed, agents, rates,
-            ttc_ticks, total, second,
+            times, total, second,
         )  # fmt: skip
         return total, second
 
@@ -398,7 +398,7 @@ def _advance(
 
 @njit(cache=True)
 @no_type_check
-def _expected_costs(plans, sizes, fixed, agents, rates, ttc_ticks, total, second):
+def _expected_costs(plans, sizes, fixed, agents, rates, times, total, second):
     """Writes the expected cost of each first phase and its second phase that is best on average.
 
     Args:
@@ -407,59 +407,72 @@ def _expected_costs(plans, sizes, fixed, agents, rates, ttc_ticks, total, second
         fixed: (B, F, S) costs that depend on no other agent.
         agents: `_Agents`.
         rates: `_Rates`.
-        ttc_ticks: (times,) ticks after which the ego, going straight on, must not touch an agent.
+        times: (times, 2) ticks and seconds after which the ego, going straight on, must not
+            touch an agent.
         total: (B, F), written.
         second: (B, F), written.
     """
-    num_first, num_second, modes = plans.shape[1], plans.shape[2], agents.states.shape[1]
-    for b in range(plans.shape[0]):
+    modes = agents.states.shape[1]
+    for b in range(len(plans)):
         first_agent, count = agents.starts[b], agents.starts[b + 1] - agents.starts[b]
-        costs = np.zeros((num_first * num_second, count, modes))
-        _contact_costs(plans[b], sizes[b], agents, first_agent, rates, ttc_ticks, costs)
+        costs = np.zeros((plans.shape[1] * plans.shape[2], count, modes))
+        _contact_costs(plans[b], sizes[b], agents, first_agent, rates, times, costs)
         probabilities = agents.probabilities[first_agent : first_agent + count]
         joint = _joint_agents(costs, probabilities)
-        combined = np.zeros(count, dtype=np.bool_)
-        for n in joint:
-            combined[n] = True
         # agents outside the joint scenarios count with the mean over their modes
         mean = fixed[b].copy().reshape(-1)
-        for c in range(len(mean)):
-            for n in range(count):
-                if not combined[n]:
-                    for m in range(modes):
-                        mean[c] += probabilities[n, m] * costs[c, n, m]
-        average = mean.copy()
-        for c in range(len(mean)):
-            for n in joint:
-                for m in range(modes):
-                    average[c] += probabilities[n, m] * costs[c, n, m]
-        scenarios = modes ** len(joint)
-        total[b] = 0.0
-        weight_sum = 0.0
-        for index in range(scenarios):
-            weight, rest = 1.0, index
-            for n in joint:
-                weight *= probabilities[n, rest % modes]
-                rest //= modes
-            if weight <= 0.0:
-                continue
-            weight_sum += weight
-            for f in range(num_first):
-                best = np.inf
-                for s in range(num_second):
-                    c = f * num_second + s
-                    cost, rest = mean[c], index
-                    for n in joint:
-                        cost += costs[c, n, rest % modes]
-                        rest //= modes
-                    best = min(best, cost)
-                total[b, f] += weight * best
-        total[b] /= max(weight_sum, 1e-12)
-        for f in range(num_first):
+        for n in range(count):
+            if not (joint == n).any():
+                _add_mean(costs, probabilities, n, mean)
+        _average_over_scenarios(costs, probabilities, joint, mean, total[b])
+        for n in joint:
+            _add_mean(costs, probabilities, n, mean)
+        for f in range(plans.shape[1]):
+            second[b, f] = mean[f * plans.shape[2] : (f + 1) * plans.shape[2]].argmin()
+
+
+@njit(cache=True)
+@no_type_check
+def _add_mean(costs, probabilities, n, mean):
+    """Adds the mean over the modes of agent n of `costs` (C, N, M) to `mean` (C,)."""
+    for c in range(len(mean)):
+        for m in range(costs.shape[2]):
+            mean[c] += probabilities[n, m] * costs[c, n, m]
+
+
+@njit(cache=True)
+@no_type_check
+def _average_over_scenarios(costs, probabilities, joint, other, total):
+    """Writes the expectation over joint scenarios of the cost of the best second phase.
+
+    Args:
+        costs: (F * S, N, M) of candidates by agent and mode.
+        probabilities: (N, M).
+        joint: (J,) agents whose modes form the M ** J scenarios.
+        other: (F * S,) further costs of each candidate.
+        total: (F,), written.
+    """
+    modes = costs.shape[2]
+    num_second = len(other) // len(total)
+    total[:] = 0.0
+    sum_of_weights = 0.0
+    chosen = np.zeros(len(joint), dtype=np.int64)
+    for index in range(modes ** len(joint)):
+        weight, rest = 1.0, index
+        for i in range(len(joint)):
+            chosen[i] = rest % modes
+            rest //= modes
+            weight *= probabilities[joint[i], chosen[i]]
+        sum_of_weights += weight
+        for f in range(len(total)):
             best = np.inf
-            for s in range(num_second):
-                if average[f * num_second + s] < best:
-                    best, second[b, f] = average[f * num_second + s], s
+            for c in range(f * num_second, (f + 1) * num_second):
+                cost = other[c]
+                for i in range(len(joint)):
+                    cost += costs[c, joint[i], chosen[i]]
+                best = min(best, cost)
+            total[f] += weight * best
+    total /= max(sum_of_weights, 1e-12)
 
 
 @njit(cache=True)
@@ -486,7 +499,7 @@ def _joint_agents(costs, probabilities):
 
 @njit(cache=True)
 @no_type_check
-def _contact_costs(plans, size, agents, first_agent, rates, ttc_ticks, costs):
+def _contact_costs(plans, size, agents, first_agent, rates, times, costs):
     """Writes what contacts of each candidate with each mode of each agent cost.
 
     Args:
@@ -495,79 +508,117 @@ def _contact_costs(plans, size, agents, first_agent, rates, ttc_ticks, costs):
         agents: `_Agents`.
         first_agent: index of the first agent of this situation.
         rates: `_Rates`.
-        ttc_ticks: (times,).
+        times: (times, 2).
         costs: (F * S, N, M), written.
     """
     num_second, steps = plans.shape[1], plans.shape[2]
     radius = 0.5 * math.hypot(size[0], size[1]) + MARGIN_M
-    trig = np.empty((steps, 2))
-    for c in range(len(costs)):
-        plan = plans[c // num_second, c % num_second]
-        for t in range(steps):
-            trig[t, 0], trig[t, 1] = math.cos(plan[t, 2]), math.sin(plan[t, 2])
-        for n in range(costs.shape[1]):
-            other_size = agents.sizes[first_agent + n]
-            reach = radius + 0.5 * math.hypot(other_size[0], other_size[1])
-            for m in range(costs.shape[2]):
-                other = agents.states[first_agent + n, m]
+    cos, sin = np.cos(plans[..., 2]), np.sin(plans[..., 2])
+    x_0, y_0 = plans[0, 0, 0, 0], plans[0, 0, 0, 1]
+    within_m = np.zeros(steps)  # no candidate, or its extension, is farther from (x_0, y_0)
+    for f in range(len(plans)):
+        for s in range(num_second):
+            for t in range(steps):
+                away = math.hypot(plans[f, s, t, 0] - x_0, plans[f, s, t, 1] - y_0)
+                within_m[t] = max(within_m[t], away + TTC_S[-1] * plans[f, s, t, 3])
+    for n in range(costs.shape[1]):
+        other_size = agents.sizes[first_agent + n]
+        reach = radius + 0.5 * math.hypot(other_size[0], other_size[1])
+        for m in range(costs.shape[2]):
+            other = agents.states[first_agent + n, m]
+            farthest, meets = 0.0, False
+            for t in range(steps):
+                farthest = max(farthest, within_m[t])
+                away = math.hypot(other[t, 0] - x_0, other[t, 1] - y_0)
+                meets = meets or away < farthest + reach
+            if not meets:
+                continue
+            for c in range(len(costs)):
+                f, s = c // num_second, c % num_second
                 costs[c, n, m] = _contact_cost(
-                    plan, trig, size, other, other_size, reach, rates, ttc_ticks
+                    plans[f, s], cos[f, s], sin[f, s], size, other, other_size, reach, rates, times
                 )
 
 
 @njit(cache=True)
 @no_type_check
-def _contact_cost(plan, trig, size, other, other_size, reach, rates, ttc_ticks):
+def _contact_cost(plan, cos, sin, size, other, other_size, reach, rates, times):
     """What the contacts of one candidate with one mode of an agent cost.
 
     Args:
         plan: (T, 4) states of the ego [x m, y m, heading rad, speed m/s].
-        trig: (T, 2) cosine and sine of its heading.
+        cos: (T,) cosine of its heading.
+        sin: (T,) sine of its heading.
         size: (2,) its length and width, m.
         other: (T, 4) [x m, y m, cosine, sine] of the other agent.
         other_size: (2,) its length and width, m.
         reach: boxes with margins cannot overlap beyond this distance of their centres, m.
         rates: `_Rates`.
-        ttc_ticks: (times,).
+        times: (times, 2).
     """
     steps = len(plan)
     critical, close = 0.0, 0.0
     for t in range(steps):
-        x, y, speed, cos, sin = plan[t, 0], plan[t, 1], plan[t, 3], trig[t, 0], trig[t, 1]
+        x, y = plan[t, 0], plan[t, 1]
         share = 1.0 - rates.later * t / steps
-        dx, dy = other[t, 0] - x, other[t, 1] - y
-        if dx * dx + dy * dy < reach * reach:
-            if turned_overlaps(
-                x, y, cos, sin, size[0] + 2.0 * MARGIN_M, size[1] + 2.0 * MARGIN_M,
-                other[t, 0], other[t, 1], other[t, 2], other[t, 3], other_size[0], other_size[1],
-            ):  # fmt: skip
-                if is_behind(x, y, plan[t, 2], size[0], other[t, 0], other[t, 1]):
-                    return max(critical, close)  # what follows is excused as well
-                close = max(close, rates.closeness * share)
-                if turned_overlaps(
-                    x, y, cos, sin, size[0], size[1],
-                    other[t, 0], other[t, 1], other[t, 2], other[t, 3],
-                    other_size[0], other_size[1],
-                ):  # fmt: skip
-                    standing = abs(speed) <= AT_REST_MPS
-                    cost = rates.obstruction if standing else rates.collision
-                    return max(cost * share, critical)
-        if critical > 0.0 or speed <= AT_REST_MPS:
-            continue
-        for i in range(len(ttc_ticks)):
-            later = t + ttc_ticks[i]
-            if later >= steps:
-                break
-            along = speed * TTC_S[i]
-            x_t, y_t = x + along * cos, y + along * sin
-            dx, dy = other[later, 0] - x_t, other[later, 1] - y_t
-            if dx * dx + dy * dy >= reach * reach:
-                continue
-            if turned_overlaps(
-                x_t, y_t, cos, sin, size[0], size[1],
-                other[later, 0], other[later, 1], other[later, 2], other[later, 3],
-                other_size[0], other_size[1],
-            ) and not is_behind(x, y, plan[t, 2], size[0], other[t, 0], other[t, 1]):  # fmt: skip
-                critical = rates.critical * share
-                break
+        if _touches(x, y, cos[t], sin[t], size, MARGIN_M, other, t, other_size, reach):
+            if is_behind(x, y, plan[t, 2], size[0], other[t, 0], other[t, 1]):
+                return max(critical, close)  # what follows is excused as well
+            close = max(close, rates.closeness * share)
+            if _touches(x, y, cos[t], sin[t], size, 0.0, other, t, other_size, reach):
+                standing = abs(plan[t, 3]) <= AT_REST_MPS
+                cost = rates.obstruction if standing else rates.collision
+                return max(cost * share, critical)
+        if critical == 0.0 and _is_critical(
+            plan, cos[t], sin[t], t, size, other, other_size, reach, times
+        ):
+            critical = rates.critical * share
     return max(critical, close)
+
+
+@njit(cache=True)
+@no_type_check
+def _is_critical(plan, cos, sin, t, size, other, other_size, reach, times):
+    """Whether the ego, going straight on from tick t, touches an agent that is not behind it.
+
+    The arguments are those of `_contact_cost`, with the cosine and the sine at tick t.
+    """
+    x, y, speed = plan[t, 0], plan[t, 1], plan[t, 3]
+    if speed <= AT_REST_MPS:
+        return False
+    for i in range(len(times)):
+        later = t + int(times[i, 0])
+        if later >= len(plan):
+            break
+        along = speed * times[i, 1]
+        if _touches(
+            x + along * cos, y + along * sin, cos, sin, size, 0.0, other, later, other_size, reach
+        ):
+            return not is_behind(x, y, plan[t, 2], size[0], other[t, 0], other[t, 1])
+    return False
+
+
+@njit(cache=True, inline="always")
+@no_type_check
+def _touches(x, y, cos, sin, size, margin, other, t, other_size, reach):
+    """Whether the ego's box overlaps that of another agent.
+
+    Args:
+        x: of the ego, m.
+        y: of the ego, m.
+        cos: of its heading.
+        sin: of its heading.
+        size: (2,) its length and width, m.
+        margin: added to every side of its box, m.
+        other: (T, 4) [x m, y m, cosine, sine] of the other agent.
+        t: tick of the other agent.
+        other_size: (2,) its length and width, m.
+        reach: boxes with margins cannot overlap beyond this distance of their centres, m.
+    """
+    dx, dy = other[t, 0] - x, other[t, 1] - y
+    if dx * dx + dy * dy >= reach * reach:
+        return False
+    return turned_overlaps(
+        x, y, cos, sin, size[0] + 2.0 * margin, size[1] + 2.0 * margin,
+        other[t, 0], other[t, 1], other[t, 2], other[t, 3], other_size[0], other_size[1],
+    )  # fmt: skip
