@@ -78,7 +78,7 @@ class Drive:
     """Part of DATA; auto is all of it that no predictor was
     trained or selected on."""
     rules: str = DEFAULT_RULES
-    """Driving rules that define the metrics: nuplan, pdms, waymax or strict."""
+    """Driving rules that define the metrics: nuplan, pdms, waymax, strict or graded."""
     jobs: int = 1
     """Number of processes that drive. The results do not depend on it."""
 

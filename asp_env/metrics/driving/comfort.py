@@ -80,6 +80,22 @@ def comfort_signals(states: Float[np.ndarray, "*batch t 4"], dt_s: float) -> dic
     return dict(zip(BOUNDS, values, strict=True))
 
 
+def within_bounds(
+    states: Float[np.ndarray, "*batch t 4"], dt_s: float
+) -> Bool[np.ndarray, "*batch t"]:
+    """Ticks at which every signal is within its bounds.
+
+    Args:
+        states: [x m, y m, heading rad, speed m/s] at at least `window_ticks` ticks.
+        dt_s: seconds per tick.
+    """
+    within = np.ones(states.shape[:-1], dtype=bool)
+    for name, value in comfort_signals(states, dt_s).items():
+        low, high = BOUNDS[name]
+        within &= (value >= low) & (value <= high)
+    return within
+
+
 def comfortable(
     states: Float[np.ndarray, "*batch t 4"], dt_s: float, long_enough: Bool[np.ndarray, "*batch"]
 ) -> Masked:
@@ -94,8 +110,5 @@ def comfortable(
         return Masked(
             value=np.zeros(states.shape[:-2]), valid=np.zeros(states.shape[:-2], dtype=bool)
         )
-    within = np.ones(states.shape[:-1], dtype=bool)
-    for name, value in comfort_signals(states, dt_s).items():
-        low, high = BOUNDS[name]
-        within &= (value >= low) & (value <= high)
+    within = within_bounds(states, dt_s)
     return Masked(value=np.asarray(within.all(axis=-1), dtype=np.float64), valid=long_enough)

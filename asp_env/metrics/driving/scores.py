@@ -7,8 +7,15 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 
 from asp_env.metrics.boxes import Contact
-from asp_env.metrics.driving.comfort import comfortable, window_ticks
+from asp_env.metrics.driving.comfort import window_ticks, within_bounds
+from asp_env.metrics.driving.cost import (
+    DrivingCostWeights,
+    driving_cost_s,
+    severity,
+    time_lost_s,
+)
 from asp_env.metrics.driving.map_context import MapContext
+from asp_env.metrics.driving.margins import CONFLICT_TTC
 from asp_env.metrics.driving.rules import Rules
 from asp_env.metrics.forecast.feasibility import infeasible_ticks
 from asp_env.metrics.masked import Masked
@@ -52,6 +59,16 @@ class EpisodeRecord:
     """Lateral offset from the logged route."""
     goal_m: Float[np.ndarray, " b"]
     """Arc length of the logged ego at the end."""
+    log_route_m: Float[np.ndarray, "b l"]
+    """Arc length of the logged ego on its route at the ticks of the scenario, from the first on."""
+    scenario_ticks: Int[np.ndarray, " b"]
+    """Number of steps that each scenario provides."""
+    near_miss: Bool[np.ndarray, "b t"]
+    """Values of `near_misses`."""
+    conflict_s: Float[np.ndarray, "b t"]
+    """Values of `conflict_time_s`, the same under all rules."""
+    required_mps2: Float[np.ndarray, "b t"]
+    """Values of `required_deceleration`."""
     map_context: MapContext
     active: Bool[np.ndarray, "b t"]
     """Ticks that belong to each episode: the first ones."""
@@ -106,17 +123,21 @@ def driving_metrics(record: EpisodeRecord, rules: Rules) -> dict[str, Masked]:
         "progress": progress,
         "making progress": (progress >= MIN_PROGRESS).astype(np.float64),
         "TTC": 1.0 - short_ttc.any(axis=1),
-        "log divergence": np.where(active, divergence, 0).sum(axis=1) / np.maximum(count, 1),
-        "route deviation": np.where(active, np.abs(record.route_offset_m), 0).sum(axis=1)
-        / np.maximum(count, 1),
+        "log divergence": _mean_over_ticks(divergence, active),
+        "route deviation": _mean_over_ticks(np.abs(record.route_offset_m), active),
     }
+    uncomfortable = _uncomfortable(record)
+    long_enough = np.asarray(uncomfortable.valid.any(axis=1))
     metrics = {name: Masked(value=value, valid=has_ticks) for name, value in values.items()}
     metrics |= {
         "direction": _direction(record),
         "speed": _speed(record),
-        "comfort": _comfort(record),
+        "comfort": Masked(
+            value=np.asarray(1.0 - uncomfortable.value.any(axis=1)), valid=long_enough
+        ),
         "feasible": _feasible(record),
     }
+    metrics |= _continuous(record, metrics, uncomfortable)
     if rules.weights:
         metrics = {"score": _score(metrics, rules, has_ticks), **metrics}
     return metrics
@@ -169,6 +190,53 @@ def _score(
     return Masked(value=product * total / np.maximum(weights, 1.0), valid=has_ticks)
 
 
+def _continuous(
+    record: EpisodeRecord, metrics: Mapping[str, Masked], uncomfortable: Masked
+) -> dict[str, Masked]:
+    """The continuous measures; `metrics` are those that are 0 or 1."""
+    active = record.active
+    count = active.sum(axis=1)
+    lost_s = time_lost_s(
+        record.route_m, count, record.log_route_m, record.scenario_ticks, record.dt_s
+    )
+    cost_s = driving_cost_s(
+        time_lost_s=lost_s,
+        ttc_s=record.conflict_s,
+        uncomfortable=uncomfortable.value > 0,
+        fault=(metrics["no at-fault collision"].value == 0) | (metrics["on road"].value == 0),
+        active=active,
+        dt_s=record.dt_s,
+        weights=DrivingCostWeights(),
+    )
+    near = record.near_miss & active
+    values = {
+        "no near miss": 1.0 - near.any(axis=1),
+        "near misses": _mean_over_ticks(near, active),
+        "min TTC": np.where(active, record.conflict_s, CONFLICT_TTC.horizon_s).min(
+            axis=1, initial=CONFLICT_TTC.horizon_s
+        ),
+        "required deceleration": np.where(active, record.required_mps2, 0.0).max(
+            axis=1, initial=0.0
+        ),
+        "safety margin": 1.0 - _mean_over_ticks(severity(record.conflict_s), active),
+        "time lost": lost_s,
+        "driving cost": cost_s,
+    }
+    long_enough = np.asarray(uncomfortable.valid.any(axis=1))
+    harsh = _mean_over_ticks(uncomfortable.value, active)
+    has_ticks = np.asarray(count > 0)
+    return {name: Masked(value=value, valid=has_ticks) for name, value in values.items()} | {
+        "uncomfortable ticks": Masked(value=harsh, valid=long_enough),
+        "smoothness": Masked(value=np.asarray(1.0 - harsh), valid=long_enough),
+    }
+
+
+def _mean_over_ticks(
+    values: Bool[np.ndarray, "b t"] | Float[np.ndarray, "b t"], active: Bool[np.ndarray, "b t"]
+) -> Float[np.ndarray, " b"]:
+    return np.where(active, values, 0).sum(axis=1) / np.maximum(active.sum(axis=1), 1)
+
+
 def _progress(record: EpisodeRecord, rules: Rules) -> Float[np.ndarray, " b"]:
     last = np.maximum(record.active.sum(axis=1) - 1, 0)
     reached = record.route_m[np.arange(len(last)), last]
@@ -194,14 +262,14 @@ def _speed(record: EpisodeRecord) -> Masked:
     return Masked(value=value, valid=np.asarray(count > 0))
 
 
-def _comfort(record: EpisodeRecord) -> Masked:
+def _uncomfortable(record: EpisodeRecord) -> Masked:
+    """(b, t) 1 at ticks beyond a comfort bound; missing for short episodes and after their end."""
     ticks, needed = record.active.sum(axis=1), window_ticks(record.dt_s)
-    value = np.zeros(len(ticks))
+    value = np.zeros(record.active.shape)
     for b, count in enumerate(ticks):
         if count >= needed:
-            enough = np.ones((), dtype=bool)
-            value[b] = comfortable(record.states[b, :count], record.dt_s, enough).value
-    return Masked(value=value, valid=np.asarray(ticks >= needed))
+            value[b, :count] = ~within_bounds(record.states[b, :count], record.dt_s)
+    return Masked(value=value, valid=record.active & (ticks >= needed)[:, None])
 
 
 def _feasible(record: EpisodeRecord) -> Masked:
