@@ -1,8 +1,10 @@
 """Which predictors are evaluated, and which part of DATA they are evaluated on."""
 
+import glob
+import re
 from collections import Counter
 from collections.abc import Callable, Sequence
-from pathlib import PurePath
+from pathlib import Path, PurePath
 from typing import Literal
 
 import numpy as np
@@ -23,6 +25,53 @@ from asp_env.errors import AspEnvError
 PartChoice = Literal["auto", "train", "validation", "test", "all"]
 
 
+def expand_runs(names: Sequence[str]) -> dict[str, tuple[str, ...]]:
+    """The training runs that each name stands for.
+
+    A name such as `ffw-asp:runs/*` is one method of several runs: all folders that match the
+    pattern behind the last colon before it, sorted by path. `*`, `?` and `[…]` match within one
+    level of folders. A pattern that is itself a path is no pattern, and an option behind `@`, as in
+    `ssp-asp:runs/*@beam`, applies to every run.
+
+    Args:
+        names: registered names, with `:RUN` for a trained predictor.
+
+    Returns:
+        The names of the runs by name as given, in the order of `names`; a name without a pattern
+        stands for itself.
+
+    Raises:
+        AspEnvError: a name is given twice, no folder matches, or a pattern contains `**`.
+    """
+    for name, count in Counter(names).items():
+        if count > 1:
+            raise _named_repeatedly(name, count)
+    return {name: _matching_runs(name) for name in names}
+
+
+def _matching_runs(name: str) -> tuple[str, ...]:
+    wildcard = min((name.find(c) for c in "*?[" if c in name), default=-1)
+    if wildcard < 0:
+        return (name,)
+    start = name.rfind(":", 0, wildcard) + 1
+    pattern, at, option = name[start:].partition("@")
+    if not start or Path(pattern).exists():
+        return (name,)
+    if "**" in pattern:
+        raise AspEnvError(f"{name}: ** is not supported; use one * for each level of folders")
+    folders = sorted(path for path in glob.glob(pattern) if Path(path).is_dir())
+    if not folders:
+        raise AspEnvError(
+            f"{name}: no folder matches {pattern}; give the folders of finished runs, with the "
+            "pattern in quotes"
+        )
+    return tuple(f"{name[:start]}{folder}{at}{option}" for folder in folders)
+
+
+def _named_repeatedly(name: str, count: int) -> AspEnvError:
+    return AspEnvError(f"--predictors: {name} is named {count} times; name it once")
+
+
 def load_predictors(names: Sequence[str], *, horizon: int, dt_s: float) -> list[Predictor]:
     """Loads predictors by name.
 
@@ -39,7 +88,7 @@ def load_predictors(names: Sequence[str], *, horizon: int, dt_s: float) -> list[
         raise AspEnvError("--predictors: none given; expected at least one, such as oracle")
     name, count = Counter(names).most_common(1)[0]
     if count > 1:
-        raise AspEnvError(f"--predictors: {name} is named {count} times; name it once")
+        raise _named_repeatedly(name, count)
     predictors = [load_predictor(name, horizon=horizon, dt_s=dt_s) for name in names]
     for name, predictor in zip(names, predictors, strict=True):
         if predictor.horizon < horizon:
@@ -55,16 +104,32 @@ def short_names(names: Sequence[str]) -> dict[str, str]:
 
     A label is the name without its run folder (`mtp`). Where that is ambiguous, the last part of
     the folder is added (`mtp 1`), and where that is ambiguous too, the whole path (`mtp a-1`).
+    Numbers are always part of the label (`blend 0.25`, `delayed 2 mtp`).
     """
-    labels = {name: name.partition(":")[0] for name in names}
-    labels = _lengthen(labels, lambda name: PurePath(name.partition(":")[2]).name)
-    return _lengthen(labels, lambda name: name.partition(":")[2].strip("/").replace("/", "-"))
+    labels = {name: _without_folder(name) for name in names}
+    labels = _lengthen(labels, lambda name: PurePath(_folder(name)).name)
+    return _lengthen(labels, lambda name: _folder(name).strip("/").replace("/", "-"))
+
+
+def _without_folder(name: str) -> str:
+    """The words of a name up to its run folder: registered names and numbers."""
+    kind, _, argument = name.partition(":")
+    number, _, rest = argument.partition(":")
+    if not re.fullmatch(r"\d*\.?\d+", number):
+        return kind
+    return " ".join(part for part in (kind, number, _without_folder(rest)) if part)
+
+
+def _folder(name: str) -> str:
+    """The run folder in a name; a number is none."""
+    words = _without_folder(name).count(" ") + 1
+    return ":".join(name.split(":")[words:])
 
 
 def _lengthen(labels: dict[str, str], suffix: Callable[[str], str]) -> dict[str, str]:
     counts = Counter(labels.values())
     return {
-        name: f"{name.partition(':')[0]} {suffix(name)}".strip() if counts[label] > 1 else label
+        name: f"{_without_folder(name)} {suffix(name)}".strip() if counts[label] > 1 else label
         for name, label in labels.items()
     }
 

@@ -1,12 +1,13 @@
 """Result tables for terminals of 80 columns. All intervals are in `metrics.csv` and the report."""
 
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Collection, Iterator, Mapping, Sequence
 
 from rich import box
 from rich.table import Table
 
-from asp_env.evaluation.results import Row
+from asp_env.evaluation.results import ORACLE_SHARE, Row, difference_of
 from asp_env.evaluation.selection import short_names
+from asp_env.evaluation.verdicts import share_text, verdict_text
 
 Headings = Mapping[str, str]
 """Column headings by metric."""
@@ -93,29 +94,124 @@ def open_loop_tables(rows: Sequence[Row], privileged: Collection[str] = ()) -> l
     return tables
 
 
-def driving_table(rows: Sequence[Row], privileged: Collection[str], shown: Sequence[str]) -> Table:
-    """Driving metrics over all scenarios, by method.
+SUBSETS = ("all", "interactive")
+"""Subsets of scenarios that are printed, as far as they occur."""
+
+
+def driving_tables(
+    rows: Sequence[Row], privileged: Collection[str], shown: Sequence[str]
+) -> list[Table]:
+    """For each of `SUBSETS`, the differences to the reference and the driving metrics, by method.
 
     Args:
         rows: closed-loop rows of `metrics.csv`.
         privileged: names of the privileged planners and predictors, which are marked.
         shown: metrics to show after the score.
     """
+    tables = []
+    for subset in SUBSETS:
+        chosen = [row for row in rows if row.subset == subset]
+        if chosen:
+            tables += _difference_tables(chosen, privileged)
+            tables.append(driving_table(chosen, privileged, shown, subset=subset))
+    return tables
+
+
+def driving_table(
+    rows: Sequence[Row],
+    privileged: Collection[str],
+    shown: Sequence[str],
+    *,
+    subset: str = "all",
+) -> Table:
+    """Driving metrics over the scenarios of a subset, by method.
+
+    Args:
+        rows: closed-loop rows of `metrics.csv`.
+        privileged: names of the privileged planners and predictors, which are marked.
+        shown: metrics to show after the score.
+        subset: `all` or a tag.
+    """
     rules = " and ".join(dict.fromkeys(row.rules for row in rows))
-    table = _table(f"driving by {rules}, mean per episode, 95 % interval over recordings")
+    table = _table(f"{_scenarios(subset)}: driving by {rules}, mean, 95 % interval over recordings")
     if len(shown) > MAX_PADDED_COLUMNS:
         table.padding = 0
-    short = short_names([row.predictor for row in rows])
     lines: dict[str, dict[str, Row]] = {}
-    for row in rows:
-        if row.subset != "all":
-            continue
-        name = " + ".join(part for part in (row.planner, short[row.predictor]) if part)
-        mark = MARK if row.planner in privileged or row.predictor in privileged else ""
-        lines.setdefault(name + mark, {})[row.metric] = row
+    for name, row in _by_method(rows, privileged):
+        if row.subset == subset:
+            lines.setdefault(name, {})[row.metric] = row
     scored = DRIVING_INTERVALS if any(row.metric in DRIVING_INTERVALS for row in rows) else {}
     _fill(table, "method", lines, scored, {name: DRIVING_VALUES[name] for name in shown})
     return table
+
+
+def _difference_tables(rows: Sequence[Row], privileged: Collection[str]) -> list[Table]:
+    """The differences of the score to the reference; none without a score or a reference."""
+    lines: dict[str, dict[str, Row]] = {}
+    for name, row in _by_method(rows, privileged, with_planner=False):
+        lines.setdefault(name, {})[row.metric] = row
+    differences = {
+        row.metric: pair[1]
+        for row in rows
+        if (pair := difference_of(row.metric)) is not None and pair[0] == "score"
+    }
+    return [
+        _difference_table(metric, reference, lines) for metric, reference in differences.items()
+    ]
+
+
+def _difference_table(metric: str, reference: str, lines: Mapping[str, Mapping[str, Row]]) -> Table:
+    one = next(row for metrics in lines.values() for row in metrics.values())
+    planners = {row.planner for each in lines.values() for row in each.values() if row.predictor}
+    table = _table(
+        f"{_scenarios(one.subset)}: score less that of {reference}, {' and '.join(planners)}"
+    )
+    has_shares = any(ORACLE_SHARE in metrics for metrics in lines.values())
+    table.add_column("predictor", min_width=16)
+    table.add_column("difference", justify="right", no_wrap=True)
+    table.add_column("MDE", justify="right", no_wrap=True)
+    table.add_column("verdict", no_wrap=True)
+    if has_shares:
+        table.add_column("oracle share", justify="right", no_wrap=True)
+    for name, metrics in lines.items():
+        row = metrics.get(metric)
+        if row is None:
+            continue
+        share = metrics.get(ORACLE_SHARE)
+        table.add_row(
+            name,
+            _signed(row),
+            "" if row.mde is None else f"{row.mde:.3f}",
+            verdict_text(row).replace(" (", "\n("),
+            *([share_text(share) if share else ""] if has_shares else []),
+        )
+    table.caption = "MDE: smallest difference that these scenarios resolve with 80 % power"
+    return table
+
+
+def _signed(row: Row) -> str:
+    if row.low is None or row.high is None:
+        return f"{row.value:+.3f}"
+    return f"{row.value:+.3f} [{row.low:.3f}, {row.high:.3f}]"
+
+
+def _scenarios(subset: str) -> str:
+    return f"{subset} scenarios"
+
+
+def _by_method(
+    rows: Sequence[Row], privileged: Collection[str], *, with_planner: bool = True
+) -> Iterator[tuple[str, Row]]:
+    """Every row with the name of its method, its number of runs and its mark."""
+    short = short_names([row.predictor for row in rows])
+    for row in rows:
+        parts = [row.planner, short[row.predictor]]
+        name = " + ".join(part for part in parts if part)
+        if not with_planner and row.predictor:
+            name = short[row.predictor]
+        runs = f" ({row.runs} runs)" if row.runs is not None and row.runs > 1 else ""
+        mark = MARK if row.planner in privileged or row.predictor in privileged else ""
+        yield f"{name}{runs}{mark}", row
 
 
 def _table(title: str) -> Table:

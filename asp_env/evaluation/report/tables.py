@@ -76,10 +76,10 @@ class Figure:
 
 
 def result_figures(results: Sequence[Result]) -> list[Figure]:
-    """Metrics by method, without metrics over time and without kinds of targets."""
+    """Metrics by method, without comparisons, metrics over time and kinds of targets."""
     groups: dict[tuple[str, str], list[Result]] = {}
     for result in results:
-        if result.at_s is None and ":" not in result.subset:
+        if result.at_s is None and ":" not in result.subset and not result.is_comparison:
             groups.setdefault((result.data, result.horizon_s), []).append(result)
     figures = []
     for group in groups.values():

@@ -240,6 +240,7 @@ def test_a_run_writes_its_folder(crossings, tmp_path):
     out = tmp_path / "out"
     Drive(data=str(crossings), out=out, max_scenarios=2).run()
     names = {"scenarios.json", "metrics.csv", "manifest.json", "report.html", "rollouts"}
+    names.add("scenarios.csv")
     assert {path.name for path in out.iterdir()} == names
     methods = sorted(path.name for path in (out / "rollouts").iterdir())
     assert methods == ["expert", "sampling + constant-velocity"]

@@ -48,7 +48,7 @@ def methods(*predictors: str, planner: str = "sampling", traffic: str = "log") -
     return Methods(
         data="",
         planner=planner,
-        predictors=predictors,
+        predictors={name: (name,) for name in predictors},
         traffic=traffic,
         rules="pdms",
         horizon_s=3.0,

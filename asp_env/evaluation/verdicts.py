@@ -1,0 +1,87 @@
+"""What a comparison states in words: verdicts on differences, oracle shares, headlines."""
+
+from typing import Protocol, runtime_checkable
+
+from asp_env.evaluation.statistics import is_resolved, samples_needed
+
+NOT_RESOLVED = "not resolved"
+
+
+@runtime_checkable
+class Statistic(Protocol):
+    """A value with its interval, as in a row of `metrics.csv`."""
+
+    @property
+    def value(self) -> float | None: ...
+    @property
+    def low(self) -> float | None: ...
+    @property
+    def high(self) -> float | None: ...
+    @property
+    def n(self) -> float | None: ...
+    @property
+    def mde(self) -> float | None: ...
+
+
+def verdict_text(difference: Statistic) -> str:
+    """Whether a difference is resolved, or how many scenarios would be needed.
+
+    Args:
+        difference: a paired difference with its minimal detectable effect.
+
+    Returns:
+        `resolved`, `equal` if the methods never differ, or `not resolved` with the reason.
+    """
+    value, mde, n = difference.value, difference.mde, difference.n
+    if value is None or mde is None or n is None:
+        return f"{NOT_RESOLVED} (one recording)"
+    if is_resolved(value, difference.low, difference.high, mde):
+        return "resolved"
+    needed = samples_needed(value, mde, int(n))
+    if needed is None:
+        return "equal" if mde == 0.0 else f"{NOT_RESOLVED} (difference 0)"
+    if needed <= n:
+        return f"{NOT_RESOLVED} (0 in interval)"
+    return f"{NOT_RESOLVED} (n ≈ {_two_digits(needed):,})"
+
+
+def share_text(share: Statistic) -> str:
+    """An oracle share in percent with its interval, such as `40 % [25, 55]`.
+
+    Args:
+        share: an oracle share between 0 and 1.
+    """
+    if share.value is None:
+        return ""
+    text = f"{100 * share.value:.0f} %"
+    if share.low is None or share.high is None:
+        return text
+    return f"{text} [{100 * share.low:.0f}, {100 * share.high:.0f}]"
+
+
+def headline(name: str, reference: str, difference: Statistic, share: Statistic | None) -> str:
+    """A sentence on a method: its oracle share, its difference to the reference, the verdict.
+
+    Args:
+        name: name of the method.
+        reference: name of the reference.
+        difference: difference of the score to that of the reference.
+        share: oracle share of the method; None where there is no ladder.
+    """
+    if difference.value is None:
+        return ""
+    bounds = ""
+    if difference.low is not None and difference.high is not None:
+        bounds = f" [{difference.low:.3f}, {difference.high:.3f}]"
+    gain = f"score {difference.value:+.3f}{bounds} against {reference}, {verdict_text(difference)}"
+    if share is None:
+        return f"{name}: {gain}."
+    percent, _, interval = share_text(share).partition(" % ")
+    article = "an" if percent in ("8", "11", "18") or percent.startswith("8") else "a"
+    return f"{name} drives like {article} {percent} % oracle {interval}".rstrip() + f": {gain}."
+
+
+def _two_digits(number: int) -> int:
+    """A number rounded up to two significant digits."""
+    unit = 10 ** max(len(str(number)) - 2, 0)
+    return -(-number // unit) * unit
