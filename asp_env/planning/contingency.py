@@ -53,9 +53,9 @@ LIMIT_S = 0.8
 STOP_S = 0.4
 """Time constant with which candidates come to a standstill. Chosen by hand."""
 
-TTC_S = (0.45, 0.9)
+TTC_S = (0.4, 0.8, 1.0)
 """A candidate is critical if the ego, going straight on at its speed, touches an agent after one of
-these times: the bound of the driving rules is 0.95 s."""
+these times, rounded to ticks: the bound of the driving rules is 0.95 s."""
 
 MARGIN_M = 0.25
 """Margin on every side of the ego's box when closeness is rated. Chosen by hand."""
@@ -231,7 +231,8 @@ class ContingencyPlanner:
             closeness=weights.closeness,
             later=weights.later,
         )
-        times = np.array([(int(time / scene.dt_s + 1e-6), time) for time in TTC_S])
+        ticks = [max(round(time / scene.dt_s), 1) for time in TTC_S]
+        times = np.array([(count, count * scene.dt_s) for count in ticks])
         total = np.zeros(fixed.shape[:2])
         second = np.zeros(fixed.shape[:2], dtype=np.int64)
         _expected_costs(
