@@ -38,8 +38,12 @@ Chosen by hand."""
 SECOND_MPS2 = (-4.0, -2.0, -1.0, 0.0, 1.0, 1.8)
 """Accelerations that second phases approach. Chosen by hand."""
 
-OFFSETS_M = (0.0, -0.7, 0.7)
-"""Offsets to the left of the route that candidates move to. Chosen by hand."""
+OFFSETS_M = (-0.7, 0.7)
+"""Offsets to the left of the route that some candidates move to. Chosen by hand."""
+
+EVADING_MPS2 = (-3.5, -1.7, 0.0, 1.0)
+"""Accelerations that the first phases of these candidates approach. Chosen by hand: fewer than on
+the route, since evasion is rare."""
 
 LATERAL_S = 2.5
 """Duration of the move to an offset. Chosen by hand."""
@@ -99,6 +103,8 @@ class ContingencyWeights:
     """If a corner leaves the drivable area by more than nuPlan's tolerance."""
     offset: float = 3.0
     """Per metre of distance from the route, mean over the horizon."""
+    evasion: float = 12.0
+    """For moving to an offset beside the route."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -136,8 +142,8 @@ class ContingencyPlanner:
         """
         self.weights = weights or ContingencyWeights()
         self._cache = RouteCache(IDM(), map_limits=True)
-        first = itertools.product(FIRST_MPS2, OFFSETS_M)
-        self._first = np.array(list(first))
+        evading = itertools.product(EVADING_MPS2, OFFSETS_M)
+        self._first = np.array([*((each, 0.0) for each in FIRST_MPS2), *evading])
         """(F, 2) acceleration m/s² and offset m."""
         self._second = np.array(SECOND_MPS2)
 
@@ -216,6 +222,7 @@ class ContingencyPlanner:
             + weights.lateral * lateral
             + weights.off_road * leaves_road
             + weights.offset * offset
+            + weights.evasion * (self._first[:, 1:] != 0)
         )
 
     def _expected(
