@@ -126,6 +126,23 @@ def test_short_names_are_as_short_as_they_can_be():
     assert short_names(["oracle", "oracle"]) == {"oracle": "oracle"}
 
 
+def test_short_names_contain_numbers():
+    """The numbers of controls and delays are part of the label, and run folders are not."""
+    names = {
+        "blend:0.25": "blend 0.25",
+        "blend:1": "blend 1",
+        "noisy-oracle:2": "noisy-oracle 2",
+        "delayed:2:oracle": "delayed 2 oracle",
+        "delayed:2:blend:0.5": "delayed 2 blend 0.5",
+        "delayed:1:delayed:2:mtp:runs/1": "delayed 1 delayed 2 mtp",
+        "delayed:2:ffw-asp:runs/1": "delayed 2 ffw-asp 1",
+        "delayed:2:ffw-asp:runs/2": "delayed 2 ffw-asp 2",
+        "ffw-asp:runs/1": "ffw-asp",
+        "dkm:2": "dkm 2",
+    }
+    assert short_names([*names]) == names
+
+
 def test_privileged_planners_are_marked():
     """With a star after the name and a caption that explains it."""
     rows = [_row("score", 0.9, planner="prophet"), _row("score", 0.5, planner="sampling")]

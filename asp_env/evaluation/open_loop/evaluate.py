@@ -13,7 +13,13 @@ from rich.console import Console
 from asp_env.data.causal import causal_histories
 from asp_env.data.predictor import Predictor
 from asp_env.data.recording import DEFAULT_DT_S, ticks
-from asp_env.data.snippets import SnippetIndex, gather_future, gather_scene, index_snippets
+from asp_env.data.snippets import (
+    HISTORY_S,
+    SnippetIndex,
+    gather_future,
+    gather_scene,
+    index_snippets,
+)
 from asp_env.data.source import Recordings, open_data
 from asp_env.evaluation import statistics
 from asp_env.evaluation.open_loop.scoring import (
@@ -119,7 +125,12 @@ def evaluate(config: Evaluate) -> OpenLoopResult:
     horizon = ticks(config.horizon, config.dt)
     loaded = load_predictors(config.predictors, horizon=horizon, dt_s=config.dt)
     allowed, part = ticks_to_evaluate(recordings, loaded, config.part, dt_s=config.dt)
-    index = index_snippets(recordings, dt_s=config.dt, horizon_s=config.horizon)
+    index = index_snippets(
+        recordings,
+        dt_s=config.dt,
+        horizon_s=config.horizon,
+        history_s=max(HISTORY_S, *(predictor.history * config.dt for predictor in loaded)),
+    )
     index = snippets_within(index, allowed)
     predictors = dict(zip(config.predictors, loaded, strict=True))
     scenes: Sequence[Any] = recordings

@@ -27,6 +27,7 @@ from asp_env.evaluation.report.results import (
     read_results,
 )
 from asp_env.evaluation.report.tables import breakdown_figures, result_figures
+from asp_env.evaluation.selection import split_name
 from asp_env.files import atomic_file
 
 BASELINE = "constant-velocity"
@@ -144,7 +145,7 @@ def _plots(results: Results) -> dict[str, Any]:
     }
     return {
         "figures": {name: json.loads(text) for name, text in figures.items() if text},
-        "colours": colours | {name.partition(":")[0]: value for name, value in colours.items()},
+        "colours": colours | {split_name(name)[0]: value for name, value in colours.items()},
     }
 
 

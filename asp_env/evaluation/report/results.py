@@ -9,6 +9,7 @@ from typing import Literal
 
 from asp_env.errors import DataError
 from asp_env.evaluation.results import HEADROOM, ORACLE_SHARE, Row, difference_of
+from asp_env.evaluation.selection import split_name
 
 SELECTIONS = ("most-probable", "best-of-3", "")
 """Selections of modes in the order of the tables; metrics of all modes together have none."""
@@ -63,7 +64,7 @@ class MethodResult:
     @property
     def name(self) -> str:
         """The planner, the predictor without its folder, or both."""
-        parts = [self.planner, self.predictor.partition(":")[0]]
+        parts = [self.planner, split_name(self.predictor)[0]]
         return " + ".join(part for part in parts if part)
 
     @property
@@ -179,7 +180,7 @@ def _result(
     fixed: tuple[str, ...],
     privileged: Collection[str],
 ) -> Result:
-    folder = PurePath(row["predictor"].partition(":")[2])
+    folder = PurePath(split_name(row["predictor"])[1])
     details = ["/".join(folder.parts[-2:])] if folder.name else []
     details += [_detail(name, row[name]) for name in varying if row[name]]
     if row["runs"] not in ("", "1"):

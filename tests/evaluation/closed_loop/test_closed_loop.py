@@ -106,6 +106,20 @@ def test_every_method_drives_the_same_scenarios(crossings):
     assert (row.traffic, row.latency_ticks, row.horizon_s) == ("log", 0, 3.0)
 
 
+def test_a_delayed_predictor_drives_the_same_scenarios(crossings):
+    """It needs 17 ticks of history, scenarios have 15; results of the others do not change."""
+    names = ("constant-velocity", "delayed:14:constant-turn-rate")
+    config = Drive(data=str(crossings), out=NOWHERE, predictors=names, max_scenarios=4)
+    alone = drive(dataclasses.replace(config, predictors=names[:1]))
+    result = drive(config)
+    assert result.manifest["scenarios"] == alone.manifest["scenarios"]
+    assert _values(result, "expert") == _values(alone, "expert")
+    score = _values(result, "sampling", names[0])["score"]
+    assert score == _values(alone, "sampling", names[0])["score"]
+    assert _values(result, "sampling", names[1])["score"] != score
+    assert list(result.rollouts)[2] == "sampling + delayed 14 constant-turn-rate"
+
+
 def test_a_planner_without_forecasts_drives_once(crossings):
     """`idm` drives once, without a predictor's name; `expert` does not drive a second time."""
     for planner, methods in (("idm", ["expert", "idm"]), ("expert", ["expert"])):
