@@ -451,7 +451,8 @@ METRIC_NOTES = {
         "Safety margin",
         "%",
         "higher",
-        "SAFETYMARGIN",
+        "Smallest time to collision as a share of 1.9 s, at most 100 %: the threshold of TTC, "
+        "0.95 s, widened to a ramp with 50 % in its middle.",
     ),
     "uncomfortable ticks": _note(
         "Uncomfortable",
@@ -459,7 +460,13 @@ METRIC_NOTES = {
         "lower",
         "Share of the ticks of an episode at which one of nuPlan's comfort bounds is exceeded.",
     ),
-    "smoothness": _note("Smoothness", "%", "higher", "100 % minus the uncomfortable ticks."),
+    "smoothness": _note(
+        "Smoothness",
+        "%",
+        "higher",
+        "The bounds of comfort widened to a ramp: 100 % up to half of every bound, 50 % at a "
+        "bound, 0 % from 1.5 times a bound on.",
+    ),
     "time lost": _note(
         "Time lost",
         "s",
@@ -472,8 +479,9 @@ METRIC_NOTES = {
         "Driving cost",
         "s",
         "lower",
-        "Time lost, plus 5 s per second at a time to collision of 0 s, falling to 0 at 3 s, plus "
-        "the uncomfortable time, plus 60 s for an at-fault collision or for leaving the road.",
+        "Time lost, plus 5 s per second of conflict of full severity, which is (1 - TTC / 3 s)², "
+        "plus the uncomfortable time, plus 30 s for an at-fault collision or for leaving the "
+        "road.",
     ),
     "log divergence": _note(
         "Log distance",

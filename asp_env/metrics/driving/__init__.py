@@ -1,6 +1,11 @@
 """Metrics of driven episodes: scores, comfort, time to collision and realism of the traffic."""
 
-from asp_env.metrics.driving.comfort import comfort_signals, comfortable, within_bounds
+from asp_env.metrics.driving.comfort import (
+    comfort_signals,
+    comfortable,
+    share_of_bounds,
+    within_bounds,
+)
 from asp_env.metrics.driving.cost import (
     DrivingCostWeights,
     driving_cost_s,
@@ -77,6 +82,7 @@ __all__ = [
     "realism_features",
     "required_deceleration",
     "severity",
+    "share_of_bounds",
     "time_lost_s",
     "time_to_collision",
     "within_bounds",

@@ -28,7 +28,9 @@ WAITS_M = np.array([0.0, 2, 4, 6, 6, 6, 6, 6, 8, 10, 12])
 def lost(route: list[float], log: np.ndarray = STEADY_M) -> float:
     """The time lost in one episode."""
     ticks = np.array([len(route)])
-    return float(time_lost_s(np.array([route]), ticks, log[None], np.array([len(log) - 1]), DT_S)[0])
+    return float(
+        time_lost_s(np.array([route]), ticks, log[None], np.array([len(log) - 1]), DT_S)[0]
+    )
 
 
 @pytest.mark.parametrize(
@@ -95,11 +97,11 @@ def test_the_logged_ego_is_at_its_own_arc_length() -> None:
 
 
 def test_severity() -> None:
-    assert severity(np.array([math.inf, 3.0, 1.5, 0.0])).tolist() == [0, 0, 0.5, 1]
+    assert severity(np.array([math.inf, 3.0, 1.5, 0.0])).tolist() == [0, 0, 0.25, 1]
 
 
 def test_driving_cost_adds_seconds() -> None:
-    """Two ticks at 1.5 s and one harsh tick of 0.2 s: 0.4·0.5·5 + 0.2, plus 3 s, plus a fault."""
+    """Two ticks at 1.5 s and one harsh tick of 0.2 s: 0.4·0.25·5 + 0.2, plus 3 s, plus a fault."""
     ttc_s = np.full((2, 10), 3.0)
     ttc_s[:, :2] = 1.5
     ttc_s[:, 9] = 0.0  # after the end
@@ -114,7 +116,7 @@ def test_driving_cost_adds_seconds() -> None:
         dt_s=0.2,
         weights=DrivingCostWeights(risk=5.0, discomfort=1.0, fault=60.0),
     )
-    assert found.tolist() == pytest.approx([1.2, 64.2])
+    assert found.tolist() == pytest.approx([0.7, 63.7])
 
 
 def test_a_perfect_episode_costs_nothing() -> None:
@@ -139,7 +141,7 @@ def test_measures_over_the_ticks_of_an_episode() -> None:
     assert found["near misses"] == 1 / 8
     assert found["min TTC"] == pytest.approx(1.2)
     assert found["required deceleration"] == 4.5
-    assert found["safety margin"] == pytest.approx(SAFETY_MARGIN)
+    assert found["safety margin"] == pytest.approx(1.2 / 1.9)
     before = values(record(**changes, active=3))
     assert (before["no near miss"], before["min TTC"], before["required deceleration"]) == (1, 3, 0)
     assert before["safety margin"] == 1
@@ -150,9 +152,28 @@ def test_measures_over_the_ticks_of_an_episode() -> None:
 @pytest.mark.parametrize(
     "fault", [{"contacts": contact(TICKS - 1, Contact.FRONT)}, {"off_road_m": at_tick(3, 1.0)}]
 )
-def test_a_fault_costs_60_s(fault: dict[str, np.ndarray]) -> None:
+def test_a_fault_costs_30_s(fault: dict[str, np.ndarray]) -> None:
     at_log = [np.linspace(33, 40, TICKS)]
-    assert values(record(**fault, log_route_m=at_log), PDMS)["driving cost"] == 60
+    assert values(record(**fault, log_route_m=at_log), PDMS)["driving cost"] == 30
+
+
+@pytest.mark.parametrize(
+    ("acceleration", "smoothness"),
+    [(0.0, 1.0), (-2.0, 1.0), (-4.05, 0.5), (-5.0, 0.2654), (-6.1, 0.0), (1.8, 0.75), (2.4, 0.5)],
+)
+def test_smoothness(acceleration: float, smoothness: float) -> None:
+    """1.5 less the share of the bound, -4.05 or 2.40 m/s², from 0 to 1."""
+    states = record().states.copy()
+    states[0, :, 3] = 15 + acceleration * 0.2 * np.arange(TICKS)
+    assert values(record(states=states))["smoothness"] == pytest.approx(smoothness, abs=1e-4)
+
+
+@pytest.mark.parametrize(("ttc_s", "margin"), [(3.0, 1), (1.9, 1), (0.95, 0.5), (0.1, 1 / 19)])
+def test_safety_margin(ttc_s: float, margin: float) -> None:
+    """Half at the bound of TTC."""
+    assert values(record(conflict_s=at_tick(2, ttc_s, 3.0)))["safety margin"] == pytest.approx(
+        margin
+    )
 
 
 def test_graded_rules_weigh_continuous_measures() -> None:
@@ -161,8 +182,9 @@ def test_graded_rules_weigh_continuous_measures() -> None:
     states[0, :, 3] = 15 - np.arange(TICKS)  # brakes at 5 m/s²
     braking = record(states=states, conflict_s=at_tick(3, 1.2, 3.0))
     found = values(braking, GRADED)
-    assert found["comfort"] == found["smoothness"] == 0
-    assert found["score"] == pytest.approx((4 + 5 * SAFETY_MARGIN) / 12)
+    assert found["comfort"] == 0
+    assert found["smoothness"] == pytest.approx(1.5 - 5 / 4.05)
+    assert found["score"] == pytest.approx((4 + 5 * 1.2 / 1.9 + 2 * (1.5 - 5 / 4.05)) / 12)
     assert values(record(ttc_s=0.1), GRADED)["score"] == pytest.approx(11 / 12)
     hit = record(contacts=contact(3, Contact.FRONT))
     assert values(hit, GRADED)["score"] == 0
