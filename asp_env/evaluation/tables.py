@@ -27,6 +27,11 @@ FORECAST_MORE = {
 }
 """Headings of the last open-loop table, by selection and metric."""
 
+REGRET_INTERVALS: Headings = {"regret": "regret", "regret removed": "removed"}
+REGRET_VALUES: Headings = {"log1p regret": "log1p"}
+REGRET_SUBSETS = ("all", "interactive")
+"""The subsets of scenarios for which planning regret is printed."""
+
 DRIVING_INTERVALS: Headings = {"score": "score"}
 DRIVING_VALUES: Headings = {
     "no collision": "no coll.",
@@ -91,6 +96,32 @@ def open_loop_tables(rows: Sequence[Row], privileged: Collection[str] = ()) -> l
         table = _table(f"{subset} targets; ₃: best of 3 modes; NLL and later columns: all modes")
         _fill(table, "predictor", more, {}, {name: name for name in FORECAST_MORE.values()})
         tables.append(table)
+    return tables
+
+
+def regret_tables(
+    rows: Sequence[Row], privileged: Collection[str] = (), *, planner: str
+) -> list[Table]:
+    """Planning regret by predictor, a table for each of `REGRET_SUBSETS` that occurs.
+
+    Args:
+        rows: open-loop rows of `metrics.csv`.
+        privileged: full names of the privileged predictors, which are marked.
+        planner: name of the planner.
+    """
+    shown = {*REGRET_INTERVALS, *REGRET_VALUES}
+    short = short_names([row.predictor for row in rows])
+    tables = []
+    for subset in REGRET_SUBSETS:
+        lines: dict[str, dict[str, Row]] = {}
+        for row in rows:
+            if row.subset == subset and row.metric in shown:
+                name = short[row.predictor] + (MARK if row.predictor in privileged else "")
+                lines.setdefault(name, {})[row.metric] = row
+        if lines:
+            title = f"planning regret, {planner}, {subset} scenarios"
+            tables.append(_table(title))
+            _fill(tables[-1], "predictor", lines, REGRET_INTERVALS, REGRET_VALUES)
     return tables
 
 

@@ -8,7 +8,7 @@ from rich.table import Table
 
 from asp_env.evaluation.results import Row
 from asp_env.evaluation.selection import short_names
-from asp_env.evaluation.tables import driving_table, open_loop_tables
+from asp_env.evaluation.tables import driving_table, open_loop_tables, regret_tables
 from asp_env.metrics.driving.rules import PDMS, RULES
 
 SHOWN = PDMS.shown
@@ -68,6 +68,25 @@ def test_tables_are_of_all_targets_if_none_moves():
     lines = _printed(open_loop_tables(_open_loop("oracle", subsets=("all",)))[0])
     assert "all targets, most-probable" in lines[0]
     assert "1.00 [0.90, 1.10]" in lines[-1]
+
+
+def test_regret_tables():
+    """Of all and of interactive scenarios; other tags are in the file only."""
+    values = {"regret": 1.5, "regret removed": -123.25, "log1p regret": 0.25}
+    rows = [
+        _row(metric, value, predictor=name, subset=subset)
+        for name in ("constant-velocity", "oracle")
+        for subset in ("all", "left", "interactive")
+        for metric, value in values.items()
+    ]
+    tables = regret_tables(rows, ["oracle"], planner="sampling")
+    assert len(tables) == 2
+    lines = [_printed(table) for table in tables]
+    assert max(len(line) for each in lines for line in each) <= 80
+    assert "planning regret, sampling, interactive" in lines[1][0]
+    found = next(line for line in lines[0] if line.startswith("oracle *"))
+    assert found.split()[2:5] == ["1.50", "[1.40,", "1.60]"]
+    assert not regret_tables(_open_loop("oracle"), planner="sampling")
 
 
 @pytest.mark.parametrize("rules", RULES.values(), ids=RULES)

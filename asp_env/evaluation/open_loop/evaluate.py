@@ -13,6 +13,7 @@ from rich.console import Console
 from asp_env.data.causal import causal_histories
 from asp_env.data.predictor import Predictor
 from asp_env.data.recording import DEFAULT_DT_S, ticks
+from asp_env.data.scenarios.scenario import find_scenarios
 from asp_env.data.snippets import (
     HISTORY_S,
     SnippetIndex,
@@ -30,6 +31,7 @@ from asp_env.evaluation.open_loop.scoring import (
     complete_forecast,
     score_forecasts,
 )
+from asp_env.evaluation.regret import RegretScores, load_candidate_planner, score_regrets
 from asp_env.evaluation.report import ForecastExamples, check_report_possible, write_report
 from asp_env.evaluation.results import Row, write_manifest, write_metrics
 from asp_env.evaluation.selection import (
@@ -39,16 +41,20 @@ from asp_env.evaluation.selection import (
     ticks_to_evaluate,
 )
 from asp_env.evaluation.statistics import Estimate
-from asp_env.evaluation.tables import open_loop_tables
+from asp_env.evaluation.tables import open_loop_tables, regret_tables
 from asp_env.files import atomic_folder
 from asp_env.metrics.forecast.calibration import calibration_error, calibration_sums
 from asp_env.metrics.forecast.errors import MODE_RULES, ModeRule
+from asp_env.planning.planner import CandidatePlanner
 
 REFERENCE = "constant-velocity"
 """If this predictor takes part, the FDE of the others is also stated as a ratio to its FDE."""
 
 RATIO = "FDE / constant velocity"
 ECE = "ECE"
+
+NO_PLANNER = ("", "none")
+"""Values of `--planner` that measure no planning regret."""
 
 EXAMPLES = 6
 """Number of situations whose forecasts the report shows."""
@@ -81,6 +87,11 @@ class Evaluate:
     best_by: ModeRule = "fde"
     """How the best of 3 modes is chosen: lowest final error,
     lowest mean error, or the rule of the paper."""
+    planner: str = "sampling"
+    """Planner whose planning regret is measured with each
+    predictor at states of the logged ego; none for no regret."""
+    max_states: int = 2000
+    """Largest number of these states; chosen at even spacing."""
 
     def run(self) -> None:
         """Evaluates, writes the folder and prints the tables.
@@ -97,7 +108,11 @@ class Evaluate:
                 folder, title=f"Open loop on {Path(self.data).name}", examples=result.examples
             )
         console = Console()
-        for table in open_loop_tables(result.rows, result.manifest["privileged"]):
+        privileged = result.manifest["privileged"]
+        for table in (
+            *open_loop_tables(result.rows, privileged),
+            *regret_tables(result.rows, privileged, planner=self.planner),
+        ):
             console.print(table)
         console.print(f"wrote {self.out}/report.html")
 
@@ -123,6 +138,7 @@ def evaluate(config: Evaluate) -> OpenLoopResult:
     """
     recordings = open_data(config.data)
     horizon = ticks(config.horizon, config.dt)
+    planner = None if config.planner in NO_PLANNER else load_candidate_planner(config.planner)
     loaded = load_predictors(config.predictors, horizon=horizon, dt_s=config.dt)
     allowed, part = ticks_to_evaluate(recordings, loaded, config.part, dt_s=config.dt)
     index = index_snippets(
@@ -140,8 +156,15 @@ def evaluate(config: Evaluate) -> OpenLoopResult:
         predictors, index, scenes=scenes, recorded=recordings, best_by=config.best_by
     )
     moving = scores.subsets["moving"]
+    regrets = (
+        None
+        if planner is None
+        else _regrets(config, planner, predictors, recordings, scenes, allowed)
+    )
     return OpenLoopResult(
-        rows=make_rows(scores, predictors, data=config.data, horizon_s=config.horizon),
+        rows=make_rows(
+            scores, predictors, data=config.data, horizon_s=config.horizon, regrets=regrets
+        ),
         manifest={
             "data": config.data,
             "data_hash": recordings.data_hash(),
@@ -154,6 +177,8 @@ def evaluate(config: Evaluate) -> OpenLoopResult:
             "recordings": len(np.unique(index.recording)),
             "snippets": len(index),
             "moving snippets": int(moving.sum()),
+            "planner": config.planner if regrets is not None else "none",
+            "states": 0 if regrets is None else len(regrets.recording),
             "best_by": config.best_by,
             "best-of-3": f"of the three most probable modes, {MODE_RULES[config.best_by]}",
             "intervals": "95 %, bootstrap over recordings",
@@ -163,8 +188,42 @@ def evaluate(config: Evaluate) -> OpenLoopResult:
     )
 
 
+def _regrets(
+    config: Evaluate,
+    planner: CandidatePlanner[Any],
+    predictors: Mapping[str, Predictor],
+    recordings: Recordings,
+    scenes: Sequence[Any],
+    allowed: Sequence[Bool[np.ndarray, " _"]],
+) -> RegretScores | None:
+    """Planning regret at states of all scenarios within the allowed ticks; None without any."""
+    scenarios = find_scenarios(
+        recordings,
+        source=config.data,
+        dt_s=config.dt,
+        history=ticks(HISTORY_S, config.dt),
+        allowed=allowed,
+    )
+    if not len(scenarios):
+        return None
+    return score_regrets(
+        predictors,
+        scenarios,
+        planner,
+        scenes=scenes,
+        recorded=recordings,
+        horizon=ticks(config.horizon, config.dt),
+        max_states=config.max_states,
+    )
+
+
 def make_rows(
-    scores: ForecastScores, predictors: Mapping[str, Predictor], *, data: str, horizon_s: float
+    scores: ForecastScores,
+    predictors: Mapping[str, Predictor],
+    *,
+    data: str,
+    horizon_s: float,
+    regrets: RegretScores | None = None,
 ) -> list[Row]:
     """Means with intervals: a row for each predictor, selection, subset and metric that occurs.
 
@@ -173,6 +232,7 @@ def make_rows(
         predictors: the predictors by name.
         data: DATA as given.
         horizon_s: forecast horizon in seconds.
+        regrets: planning regret of the predictors, if it was measured.
     """
     reference = {
         each.selection: each
@@ -188,6 +248,8 @@ def make_rows(
         for modes in scores.modes:
             if modes.name == name:
                 estimates += _calibration(modes, scores)
+        if regrets is not None:
+            estimates += [(ALL_MODES, *each) for each in regrets.estimates(name)]
         metadata = predictor.metadata
         rows += [
             Row(

@@ -317,6 +317,28 @@ METRIC_NOTES = {
         "Mean distance between most probable forecasts made 0.6 s apart, over the ticks that both "
         "cover.",
     ),
+    "regret": _note(
+        "Regret",
+        "",
+        "lower",
+        "Planning regret: cost, by the recorded future, of the plan that the planner chooses with "
+        "the forecast, less that of the plan it chooses with the recorded future. Mean over states "
+        "of the logged ego; subsets are tags of their scenarios.",
+    ),
+    "log1p regret": _note(
+        "ln(1 + regret)",
+        "",
+        "lower",
+        "Mean of the logarithm of one plus the planning regret, on which few large regrets have "
+        "less weight.",
+    ),
+    "regret removed": _note(
+        "Regret removed",
+        "%",
+        "higher",
+        "100 % minus the planning regret as a share of that with constant velocity at the same "
+        "states; 100 % for the oracle. Paired interval.",
+    ),
     "score": _note(
         "Score",
         "%",
