@@ -25,6 +25,9 @@ CONTROLS = ("blind", BASELINE, "blend:0.25", "blend:0.5", "blend:0.75", ORACLE)
 MIN_RUNGS = 3
 """An oracle share needs the baseline, the oracle and at least one rung between them."""
 
+_ROUNDING = 1e-9
+"""Scores that differ by less are equal. Chosen by hand: above the rounding of means of scores."""
+
 
 def rung(predictor: str) -> float | None:
     """The share of the recorded future in the forecasts of a predictor.
@@ -82,8 +85,8 @@ def oracle_shares(
         shares: share of each rung, in increasing order.
     """
     fitted = isotonic(ladder)
-    below = (fitted < scores[:, None]).sum(axis=-1)
-    not_above = (fitted <= scores[:, None]).sum(axis=-1)
+    below = (fitted < scores[:, None] - _ROUNDING).sum(axis=-1)
+    not_above = (fitted <= scores[:, None] + _ROUNDING).sum(axis=-1)
     return (
         _crossing(scores, fitted, shares, below) + _crossing(scores, fitted, shares, not_above)
     ) / 2
@@ -136,6 +139,16 @@ def headroom(
         return Estimate(value=np.nan, low=None, high=None, n=n)
     with np.errstate(invalid="ignore", divide="ignore"):
         return interval((scores - baseline) / (oracle - baseline), n=n)
+
+
+def is_under_test(predictor: str, *, privileged: bool) -> bool:
+    """Whether a predictor is compared for its own sake, and not a control.
+
+    Args:
+        predictor: name of the predictor as given; empty for a method without forecasts.
+        privileged: whether the method is given the recorded future.
+    """
+    return bool(predictor) and not privileged and predictor not in CONTROLS
 
 
 def missing_controls(predictors: Sequence[str]) -> tuple[str, ...]:

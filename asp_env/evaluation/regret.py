@@ -86,17 +86,29 @@ class RegretScores:
     recording: Int[np.ndarray, " n"]
     """Index of each state's recording, over which intervals are resampled."""
 
-    def estimates(self, name: str) -> Iterator[tuple[str, str, Estimate]]:
-        """Subset, metric and estimate of a predictor's metrics."""
+    def estimates(
+        self, runs: Sequence[str], *, stream: int = 0
+    ) -> Iterator[tuple[str, str, Estimate]]:
+        """Subset, metric and estimate of a predictor's metrics.
+
+        Args:
+            runs: names of its training runs; one name for a predictor without several runs.
+            stream: as for `statistics.resampled_sums`.
+        """
         for subset, member in self.subsets.items():
-            regret, groups = self.regrets[name][member], self.recording[member]
-            yield subset, REGRET, statistics.mean(regret, groups)
-            yield subset, LOG_REGRET, statistics.mean(np.log1p(regret), groups)
-            reference = self.regrets[REFERENCE][member]
-            if name != REFERENCE and reference.any():
-                parts = np.stack([regret, reference], axis=-1)
-                removed = statistics.from_sums(parts, groups, lambda s: 1 - s[..., 0] / s[..., 1])
-                yield subset, REMOVED, removed
+            regret = np.stack([self.regrets[run][member] for run in runs])
+            reference = np.broadcast_to(self.regrets[REFERENCE][member], regret.shape)
+            per_state = {REGRET: (regret, np.ones(regret.shape))}
+            per_state[LOG_REGRET] = (np.log1p(regret), np.ones(regret.shape))
+            if [*runs] != [REFERENCE] and reference.any():
+                per_state[REMOVED] = (reference - regret, reference)
+            for metric, parts in per_state.items():
+                sums = statistics.resampled_sums(
+                    np.stack(parts, axis=-1), self.recording[member], stream=stream
+                )
+                with np.errstate(invalid="ignore", divide="ignore"):
+                    ratios = sums[..., 0] / sums[..., 1]
+                yield subset, metric, statistics.interval(ratios, n=int(member.sum()))
 
 
 def score_regrets(

@@ -14,6 +14,9 @@ from asp_env.files import atomic_file
 PACKAGES = ("asp-env", "numpy", "numba", "torch", "gymnasium", "eclipse-sumo")
 """Packages whose versions the manifest states, as far as they are installed."""
 
+SCORE = "score"
+"""Metric: the score of the driving rules."""
+
 ORACLE_SHARE = "oracle share"
 """Metric: position of a method's score on the ladder from constant velocity (0) to the oracle (1),
 see `asp_env.evaluation.ladder`."""

@@ -99,6 +99,16 @@ def load_predictors(names: Sequence[str], *, horizon: int, dt_s: float) -> list[
     return predictors
 
 
+def shared_metadata(predictors: Sequence[Predictor], key: str) -> str:
+    """An entry of the metadata of the runs of a method; different entries are joined by ` | `.
+
+    Args:
+        predictors: the predictor of each run.
+        key: key of `Predictor.metadata`.
+    """
+    return " | ".join(dict.fromkeys(each.metadata.get(key, "") for each in predictors))
+
+
 def short_names(names: Sequence[str]) -> dict[str, str]:
     """The shortest distinct labels of predictors, by their full names.
 

@@ -130,9 +130,25 @@ def resampled_sums(
         Sums of shape `(1 + RESAMPLES, *sums)`. If all samples are from one recording, there are no
         resamples and the shape is `(1, *sums)`.
     """
+    return average_runs(run_sums(parts, groups), stream=stream)
+
+
+def run_sums(
+    parts: Shaped[np.ndarray, "runs n ..."], groups: Shaped[np.ndarray, " n"]
+) -> Float[np.ndarray, "draws runs ..."]:
+    """Sums over samples of each run: of the samples as they are, then of every resample.
+
+    Args:
+        parts: terms of the sums of each run for each of n > 0 samples, of shape `(runs, n, *sums)`.
+        groups: recording that each sample is from, as numbers or names.
+
+    Returns:
+        Sums of shape `(1 + RESAMPLES, runs, *sums)`, or `(1, runs, *sums)` if all samples are from
+        one recording.
+    """
     names, index = np.unique(groups, return_inverse=True)
-    runs, shape = len(parts), parts.shape[2:]
-    by_sample = np.moveaxis(parts.reshape(runs, len(index), -1), 1, 0).reshape(len(index), -1)
+    runs, samples, *shape = parts.shape
+    by_sample = np.moveaxis(parts.reshape(runs, samples, -1), 1, 0).reshape(samples, -1)
     by_group = np.stack(
         [
             np.bincount(index.reshape(-1), weights=column, minlength=len(names))
@@ -140,14 +156,30 @@ def resampled_sums(
         ],
         axis=-1,
     )
-    sample = by_group.sum(axis=0).reshape(1, runs, -1).mean(axis=1)
-    if len(names) < 2:
-        return sample.reshape(1, *shape)
-    by_run = (_resample_counts(len(names)) @ by_group).reshape(RESAMPLES, runs, -1)
-    resamples = by_run[:, 0]
-    if runs > 1:
-        resamples = np.einsum("br,brk->bk", _run_shares(runs, stream), by_run)
-    return np.concatenate([sample, resamples]).reshape(1 + RESAMPLES, *shape)
+    sums = by_group.sum(axis=0)[None]
+    if len(names) > 1:
+        sums = np.concatenate([sums, _resample_counts(len(names)) @ by_group])
+    return sums.reshape(len(sums), runs, *shape)
+
+
+def average_runs(
+    values: Float[np.ndarray, "draws runs ..."], *, stream: int = 0
+) -> Float[np.ndarray, "draws ..."]:
+    """Means over runs; those of resamples over resampled runs.
+
+    Args:
+        values: values of each run, of the samples as they are, then of every resample.
+        stream: number of the sequence of random numbers, as for `resampled_sums`.
+    """
+    draws, runs = values.shape[:2]
+    if runs == 1:
+        return values[:, 0]
+    sample = values[:1].mean(axis=1)
+    if draws == 1:
+        return sample
+    return np.concatenate(
+        [sample, np.einsum("br,br...->b...", _run_shares(runs, stream), values[1:])]
+    )
 
 
 def interval(draws: Float[np.ndarray, " draws"], *, n: int) -> Estimate:
@@ -158,11 +190,12 @@ def interval(draws: Float[np.ndarray, " draws"], *, n: int) -> Estimate:
             `resampled_sums`; resamples for which it is not defined are NaN.
         n: number of samples.
     """
-    value = float(draws[0])
-    if len(draws) == 1:
+    value, resamples = float(draws[0]), draws[1:]
+    resamples = resamples[~np.isnan(resamples)]
+    if not len(resamples):
         return Estimate(value=value, low=None, high=None, n=n)
     tail = (1 - LEVEL) / 2
-    low, high = np.nanquantile(draws[1:], [tail, 1 - tail])
+    low, high = np.quantile(resamples, [tail, 1 - tail])
     return Estimate(value=value, low=float(low), high=float(high), n=n)
 
 
@@ -176,7 +209,7 @@ def difference(draws: Float[np.ndarray, " draws"], *, n: int) -> Difference:
     estimate = interval(draws, n=n)
     if len(draws) == 1:
         return Difference(estimate=estimate, mde=None, p=None)
-    error = float(np.nanstd(draws[1:], ddof=1))
+    error = float(draws[1:].std(ddof=1))
     return Difference(
         estimate=estimate, mde=DETECTABLE * error, p=_two_sided_p(estimate.value, error)
     )

@@ -5,9 +5,10 @@ from collections.abc import Collection, Iterator, Mapping, Sequence
 from rich import box
 from rich.table import Table
 
-from asp_env.evaluation.results import ORACLE_SHARE, Row, difference_of
+from asp_env.evaluation.ladder import is_under_test
+from asp_env.evaluation.results import ORACLE_SHARE, SCORE, Row, difference_of
 from asp_env.evaluation.selection import short_names
-from asp_env.evaluation.verdicts import share_text, verdict_text
+from asp_env.evaluation.verdicts import headline, share_text, verdict_text
 
 Headings = Mapping[str, str]
 """Column headings by metric."""
@@ -32,7 +33,7 @@ REGRET_VALUES: Headings = {"log1p regret": "log1p"}
 REGRET_SUBSETS = ("all", "interactive")
 """The subsets of scenarios for which planning regret is printed."""
 
-DRIVING_INTERVALS: Headings = {"score": "score"}
+DRIVING_INTERVALS: Headings = {SCORE: "score"}
 DRIVING_VALUES: Headings = {
     "no collision": "no coll.",
     "no at-fault collision": "no fault",
@@ -80,7 +81,7 @@ def open_loop_tables(rows: Sequence[Row], privileged: Collection[str] = ()) -> l
     for row in rows:
         if row.subset != subset:
             continue
-        name = short[row.predictor] + (MARK if row.predictor in privileged else "")
+        name = short[row.predictor] + _runs(row) + (MARK if row.predictor in privileged else "")
         if row.selection:
             lines = by_selection.setdefault(row.selection, {})
             lines.setdefault(name, {})[row.metric] = row
@@ -148,6 +149,26 @@ def driving_tables(
     return tables
 
 
+def headlines(rows: Sequence[Row], privileged: Collection[str]) -> list[str]:
+    """A sentence for each predictor under test, of the last of `SUBSETS` that occurs.
+
+    Args:
+        rows: closed-loop rows of `metrics.csv`.
+        privileged: names of the privileged planners and predictors.
+    """
+    subset = next((name for name in reversed(SUBSETS) if any(r.subset == name for r in rows)), "")
+    chosen = [row for row in rows if row.subset == subset]
+    shares = {(row.planner, row.predictor): row for row in chosen if row.metric == ORACLE_SHARE}
+    return [
+        f"{_scenarios(subset, row.n)}: ".capitalize()
+        + headline(name, pair[1], _signed(row), row, shares.get((row.planner, row.predictor)))
+        for name, row in _by_method(chosen, privileged, with_planner=False)
+        if (pair := difference_of(row.metric)) is not None
+        and pair[0] == SCORE
+        and is_under_test(row.predictor, privileged=row.predictor in privileged)
+    ]
+
+
 def driving_table(
     rows: Sequence[Row],
     privileged: Collection[str],
@@ -164,7 +185,8 @@ def driving_table(
         subset: `all` or a tag.
     """
     rules = " and ".join(dict.fromkeys(row.rules for row in rows))
-    table = _table(f"{_scenarios(subset)}: driving by {rules}, mean, 95 % interval over recordings")
+    count = max((row.n for row in rows if row.subset == subset), default=0)
+    table = _table(f"{_scenarios(subset, count)}: driving by {rules}, mean [95 % interval]")
     if len(shown) > MAX_PADDED_COLUMNS:
         table.padding = 0
     lines: dict[str, dict[str, Row]] = {}
@@ -178,25 +200,28 @@ def driving_table(
 
 def _difference_tables(rows: Sequence[Row], privileged: Collection[str]) -> list[Table]:
     """The differences of the score to the reference; none without a score or a reference."""
+    planners = list(dict.fromkeys(row.planner for row in rows if row.predictor))
     lines: dict[str, dict[str, Row]] = {}
-    for name, row in _by_method(rows, privileged, with_planner=False):
+    for name, row in _by_method(rows, privileged, with_planner=len(planners) > 1):
         lines.setdefault(name, {})[row.metric] = row
     differences = {
-        row.metric: pair[1]
+        row.metric: (pair[1], row)
         for row in rows
-        if (pair := difference_of(row.metric)) is not None and pair[0] == "score"
+        if (pair := difference_of(row.metric)) is not None and pair[0] == SCORE
     }
     return [
-        _difference_table(metric, reference, lines) for metric, reference in differences.items()
+        _difference_table(
+            f"{_scenarios(row.subset, row.n)}, {' and '.join(planners)}: "
+            f"score less that of {reference}",
+            metric,
+            lines,
+        )
+        for metric, (reference, row) in differences.items()
     ]
 
 
-def _difference_table(metric: str, reference: str, lines: Mapping[str, Mapping[str, Row]]) -> Table:
-    one = next(row for metrics in lines.values() for row in metrics.values())
-    planners = {row.planner for each in lines.values() for row in each.values() if row.predictor}
-    table = _table(
-        f"{_scenarios(one.subset)}: score less that of {reference}, {' and '.join(planners)}"
-    )
+def _difference_table(title: str, metric: str, lines: Mapping[str, Mapping[str, Row]]) -> Table:
+    table = _table(title)
     has_shares = any(ORACLE_SHARE in metrics for metrics in lines.values())
     table.add_column("predictor", min_width=16)
     table.add_column("difference", justify="right", no_wrap=True)
@@ -213,7 +238,7 @@ def _difference_table(metric: str, reference: str, lines: Mapping[str, Mapping[s
             name,
             _signed(row),
             "" if row.mde is None else f"{row.mde:.3f}",
-            verdict_text(row).replace(" (", "\n("),
+            verdict_text(row).replace(" (", "\n").replace(" needed)", "").rstrip(")"),
             *([share_text(share) if share else ""] if has_shares else []),
         )
     table.caption = "MDE: smallest difference that these scenarios resolve with 80 % power"
@@ -226,8 +251,8 @@ def _signed(row: Row) -> str:
     return f"{row.value:+.3f} [{row.low:.3f}, {row.high:.3f}]"
 
 
-def _scenarios(subset: str) -> str:
-    return f"{subset} scenarios"
+def _scenarios(subset: str, count: int) -> str:
+    return f"all {count} scenarios" if subset == "all" else f"{count} {subset} scenarios"
 
 
 def _by_method(
@@ -240,9 +265,12 @@ def _by_method(
         name = " + ".join(part for part in parts if part)
         if not with_planner and row.predictor:
             name = short[row.predictor]
-        runs = f" ({row.runs} runs)" if row.runs is not None and row.runs > 1 else ""
         mark = MARK if row.planner in privileged or row.predictor in privileged else ""
-        yield f"{name}{runs}{mark}", row
+        yield f"{name}{_runs(row)}{mark}", row
+
+
+def _runs(row: Row) -> str:
+    return f" ({row.runs} runs)" if row.runs is not None and row.runs > 1 else ""
 
 
 def _table(title: str) -> Table:

@@ -4,6 +4,7 @@ from typing import Protocol, runtime_checkable
 
 from asp_env.evaluation.statistics import is_resolved, samples_needed
 
+RESOLVED = "resolved"
 NOT_RESOLVED = "not resolved"
 
 
@@ -36,13 +37,13 @@ def verdict_text(difference: Statistic) -> str:
     if value is None or mde is None or n is None:
         return f"{NOT_RESOLVED} (one recording)"
     if is_resolved(value, difference.low, difference.high, mde):
-        return "resolved"
+        return RESOLVED
     needed = samples_needed(value, mde, int(n))
     if needed is None:
         return "equal" if mde == 0.0 else f"{NOT_RESOLVED} (difference 0)"
     if needed <= n:
         return f"{NOT_RESOLVED} (0 in interval)"
-    return f"{NOT_RESOLVED} (n ≈ {_two_digits(needed):,})"
+    return f"{NOT_RESOLVED} (n ≈ {_two_digits(needed):,} needed)"
 
 
 def share_text(share: Statistic) -> str:
@@ -59,26 +60,24 @@ def share_text(share: Statistic) -> str:
     return f"{text} [{100 * share.low:.0f}, {100 * share.high:.0f}]"
 
 
-def headline(name: str, reference: str, difference: Statistic, share: Statistic | None) -> str:
+def headline(
+    name: str, reference: str, gain: str, difference: Statistic, share: Statistic | None
+) -> str:
     """A sentence on a method: its oracle share, its difference to the reference, the verdict.
 
     Args:
         name: name of the method.
         reference: name of the reference.
+        gain: the difference as text, such as `+0.026 [0.002, 0.051]`.
         difference: difference of the score to that of the reference.
         share: oracle share of the method; None where there is no ladder.
     """
-    if difference.value is None:
-        return ""
-    bounds = ""
-    if difference.low is not None and difference.high is not None:
-        bounds = f" [{difference.low:.3f}, {difference.high:.3f}]"
-    gain = f"score {difference.value:+.3f}{bounds} against {reference}, {verdict_text(difference)}"
-    if share is None:
-        return f"{name}: {gain}."
-    percent, _, interval = share_text(share).partition(" % ")
-    article = "an" if percent in ("8", "11", "18") or percent.startswith("8") else "a"
-    return f"{name} drives like {article} {percent} % oracle {interval}".rstrip() + f": {gain}."
+    drives = ""
+    if share is not None and share.value is not None:
+        percent, _, bounds = share_text(share).partition(" % ")
+        article = "an" if percent.startswith("8") or percent in ("11", "18") else "a"
+        drives = f" drives like {article} {percent.removesuffix(' %')} % oracle {bounds}".rstrip()
+    return f"{name}{drives}: score {gain} against {reference}, {verdict_text(difference)}."
 
 
 def _two_digits(number: int) -> int:

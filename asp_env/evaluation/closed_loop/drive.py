@@ -31,7 +31,7 @@ from asp_env.evaluation.closed_loop.scenario_table import write_scenario_table
 from asp_env.evaluation.closed_loop.summary import Comparison, MethodScores, comparison_rows
 from asp_env.evaluation.ladder import BASELINE, missing_controls
 from asp_env.evaluation.report import check_report_possible, write_report
-from asp_env.evaluation.results import Row, write_manifest, write_metrics
+from asp_env.evaluation.results import SCORE, Row, write_manifest, write_metrics
 from asp_env.evaluation.selection import (
     PartChoice,
     expand_runs,
@@ -39,7 +39,7 @@ from asp_env.evaluation.selection import (
     short_names,
     ticks_to_evaluate,
 )
-from asp_env.evaluation.tables import driving_tables
+from asp_env.evaluation.tables import driving_tables, headlines
 from asp_env.files import atomic_folder
 from asp_env.metrics.driving.rules import DEFAULT_RULES, RULES, Rules
 from asp_env.sim.traffic.log import LogDriver
@@ -108,6 +108,8 @@ class Drive:
         shown = RULES[self.rules].shown
         for table in driving_tables(result.rows, result.manifest["privileged"], shown):
             console.print(table)
+        for sentence in headlines(result.rows, result.manifest["privileged"]):
+            console.print(sentence)
         console.print(f"wrote {self.out}/report.html")
 
 
@@ -255,8 +257,7 @@ def _comparison(
             value=0.0,
             n=0,
         ),
-        compared=[*(["score"] if rules.weights else []), *rules.shown],
-        has_score=bool(rules.weights),
+        compared=[*([SCORE] if rules.weights else []), *rules.shown],
         reference=config.reference or BASELINE,
         replayed=config.traffic == LogDriver.name,
     )

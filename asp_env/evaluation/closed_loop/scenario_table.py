@@ -17,7 +17,8 @@ def write_scenario_table(
 ) -> None:
     """Writes `scenarios.csv`: a row for each method, training run and scenario.
 
-    The columns are `COLUMNS` and the names of the metrics; a metric that is not defined is empty.
+    The columns are `COLUMNS` and the names of the metrics that are defined in any scenario; where a
+    metric is not defined, its cell is empty.
     Numbers have six significant digits, tags are separated by blanks.
 
     Args:
@@ -25,7 +26,15 @@ def write_scenario_table(
         scenarios: the scenarios.
         methods: the scores of all methods in these scenarios.
     """
-    metrics = list(dict.fromkeys(name for m in methods for s in m.scores for name in s.metrics))
+    metrics = list(
+        dict.fromkeys(
+            name
+            for method in methods
+            for scores in method.scores
+            for name, metric in scores.metrics.items()
+            if metric.valid.any()
+        )
+    )
     with (
         atomic_file(folder / "scenarios.csv") as partial,
         partial.open("w", newline="") as file,

@@ -15,7 +15,8 @@ from asp_env.data.scenarios.scenario import ScenarioSet
 from asp_env.data.scenarios.tags import TAGS
 from asp_env.evaluation import ladder, statistics
 from asp_env.evaluation.closed_loop.comparison import EpisodeScores
-from asp_env.evaluation.results import HEADROOM, ORACLE_SHARE, Row, difference_name
+from asp_env.evaluation.results import HEADROOM, ORACLE_SHARE, SCORE, Row, difference_name
+from asp_env.evaluation.selection import shared_metadata
 from asp_env.evaluation.statistics import Difference, Estimate
 from asp_env.metrics.masked import Masked
 
@@ -42,10 +43,9 @@ class MethodScores:
             valid=np.stack([metric.valid for metric in each]),
         )
 
-    def fact(self, key: str) -> str:
-        """An entry of the predictors' metadata; different ones of several runs are joined."""
-        metadata = [predictor.metadata for predictor in self.runs.values() if predictor]
-        return " | ".join(dict.fromkeys(each.get(key, "") for each in metadata))
+    def metadata(self, key: str) -> str:
+        """An entry of the predictors' metadata; empty without forecasts."""
+        return shared_metadata([each for each in self.runs.values() if each is not None], key)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -57,9 +57,7 @@ class Comparison:
     common: Row
     """A row with the cells that all rows share."""
     compared: Sequence[str]
-    """Metrics of which differences are stated; the first is the score, if the rules have one."""
-    has_score: bool
-    """Whether the first compared metric is the score of the rules."""
+    """Metrics of which differences are stated, with the score if the rules have one."""
     reference: str | None
     """Predictor that differences refer to, None for no differences."""
     replayed: bool
@@ -101,9 +99,9 @@ def _method_row(comparison: Comparison, method: MethodScores) -> Row:
         comparison.common,
         planner=method.planner,
         predictor=method.predictor,
-        trained_on=method.fact("trained_on"),
-        view=method.fact("view"),
-        recipe=method.fact("preset"),
+        trained_on=method.metadata("trained_on"),
+        view=method.metadata("view"),
+        recipe=method.metadata("preset"),
         runs=len(method.runs) if method.predictor else None,
     )
 
@@ -132,7 +130,7 @@ def _table(comparison: Comparison, member: Bool[np.ndarray, " n"]) -> _Table:
             if estimate is not None:
                 table.estimates[number, metric] = estimate
     _add_differences(comparison, member, table)
-    if comparison.has_score and comparison.replayed:
+    if SCORE in comparison.compared and comparison.replayed:
         _add_ladder(comparison, member, table)
     return table
 
@@ -213,7 +211,7 @@ def _add_ladder(comparison: Comparison, member: Bool[np.ndarray, " n"], table: _
     rungs = {m.predictor: share for m in methods if (share := ladder.rung(m.predictor)) is not None}
     if ladder.BASELINE not in rungs or ladder.ORACLE not in rungs:
         return
-    means, n = _means(methods, "score", member, comparison.scenarios.recording)
+    means, n = _means(methods, SCORE, member, comparison.scenarios.recording)
     if not n:
         return
     of = dict(zip((m.predictor for m in methods), means.T, strict=True))
