@@ -1,12 +1,15 @@
 """Planners: they decide what the ego does, given a scene and a forecast of the other agents."""
 
 from asp_env.planning.idm import IDMPlanner
+from asp_env.planning.pdm import PDMPlanner, PDMWeights
 from asp_env.planning.planner import Expert, Plan, Planner, load_planner
 from asp_env.planning.sampling import SamplingPlanner, SamplingWeights
 
 __all__ = [
     "Expert",
     "IDMPlanner",
+    "PDMPlanner",
+    "PDMWeights",
     "Plan",
     "Planner",
     "SamplingPlanner",
