@@ -23,7 +23,7 @@ Different from the paper:
   speed no harder than `TARGET_BRAKING_MPS2`.
 - The driving direction is not scored; a proposal pays for its offset from the route instead.
 - The comfort of a proposal includes the ego's past second.
-- The ego brakes at any speed, not only below 5 m/s, and only if that makes a collision less
+- The ego brakes at any speed, not only below 5 m/s, unless a collision within 2 s would become more
   probable.
 """
 
@@ -39,7 +39,13 @@ from numba import njit
 from asp_env.data.predictor import Forecast
 from asp_env.data.scene import EGO, Scene
 from asp_env.dynamics import MAX_ACCELERATION_MPS2, forward
-from asp_env.dynamics.car_following import IDM, free_ahead, idm_acceleration, pursuit_steering
+from asp_env.dynamics.car_following import (
+    IDM,
+    PURSUIT_S,
+    free_ahead,
+    idm_acceleration,
+    pursuit_steering,
+)
 from asp_env.geometry import overlaps, point_on_route, project, route_coordinates
 from asp_env.metrics.boxes import AT_REST_MPS, is_behind, touching_trailers
 from asp_env.metrics.drivable import OFF_ROAD_M, off_road_m
@@ -60,9 +66,14 @@ TARGET_BRAKING_MPS2 = 3.0
 """A proposal brakes by at most this much for its target speed, or harder for a leader. Balances
 yielding early against comfort. Chosen by hand."""
 
-JERK_MPS3 = 4.0
-"""Largest change of a proposal's acceleration per second, below nuPlan's comfort bound of
-4.13 m/s³. Chosen by hand."""
+LIMIT_AHEAD_S = 0.6
+"""A proposal reaches a lower speed limit so far ahead within this time. Balances exceeding the
+limit against braking too long, since the jerk is limited. Chosen by hand."""
+
+JERK_MPS3 = 3.0
+"""Largest change of a proposal's acceleration per second. Balances early braking against nuPlan's
+comfort bound of 4.13 m/s³, which jerks of 3.5 m/s³ at the ends of an episode break, since the
+parabola is extrapolated there. Chosen by hand."""
 
 OFFSET_RATE_MPS = 0.5
 """Lateral speed at which a proposal approaches its offset. Balances evasion against comfort. Chosen
@@ -158,8 +169,8 @@ class PDMPlanner:
         chosen = scores[:, :-1].argmax(axis=1)
         rows = np.arange(len(chosen))
         danger = 1.0 - no_emergency[rows, chosen]
-        braking_helps = no_emergency[:, -1] > no_emergency[rows, chosen]
-        emergency = (danger >= self.weights.emergency) & braking_helps
+        not_worse = no_emergency[:, -1] >= no_emergency[rows, chosen]
+        emergency = (danger >= self.weights.emergency) & not_worse
         chosen = np.where(emergency, scores.shape[1] - 1, chosen)
         return Plan(actions=proposals.actions[rows, chosen], states=proposals.states[rows, chosen])
 
@@ -348,17 +359,21 @@ def _act(
                 gap, leader_speed = free_ahead(
                     around, boxes, radii, is_obstacle, 0, path, count, arc, reach
                 )
-                index = min(max(int(arc + 0.5), 0), count - 1)
-                desired = profiles[c, 0] * routes.speed_limits[b, index]
+                limits = routes.speed_limits[b]
+                desired = profiles[c, 0] * limits[min(max(int(arc + 0.5), 0), count - 1)]
                 # at this speed the free term of the law is the hardest braking for a target speed
                 lowest = speed / (1.0 + TARGET_BRAKING_MPS2 / law[0]) ** 0.25
                 wanted = idm_acceleration(speed, max(desired, lowest), gap, leader_speed, law)
+                # the law alone exceeds a falling limit
+                ahead = arc + speed * LIMIT_AHEAD_S
+                excess = limits[min(max(int(ahead + 0.5), 0), count - 1)] - speed
+                wanted = min(wanted, max(excess / LIMIT_AHEAD_S, -TARGET_BRAKING_MPS2))
                 change = JERK_MPS3 * dt_s
                 acceleration = min(max(wanted, before[b, c] - change), before[b, c] + change)
                 acceleration = min(max(acceleration, -MAX_ACCELERATION_MPS2), law[0])
             # not beyond standstill, so that comfort rates what really happens
             actions[b, c, 0] = max(acceleration, min(-speed / dt_s, 0.0))
-            step = OFFSET_RATE_MPS * 0.45
+            step = OFFSET_RATE_MPS * PURSUIT_S
             aim = min(max(profiles[c, 1], offset - step), offset + step)
             actions[b, c, 1] = pursuit_steering(
                 x, y, heading, speed, length, route, count, arc, aim
