@@ -108,7 +108,7 @@ class ContingencyWeights:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Candidates:
+class BranchingCandidates:
     """F first phases with S second phases each, for each of B egos over T ticks."""
 
     actions: Float[np.ndarray, "b f s t 2"]
@@ -122,7 +122,7 @@ class Candidates:
 class ContingencyPlanner:
     """Chooses the first phase with the lowest expected cost of its best continuations.
 
-    Candidates are limited in jerk, keep the speed limits of lanes and bends, and steer by pure
+    BranchingCandidates are limited in jerk, keep the speed limits of lanes and bends, and steer by pure
     pursuit of the route or of a line that moves beside it along a quintic polynomial. Since the
     first phase starts from the present acceleration, consecutive plans agree without a memory of
     the last one. Joint scenarios combine the modes of the agents whose modes change the costs most.
@@ -160,7 +160,7 @@ class ContingencyPlanner:
             states=candidates.states[rows, best, second],
         )
 
-    def candidates(self, scene: Scene, steps: int) -> Candidates:
+    def candidates(self, scene: Scene, steps: int) -> BranchingCandidates:
         """All candidates of each situation, which do not depend on forecasts.
 
         Args:
@@ -182,12 +182,12 @@ class ContingencyPlanner:
             egos, before, lengths, routes, self._first, self._second, switch, scene.dt_s,
             actions, states, motion,
         )  # fmt: skip
-        return Candidates(
+        return BranchingCandidates(
             actions=actions, states=states, fixed_costs=self._fixed_costs(scene, states, motion)
         )
 
     def costs(
-        self, scene: Scene, forecast: Forecast, candidates: Candidates
+        self, scene: Scene, forecast: Forecast, candidates: BranchingCandidates
     ) -> Float[np.ndarray, "b f"]:
         """The expected cost of each first phase with its best continuations.
 
@@ -226,7 +226,7 @@ class ContingencyPlanner:
         )
 
     def _expected(
-        self, scene: Scene, forecast: Forecast, candidates: Candidates
+        self, scene: Scene, forecast: Forecast, candidates: BranchingCandidates
     ) -> tuple[Float[np.ndarray, "b f"], Int[np.ndarray, "b f"]]:
         """Expected cost of each first phase, and its second phase that is best on average."""
         weights, fixed = self.weights, candidates.fixed_costs

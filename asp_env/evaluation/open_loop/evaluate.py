@@ -266,9 +266,7 @@ def make_rows(
         if modes:
             estimates += _calibration(modes, scores, stream)
         if regrets is not None:
-            estimates += [
-                (ALL_MODES, *each) for each in regrets.estimates(members, stream=stream)
-            ]
+            estimates += [(ALL_MODES, *each) for each in regrets.estimates(members, stream=stream)]
         loaded = [predictors[run] for run in members]
         rows += [
             Row(
