@@ -75,7 +75,9 @@ class Demo:
         run = self.out / PREDICTOR
         if not (run / "config.json").exists():
             console.rule(f"Training the predictor {PREDICTOR}")
-            _run_command("train", predictor=PREDICTOR, data=str(training), out=run, recipe=RECIPE)
+            _run_command(
+                "train", predictor=PREDICTOR, data=(str(training),), out=run, recipe=RECIPE
+            )
         console.rule("Evaluating forecasts and driving")
         trained = f"{PREDICTOR}:{run}"
         open_loop = evaluate(
