@@ -2,7 +2,7 @@
 
 All registered predictors are tested. Trained ones have random weights and read rasters or vectors;
 those that chain segments are tested with every chaining at 6 s. The recipes `ours` are tested on
-vectors.
+vectors. The pretrained ones are tested with their own weights.
 """
 
 from functools import cache
@@ -23,6 +23,7 @@ from asp_env.data.snippets import (
     gather_scene,
     index_snippets,
 )
+from predictors.inference.pretrained import PRETRAINED, pretrained_names
 from predictors.models.chaining import CHAININGS
 from predictors.training.recipes import RECIPES
 from tests.builders import make_recording
@@ -71,6 +72,7 @@ CHAINED = tuple(Case("ssp-asp", "vectors", chaining) for chaining in CHAININGS)
 OURS = tuple(Case(name, "vectors", preset="ours") for name, of in RECIPES.items() if "ours" in of)
 OURS_CHAINED = tuple(Case("ssp-asp", "vectors", chaining, "ours") for chaining in CHAININGS)
 TRAINED = ONE_SEGMENT + CHAINED + OURS + OURS_CHAINED
+SHIPPED = tuple(Case(f"{name}:{PRETRAINED}") for name in pretrained_names())
 
 
 def with_predictors(cases: tuple[Case, ...]) -> pytest.MarkDecorator:
@@ -79,7 +81,7 @@ def with_predictors(cases: tuple[Case, ...]) -> pytest.MarkDecorator:
     return pytest.mark.parametrize("predictor", cases, ids=labels, indirect=True)
 
 
-every = with_predictors(PHYSICAL + TRAINED)
+every = with_predictors(PHYSICAL + TRAINED + SHIPPED)
 
 
 @cache
