@@ -35,8 +35,8 @@ from predictors.training.data import (
     open_training_data,
 )
 from predictors.training.data_loading import batch_workers
+from predictors.training.initial_weights import InitialWeights
 from predictors.training.lightning_parts import BestCheckpoint, EpochLogger, TrainingModule
-from predictors.training.pretrained import PretrainedWeights
 from predictors.training.recipes import SEGMENT_S, TrainingConfig
 from predictors.training.trainer import LOGS, Hardware, SafetensorsIO, make_trainer, quiet
 
@@ -89,17 +89,17 @@ def train(
         run["validation_hash"] = chosen.validation_hash
     spec: PredictorSpec = registry.find("predictors", config.predictor)
     view = make_view(config.view, pixels=config.pixels)
-    pretrained = None
+    initial = None
     if start is not None:
-        pretrained = PretrainedWeights.read(start, spec, view=view, dt_s=config.dt_s)
-        run["start"] = pretrained.weights_hash
+        initial = InitialWeights.read(start, spec, view=view, dt_s=config.dt_s)
+        run["start"] = initial.weights_hash
     resumed = _resumes(out, run, staged=start == out / FIRST_STAGE)
 
     training = chosen.training
-    if pretrained is None or pretrained.action_range is None:
+    if initial is None or initial.action_range is None:
         scale = action_range(training.recordings, training.snippets)
     else:
-        scale = pretrained.action_range
+        scale = initial.action_range
     shape = shape_for(
         view,
         history=training.snippets.history,
@@ -110,10 +110,10 @@ def train(
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(config.seed)
         network = spec.network(config.network, shape)
-    not_loaded = [] if pretrained is None else pretrained.apply(network)
+    not_loaded = [] if initial is None else initial.apply(network)
     trained_on = chosen.trained_on
-    if pretrained is not None and pretrained.trained_on is not None:
-        trained_on = trained_on.continued_from(pretrained.trained_on)
+    if initial is not None and initial.trained_on is not None:
+        trained_on = trained_on.continued_from(initial.trained_on)
     batches = [
         split.batches(view, size=size, later_ticks=network.later_ticks, config=config)
         for split, size in (
