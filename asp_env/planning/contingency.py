@@ -122,7 +122,7 @@ class BranchingCandidates:
 class ContingencyPlanner:
     """Chooses the first phase with the lowest expected cost of its best continuations.
 
-    BranchingCandidates are limited in jerk, keep the speed limits of lanes and bends, and steer by pure
+    Candidates are limited in jerk, keep the speed limits of lanes and bends, and steer by pure
     pursuit of the route or of a line that moves beside it along a quintic polynomial. Since the
     first phase starts from the present acceleration, consecutive plans agree without a memory of
     the last one. Joint scenarios combine the modes of the agents whose modes change the costs most.
