@@ -19,8 +19,8 @@ Different from the paper:
 - The horizon and the tick are those of the forecast, by default 3 s and 0.2 s instead of 4 s and
   0.1 s, and every tick has a new plan.
 - Speed limits are lowered in and before bends, and the target speeds are shares of these.
-- Proposals have a limited jerk, approach their offset at a limited rate, and brake for a target
-  speed no harder than `TARGET_BRAKING_MPS2`.
+- Proposals have a limited jerk, approach their offset at a
+  limited rate, and brake for a target speed no harder than `TARGET_BRAKING_MPS2`.
 - The driving direction is not scored; a proposal pays for its offset from the route instead.
 - The comfort of a proposal includes the ego's past second.
 - The ego brakes at any speed, not only below 5 m/s, unless a collision within 2 s would become more
@@ -58,6 +58,10 @@ SPEED_SHARES = (1.0, 0.8, 0.6, 0.4, 0.2)
 
 OFFSETS_M = (0.0, -1.0, 1.0)
 """Offsets of the proposals to the left of the route (Dauner et al.)."""
+
+ACCELERATION_MPS2 = 2.0
+"""Maximum acceleration of the intelligent driver model of the proposals. Balances progress against
+nuPlan's comfort bound of 2.4 m/s²; `IDM` has 1.5 m/s². Chosen by hand."""
 
 EMERGENCY_S = 2.0
 """The ego brakes if the best proposal collides within this time (Dauner et al.)."""
@@ -151,10 +155,10 @@ class PDMPlanner:
 
         Args:
             weights: of the score, by default `PDMWeights()`.
-            idm: parameters of the proposals, by default `IDM()`.
+            idm: parameters of the proposals, by default with `ACCELERATION_MPS2`.
         """
         self.weights = weights or PDMWeights()
-        self._idm = idm or IDM()
+        self._idm = idm or IDM(max_acceleration_mps2=ACCELERATION_MPS2)
         self._cache = RouteCache(self._idm, map_limits=True)
         pairs = [*itertools.product(SPEED_SHARES, OFFSETS_M), (0.0, 0.0)]
         self._profiles = np.array(pairs)
