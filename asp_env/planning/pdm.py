@@ -19,12 +19,12 @@ Different from the paper:
 - The horizon and the tick are those of the forecast, by default 3 s and 0.2 s instead of 4 s and
   0.1 s, and every tick has a new plan.
 - Speed limits are lowered in and before bends, and the target speeds are shares of these.
-- Proposals have a limited jerk, approach their offset at a
-  limited rate, and brake for a target speed no harder than `TARGET_BRAKING_MPS2`.
+- Proposals have a limited jerk, approach their offset at a limited rate, and brake for a target
+  speed no harder than `TARGET_BRAKING_MPS2`.
 - The driving direction is not scored; a proposal pays for its offset from the route instead.
 - The comfort of a proposal includes the ego's past second.
-- The ego brakes at any speed, not only below 5 m/s, unless a collision within 2 s would become more
-  probable.
+- The ego brakes at any speed, not only up to 5 m/s as in the authors' code, tuplan_garage, unless a
+  collision within 2 s would become more probable.
 """
 
 import itertools
