@@ -43,7 +43,7 @@ class ConstantVelocity:
         Raises:
             AspEnvError: The argument is not empty.
         """
-        _refuse_argument("constant-velocity", argument)
+        refuse_argument("constant-velocity", argument)
         return cls(horizon=horizon, dt_s=dt_s)
 
     def predict(self, scene: Scene, future: Future | None = None) -> Forecast:
@@ -56,7 +56,7 @@ class ConstantVelocity:
         scene.check_dt(self.dt_s, self.name)
         states = constant_velocity(scene, steps=self.horizon)
         actions = np.zeros((*states.shape[:-1], 2), dtype=states.dtype)
-        return _one_mode(scene, states, actions, predictable_targets(scene, self.history))
+        return one_mode(scene, states, actions, predictable_targets(scene, self.history))
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -90,7 +90,7 @@ class ConstantTurnRate:
         Raises:
             AspEnvError: The argument is not empty.
         """
-        _refuse_argument("constant-turn-rate", argument)
+        refuse_argument("constant-turn-rate", argument)
         return cls(horizon=horizon, dt_s=dt_s)
 
     def predict(self, scene: Scene, future: Future | None = None) -> Forecast:
@@ -113,7 +113,7 @@ class ConstantTurnRate:
         action = clip_actions(inverse(now, after, lengths, self.dt_s))
         actions = np.repeat(action[:, None], self.horizon, axis=1)
         states = rollout(now, actions, lengths, self.dt_s, reverse=True)
-        return _one_mode(scene, states, actions, valid)
+        return one_mode(scene, states, actions, valid)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -144,7 +144,7 @@ class Oracle:
         Raises:
             AspEnvError: The argument is not empty.
         """
-        _refuse_argument("oracle", argument)
+        refuse_argument("oracle", argument)
         return cls(horizon=horizon, dt_s=dt_s)
 
     def predict(self, scene: Scene, future: Future | None = None) -> Forecast:
@@ -157,18 +157,15 @@ class Oracle:
         if future is None or future.states.shape[1] < self.horizon:
             given = "none" if future is None else f"one of {future.states.shape[1]} ticks"
             raise AspEnvError(
-                f"oracle needs the recorded future of {self.horizon} ticks and was given {given}: "
-                "it works on recordings only"
+                f"{self.name} needs the recorded future of {self.horizon} ticks and was given "
+                f"{given}: it works on recordings only"
             )
         index = (scene.targets[:, 0], scene.targets[:, 1])
         known = future.valid[:, : self.horizon]
         valid = scene.valid[index][:, -1] & known.any(axis=-1)
         now = np.where(valid[:, None], scene.target_states, 0)
         states = _fill_gaps(now, future.states[:, : self.horizon], known, self.dt_s)
-        lengths = np.where(valid, scene.sizes[index][:, 0], 1).astype(np.float32)[:, None]
-        before = np.concatenate([now[:, None], states[:, :-1]], axis=1)
-        actions = inverse(before, states, lengths, self.dt_s)
-        return _one_mode(scene, states, actions, valid)
+        return with_inferred_actions(scene, states, valid)
 
 
 def predictable_targets(scene: Scene, history: int) -> Bool[np.ndarray, " t"]:
@@ -187,7 +184,8 @@ def predictable_targets(scene: Scene, history: int) -> Bool[np.ndarray, " t"]:
     return predicted & scene.valid[index][:, scene.history - history :].all(axis=-1)
 
 
-def _refuse_argument(name: str, argument: str) -> None:
+def refuse_argument(name: str, argument: str) -> None:
+    """Raises an `AspEnvError` if a predictor without an argument was given one."""
     if argument:
         raise AspEnvError(f"predictor {name} takes no argument, {argument!r} was given: use {name}")
 
@@ -234,13 +232,41 @@ def _fill_gaps(
     return np.where(known[..., None], future, filled[:, 1:]).astype(np.float32)
 
 
-def _one_mode(
+def with_inferred_actions(
+    scene: Scene, states: Float[np.ndarray, "t steps 4"], valid: Bool[np.ndarray, " t"]
+) -> Forecast:
+    """A forecast of one mode whose actions are inferred from its states.
+
+    The actions may exceed the limits of actions.
+
+    Args:
+        scene: the scene.
+        states: [x m, y m, heading rad, speed m/s] in the recording's frame.
+        valid: which targets are forecast.
+    """
+    index = (scene.targets[:, 0], scene.targets[:, 1])
+    now = np.where(valid[:, None], scene.target_states, 0)
+    lengths = np.where(valid, scene.sizes[index][:, 0], 1).astype(np.float32)[:, None]
+    before = np.concatenate([now[:, None], states[:, :-1]], axis=1)
+    return one_mode(scene, states, inverse(before, states, lengths, scene.dt_s), valid)
+
+
+def one_mode(
     scene: Scene,
     states: Float[np.ndarray, "t steps 4"],
-    actions: Float[np.ndarray, "t steps 2"],
+    actions: Float[np.ndarray, "t steps 2"] | None,
     valid: Bool[np.ndarray, " t"],
 ) -> Forecast:
+    """A forecast of one mode with probability 1.
+
+    Args:
+        scene: the scene.
+        states: [x m, y m, heading rad, speed m/s] in the recording's frame.
+        actions: [acceleration m/s², steering rad], or None for a forecast without actions.
+        valid: which targets are forecast.
+    """
     certain = np.zeros((len(states), 1), dtype=np.float32)
+    modes = None if actions is None else actions[:, None]
     return make_forecast(
-        scene, states=states[:, None], actions=actions[:, None], log_probs=certain, valid=valid
+        scene, states=states[:, None], actions=modes, log_probs=certain, valid=valid
     )

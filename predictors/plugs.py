@@ -1,12 +1,14 @@
 """The predictors of this package, as the entry points in `asp_env.predictors` name them.
 
 The specifications of trained predictors are made on first access, so that the physical predictors
-need no torch.
+and the controls need no torch.
 """
 
 from functools import cache
 from typing import TYPE_CHECKING, Any
 
+from predictors.controls import Blend, Blind, NoisyOracle, ShuffledOracle
+from predictors.delayed import Delayed
 from predictors.physical import ConstantTurnRate, ConstantVelocity, Oracle
 
 if TYPE_CHECKING:
@@ -17,7 +19,20 @@ if TYPE_CHECKING:
     FFWASP: PredictorSpec
     SSPASP: PredictorSpec
 
-__all__ = ["DKM", "FFWASP", "MTP", "SSPASP", "ConstantTurnRate", "ConstantVelocity", "Oracle"]
+__all__ = [
+    "DKM",
+    "FFWASP",
+    "MTP",
+    "SSPASP",
+    "Blend",
+    "Blind",
+    "ConstantTurnRate",
+    "ConstantVelocity",
+    "Delayed",
+    "NoisyOracle",
+    "Oracle",
+    "ShuffledOracle",
+]
 
 
 @cache

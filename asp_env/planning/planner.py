@@ -1,7 +1,7 @@
 """The socket for planners, and `expert`: the recorded ego, the reference for every planner."""
 
 from dataclasses import dataclass
-from typing import NoReturn, Protocol, runtime_checkable
+from typing import NoReturn, Protocol, TypeVar, runtime_checkable
 
 import numpy as np
 from jaxtyping import Float
@@ -46,6 +46,52 @@ class Planner(Protocol):
 
         Raises:
             AspEnvError: the scene has no routes.
+        """
+        ...
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Candidates:
+    """C plans for each of B situations, of which a planner chooses one.
+
+    A planner that needs more of them for their costs extends this class.
+    """
+
+    actions: Float[np.ndarray, "b c t 2"]
+    """[acceleration m/s², steering rad]."""
+    states: Float[np.ndarray, "b c t 4"]
+    """[x m, y m, heading rad, speed m/s] after each action."""
+
+
+CandidatesT = TypeVar("CandidatesT", bound=Candidates)
+
+
+@runtime_checkable
+class CandidatePlanner(Planner, Protocol[CandidatesT]):
+    """A planner that chooses the cheapest of finitely many candidates.
+
+    The candidates do not depend on the forecast, and `plan` returns the first of the cheapest ones.
+    So the same candidates can be rated by several forecasts, as planning regret does
+    (`asp_env.planning.regret`).
+    """
+
+    def candidates(self, scene: Scene, steps: int) -> CandidatesT:
+        """The candidates for all B situations of a scene, over `steps` ticks.
+
+        Raises:
+            AspEnvError: the scene has no routes.
+        """
+        ...
+
+    def costs(
+        self, scene: Scene, forecast: Forecast, candidates: CandidatesT
+    ) -> Float[np.ndarray, "b c"]:
+        """Costs of candidates; their unit is the planner's own.
+
+        Args:
+            scene: the scene that the candidates are of.
+            forecast: of all other agents that are present, over the ticks of the candidates.
+            candidates: C candidates for each situation.
         """
         ...
 

@@ -16,8 +16,8 @@ from asp_env.dynamics.car_following import IDM, pursuit_steering
 from asp_env.geometry import overlaps, project, route_coordinates, wrap_angle
 from asp_env.metrics.boxes import AT_REST_MPS, is_behind, touching_trailers
 from asp_env.metrics.drivable import OFF_ROAD_M, off_road_m
-from asp_env.planning.idm import RouteCache, Routes
-from asp_env.planning.planner import Plan
+from asp_env.planning.idm import RouteCache
+from asp_env.planning.planner import Candidates, Plan
 
 FIRST_MPS2 = (-5.0, -2.5, -1.0, 0.0, 0.7, 1.4)
 """Accelerations of the candidates up to `SWITCH_S`. Chosen by hand."""
@@ -68,11 +68,9 @@ class SamplingWeights:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class _Candidates:
-    """C candidates for each of B egos over T ticks."""
+class RouteCandidates(Candidates):
+    """C candidates along the route for each of B egos over T ticks."""
 
-    actions: Float[np.ndarray, "b c t 2"]
-    states: Float[np.ndarray, "b c t 4"]
     gained_m: Float[np.ndarray, "b c"]
     """Arc length along the route from the first to the last action."""
     offset_m: Float[np.ndarray, "b c"]
@@ -108,13 +106,19 @@ class SamplingPlanner:
     def plan(self, scene: Scene, forecast: Forecast) -> Plan:
         """The cheapest candidate of each situation, the first of equals."""
         steps = forecast.states.shape[2]
-        candidates = self._sample(scene, self._cache.routes(scene), steps)
-        costs = self._costs(scene, forecast, candidates)
+        candidates = self.candidates(scene, steps)
+        costs = self.costs(scene, forecast, candidates)
         best = costs.argmin(axis=1)
         rows = np.arange(len(best))
         return Plan(actions=candidates.actions[rows, best], states=candidates.states[rows, best])
 
-    def _sample(self, scene: Scene, routes: Routes, steps: int) -> _Candidates:
+    def candidates(self, scene: Scene, steps: int) -> RouteCandidates:
+        """The candidates for all situations over `steps` ticks.
+
+        Raises:
+            AspEnvError: the scene has no routes.
+        """
+        routes = self._cache.routes(scene)
         shape = (len(routes.counts), len(self._profiles))
         egos = np.ascontiguousarray(scene.states[:, EGO, -1])
         lengths = np.maximum(scene.sizes[:, EGO, 0], 0.1)
@@ -133,13 +137,14 @@ class SamplingPlanner:
             state = forward(state, actions[:, :, k], lengths[:, None], scene.dt_s)
             states[:, :, k] = state
             mean_offset += np.abs(offset) / steps
-        return _Candidates(
+        return RouteCandidates(
             actions=actions, states=states, gained_m=arc - start[:, :1], offset_m=mean_offset
         )
 
-    def _costs(
-        self, scene: Scene, forecast: Forecast, candidates: _Candidates
+    def costs(
+        self, scene: Scene, forecast: Forecast, candidates: RouteCandidates
     ) -> Float[np.ndarray, "b c"]:
+        """Costs of candidates, the sums of the terms of `SamplingWeights`."""
         weights = self.weights
         collision, closeness = _contact_probabilities(scene, forecast, candidates.states)
         before = scene.actions[:, EGO, -1, 0][:, None]

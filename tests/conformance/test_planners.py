@@ -11,12 +11,13 @@ from asp_env.data.scene import Scene
 from asp_env.data.snippets import gather_scene, index_snippets
 from asp_env.dynamics import MAX_ACCELERATION_MPS2, MAX_STEERING_RAD, rollout
 from asp_env.errors import AspEnvError
-from asp_env.planning.planner import Plan, Planner, load_planner
+from asp_env.planning.planner import CandidatePlanner, Plan, Planner, load_planner
 from tests.builders import make_recording
 from tests.planning.situations import STEPS, straight_ahead
 from tests.sim.worlds import drive, scenario, simulate
 
 PLANNERS = [name for name in registry.names("planners") if not load_planner(name).privileged]
+WITH_CANDIDATES = [name for name in PLANNERS if isinstance(load_planner(name), CandidatePlanner)]
 EGOS = [scenario(1), scenario(2, start=40), scenario(3, start=25), scenario(4, recording=1)]
 
 
@@ -156,6 +157,22 @@ def test_uses_forecasts_is_correct(name, scene):
     planner = load_planner(name)
     same = _equal(planner.plan(scene, forecast), planner.plan(scene, blocking))
     assert same == (not planner.uses_forecasts)
+
+
+@pytest.mark.parametrize("name", WITH_CANDIDATES)
+def test_the_plan_is_the_first_of_the_cheapest_candidates(name, scene):
+    """Bit for bit; candidates are the rollouts of their actions."""
+    planner = load_planner(name)
+    assert isinstance(planner, CandidatePlanner)
+    forecast = straight_ahead(scene)
+    candidates = planner.candidates(scene, STEPS)
+    costs = planner.costs(scene, forecast, candidates)
+    assert costs.shape == candidates.states.shape[:2]
+    assert np.isfinite(costs).all()
+    rows = np.arange(len(costs)), costs.argmin(axis=1)
+    plan = planner.plan(scene, forecast)
+    assert candidates.actions[rows].tobytes() == plan.actions.tobytes()
+    assert candidates.states[rows].tobytes() == plan.states.tobytes()
 
 
 @pytest.mark.parametrize("name", PLANNERS)

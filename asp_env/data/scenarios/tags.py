@@ -29,6 +29,8 @@ in either direction.
 `roundabout`: the ego drives at least 10 m along a roundabout of the map, within 2 m of the centre
     line of one of its lanes and heading within 45° of it.
 `roundabout-entry`, `roundabout-exit`: a `roundabout` that the ego enters; that it leaves.
+`interactive`: `pet_s` is below 3 s, or `dttcp_s` is (`asp_env.data.scenarios.conflicts`). It
+    depends on the recording alone, so that it favours no predictor or planner.
 
 Recordings have no traffic signals, so waiting at a signal while others cross is `yielding`, too.
 
@@ -37,8 +39,9 @@ centre. On at least nine tenths of its points the direction of travel, all clock
 counter-clockwise, is within 35° of the tangent of a circle about the ring's centroid. No point is
 more than 100 m from the centroid, or more than three times as far as another point.
 
-All kernels are in this file, because numba's cache checks only the file of the kernel that Python
-calls; `asp_env.geometry` is the exception.
+All kernels that `describe` calls are in this file or `conflicts.py`, and none calls one of the
+other file, because numba's cache checks only the file of the kernel that Python calls;
+`asp_env.geometry` is the exception.
 """
 
 import math
@@ -51,12 +54,14 @@ from numba import njit
 from asp_env.data.classes import PREDICTED, VULNERABLE, AgentClass
 from asp_env.data.recording import Recording
 from asp_env.data.road_map import RoadMap
+from asp_env.data.scenarios.conflicts import measure_conflicts
 from asp_env.geometry import project, resample, route_along, wrap_scalar
 
 TAGS = (
     *("left", "right", "straight", "u-turn"),
     *("standing-start", "stopping", "following", "yielding", "crossing-vru"),
     *("roundabout", "roundabout-entry", "roundabout-exit"),
+    "interactive",
 )
 """Names of the tags, in the order of the columns of `describe`."""
 
@@ -67,6 +72,11 @@ COLUMNS = {
     "turn_deg": "total change of the ego's heading while it does not stand, left positive",
     "density": "number of other agents within 30 m of the ego, mean over the ticks",
     "agents": "number of other agents that are present at any tick",
+    "max_density": "largest number of other agents within 30 m of the ego at any tick",
+    "pet_s": "post-encroachment time: smallest time between the ego and another agent at the "
+    "crossing or merging of their paths; infinite without one",
+    "dttcp_s": "smallest difference of the times to the conflict point at present speeds; infinite "
+    "without a conflict",
 }
 """Names of the measures with their descriptions, in the order of the columns of `describe`."""
 
@@ -98,6 +108,7 @@ CROSSING_AHEAD_M = 30.0
 ROUNDABOUT_M = 10.0
 ROUNDABOUT_HALF_WIDTH_M = 2.0
 DENSITY_RADIUS_M = 30.0
+INTERACTIVE_S = 3.0
 MAX_RADIUS_M = 100.0
 MAX_RADIUS_RATIO = 3.0
 TANGENTIAL_SHARE = 0.9
@@ -122,9 +133,11 @@ _ROUNDING = 1e-6
 
 (
     _LEFT, _RIGHT, _STRAIGHT, _U_TURN, _STANDING_START, _STOPPING, _FOLLOWING, _YIELDING,
-    _CROSSING_VRU, _ROUNDABOUT, _ENTRY, _EXIT,
-) = range(12)  # fmt: skip
-_LENGTH, _DISTANCE, _MAX_SPEED, _TURN, _DENSITY, _AGENTS = range(6)
+    _CROSSING_VRU, _ROUNDABOUT, _ENTRY, _EXIT, _INTERACTIVE,
+) = range(13)  # fmt: skip
+(
+    _LENGTH, _DISTANCE, _MAX_SPEED, _TURN, _DENSITY, _AGENTS, _MAX_DENSITY, _PET, _DTTCP,
+) = range(9)  # fmt: skip
 
 
 def describe(
@@ -154,28 +167,28 @@ def describe(
     for track, tick in zip(tracks.tolist(), start_ticks.tolist(), strict=True):
         ahead = recording.track(track)[tick * stride - first[track] :: stride]
         routes.append(route_along(ahead, beyond_m=BEYOND_M))
-    _describe_all(
-        _Tracks(
-            states=np.array(recording.states),  # copies of read-only arrays: one compiled kernel
-            starts=recording.starts.astype(np.int64),
-            first=first,
-            last=recording.last_frames.astype(np.int64),
-            sizes=np.array(recording.sizes),
-            roles=_roles(recording),
-        ),
-        _Drives(
-            tracks=tracks.astype(np.int64),
-            ticks=start_ticks.astype(np.int64),
-            lengths=lengths.astype(np.int64),
-            routes=np.concatenate(routes),
-            route_starts=np.cumsum([len(route) for route in routes]),
-        ),
-        stride,
-        stride / recording.frame_rate_hz,
-        roundabout_points(recording.road_map),
-        tags,
-        values,
+    table = _Tracks(
+        states=np.array(recording.states),  # copies of read-only arrays: one compiled kernel
+        starts=recording.starts.astype(np.int64),
+        first=first,
+        last=recording.last_frames.astype(np.int64),
+        sizes=np.array(recording.sizes),
+        roles=_roles(recording),
     )
+    drives = _Drives(
+        tracks=tracks.astype(np.int64),
+        ticks=start_ticks.astype(np.int64),
+        lengths=lengths.astype(np.int64),
+        routes=np.concatenate(routes),
+        route_starts=np.cumsum([len(route) for route in routes]),
+    )
+    dt_s = stride / recording.frame_rate_hz
+    ring = roundabout_points(recording.road_map)
+    _describe_all(table, drives, stride, dt_s, ring, tags, values)
+    conflicts = np.full((len(tracks), 2), np.inf)
+    measure_conflicts(table, drives, stride, dt_s, conflicts)
+    values[:, _PET], values[:, _DTTCP] = conflicts.T
+    tags[:, _INTERACTIVE] = conflicts.min(axis=1) < INTERACTIVE_S
     return tags, values
 
 
@@ -305,16 +318,14 @@ def _describe_all(tracks, drives, stride, dt_s, ring, tags, values):
         others = np.flatnonzero((tracks.roles > 0) & (tracks.first <= end) & (tracks.last >= frame))
         others = others[others != e]
         placed = np.full((len(others), count, 4), np.nan)
-        ticks_near = 0
+        nearby = np.zeros(count)
         for k in range(len(others)):
             o = others[k]
             rows = tracks.states[tracks.starts[o] : tracks.starts[o + 1]]
-            present, near_ego = _place(
-                rows, tracks.first[o], frame, stride, ego, arcs, route, placed[k]
+            values[i, _AGENTS] += _place(
+                rows, tracks.first[o], frame, stride, ego, arcs, route, placed[k], nearby
             )
-            values[i, _AGENTS] += present
-            ticks_near += near_ego
-        values[i, _DENSITY] = ticks_near / count
+        values[i, _DENSITY], values[i, _MAX_DENSITY] = nearby.sum() / count, nearby.max()
         route_end = len(route) - 1 - BEYOND_M  # of the recorded part
         size, sizes, roles = tracks.sizes[e], tracks.sizes[others], tracks.roles[others]
         reach = 0.5 * (size[1] + sizes[:, 1])
@@ -393,7 +404,7 @@ def _tag_roundabout(ego, ring, tags):
 
 @njit(cache=True)
 @no_type_check
-def _place(rows, first, frame, stride, ego, arcs, route, placed):
+def _place(rows, first, frame, stride, ego, arcs, route, placed, nearby):
     """Projects another agent onto the ego's route.
 
     Args:
@@ -406,18 +417,19 @@ def _place(rows, first, frame, stride, ego, arcs, route, placed):
         route: (points, 2) of the ego, 1 m apart.
         placed: (ticks, 4) output: arc length m, offset m, angle to the route rad and speed m/s; NaN
             where the agent is absent, an infinite offset where it is far from the route.
+        nearby: (ticks,) number of agents within `DENSITY_RADIUS_M` of the ego, increased.
 
     Returns:
-        Whether the agent is present at any tick, and at how many ticks it is near the ego.
+        Whether the agent is present at any tick.
     """
-    present, ticks_near = False, 0
+    present = False
     for t in range(len(ego)):
         row = frame + t * stride - first
         if row < 0 or row >= len(rows):
             continue
         present = True
         x, y = rows[row, 0], rows[row, 1]
-        ticks_near += math.hypot(x - ego[t, 0], y - ego[t, 1]) <= DENSITY_RADIUS_M
+        nearby[t] += math.hypot(x - ego[t, 0], y - ego[t, 1]) <= DENSITY_RADIUS_M
         placed[t, 1] = np.inf
         nearest, best = 0, np.inf
         low = max(0, int(arcs[t]) - _LOOK_BACK_M)
@@ -430,7 +442,7 @@ def _place(rows, first, frame, stride, ego, arcs, route, placed):
             arc, offset, heading = project(route, len(route), x, y, nearest, 2.0 * _COARSE_M)
             placed[t, 0], placed[t, 1] = arc, offset
             placed[t, 2], placed[t, 3] = wrap_scalar(rows[row, 2] - heading), rows[row, 3]
-    return present, ticks_near
+    return present
 
 
 @njit(cache=True)

@@ -12,6 +12,7 @@ from asp_env.data.predictor import Forecast, Predictor, fill_missing
 from asp_env.data.rollout import Rollout
 from asp_env.data.scenarios.scenario import Scenario
 from asp_env.data.scene import EGO, Scene
+from asp_env.data.snippets import Future
 from asp_env.metrics.driving.map_context import map_context
 from asp_env.metrics.driving.realism import realism, realism_features
 from asp_env.metrics.driving.rules import Rules
@@ -50,7 +51,7 @@ class EpisodeSettings:
     horizon: int
     """Number of ticks of every forecast and plan."""
     history: int
-    """Number of ticks of history."""
+    """Number of ticks of history; a predictor that needs more is shown more."""
     dt_s: float
 
 
@@ -101,7 +102,7 @@ def drive_episodes(
         make_traffic(settings.traffic, dt_s=settings.dt_s, default=settings.world.traffic),
         num_episodes=len(scenarios),
         dt_s=settings.dt_s,
-        history=settings.history,
+        history=max(settings.history, predictor.history),
         world_class=settings.world,
     )
     world = simulation.world
@@ -142,21 +143,39 @@ def _decide(
     horizon: int,
 ) -> Decision:
     scene = world.scene()
-    scene = scene.with_targets(_targets_near_running_egos(scene, running))
+    scene = scene.with_targets(targets_near_egos(scene, running))
     future = recorded_future(world, scene, horizon) if predictor.privileged else None
-    forecast = predictor.predict(scene, future)
-    forecast = dataclasses.replace(  # cut, so that plans are equally long with every predictor
+    forecast = forecast_for_planner(predictor, scene, future, horizon)
+    return Decision(running=running, forecast=forecast, plan=planner.plan(scene, forecast))
+
+
+def forecast_for_planner(
+    predictor: Predictor, scene: Scene, future: Future | None, horizon: int
+) -> Forecast:
+    """The forecast that a planner plans with: of every target, and over the planner's horizon.
+
+    Args:
+        predictor: the predictor.
+        scene: the scene.
+        future: recorded future of the targets; only privileged predictors receive it.
+        horizon: number of ticks; longer forecasts are cut, so that plans are equally long.
+    """
+    forecast = predictor.predict(scene, future if predictor.privileged else None)
+    forecast = dataclasses.replace(
         forecast,
         states=forecast.states[:, :, :horizon],
         actions=forecast.actions[:, :, :horizon],
     )
-    forecast = fill_missing(forecast, scene)
-    return Decision(running=running, forecast=forecast, plan=planner.plan(scene, forecast))
+    return fill_missing(forecast, scene)
 
 
-def _targets_near_running_egos(
-    scene: Scene, running: Bool[np.ndarray, " b"]
-) -> Int[np.ndarray, "t 2"]:
+def targets_near_egos(scene: Scene, running: Bool[np.ndarray, " b"]) -> Int[np.ndarray, "t 2"]:
+    """The targets of a scene that are within `FORECAST_WITHIN_M` of the ego.
+
+    Args:
+        scene: the scene.
+        running: mask of the situations whose targets are returned.
+    """
     situation, slot = scene.targets[:, 0], scene.targets[:, 1]
     egos = scene.states[situation, EGO, -1, :2]
     distance_m = np.linalg.norm(scene.states[situation, slot, -1, :2] - egos, axis=-1)

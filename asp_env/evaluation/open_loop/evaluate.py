@@ -13,7 +13,14 @@ from rich.console import Console
 from asp_env.data.causal import causal_histories
 from asp_env.data.predictor import Predictor
 from asp_env.data.recording import DEFAULT_DT_S, ticks
-from asp_env.data.snippets import SnippetIndex, gather_future, gather_scene, index_snippets
+from asp_env.data.scenarios.scenario import find_scenarios
+from asp_env.data.snippets import (
+    HISTORY_S,
+    SnippetIndex,
+    gather_future,
+    gather_scene,
+    index_snippets,
+)
 from asp_env.data.source import Recordings, open_data
 from asp_env.evaluation import statistics
 from asp_env.evaluation.open_loop.scoring import (
@@ -24,25 +31,32 @@ from asp_env.evaluation.open_loop.scoring import (
     complete_forecast,
     score_forecasts,
 )
+from asp_env.evaluation.regret import RegretScores, load_candidate_planner, score_regrets
 from asp_env.evaluation.report import ForecastExamples, check_report_possible, write_report
 from asp_env.evaluation.results import Row, write_manifest, write_metrics
 from asp_env.evaluation.selection import (
     PartChoice,
+    expand_runs,
     load_predictors,
+    shared_metadata,
     snippets_within,
     ticks_to_evaluate,
 )
 from asp_env.evaluation.statistics import Estimate
-from asp_env.evaluation.tables import open_loop_tables
+from asp_env.evaluation.tables import open_loop_tables, regret_tables
 from asp_env.files import atomic_folder
 from asp_env.metrics.forecast.calibration import calibration_error, calibration_sums
 from asp_env.metrics.forecast.errors import MODE_RULES, ModeRule
+from asp_env.planning.planner import CandidatePlanner
 
 REFERENCE = "constant-velocity"
 """If this predictor takes part, the FDE of the others is also stated as a ratio to its FDE."""
 
 RATIO = "FDE / constant velocity"
 ECE = "ECE"
+
+NO_PLANNER = ("", "none")
+"""Values of `--planner` that measure no planning regret."""
 
 EXAMPLES = 6
 """Number of situations whose forecasts the report shows."""
@@ -60,7 +74,8 @@ class Evaluate:
         "constant-velocity",
         "constant-turn-rate",
     )
-    """Predictors by name; trained ones with their run folder."""
+    """Predictors by name; trained ones with their run folder.
+    A pattern in quotes, such as 'ffw-asp:runs/*', is one method of several runs."""
     horizon: float = 3.0
     """Forecast horizon in seconds."""
     dt: float = DEFAULT_DT_S
@@ -75,6 +90,11 @@ class Evaluate:
     best_by: ModeRule = "fde"
     """How the best of 3 modes is chosen: lowest final error,
     lowest mean error, or the rule of the paper."""
+    planner: str = "sampling"
+    """Planner whose planning regret is measured with each
+    predictor at states of the logged ego; none for no regret."""
+    max_states: int = 2000
+    """Largest number of these states; chosen at even spacing."""
 
     def run(self) -> None:
         """Evaluates, writes the folder and prints the tables.
@@ -91,7 +111,11 @@ class Evaluate:
                 folder, title=f"Open loop on {Path(self.data).name}", examples=result.examples
             )
         console = Console()
-        for table in open_loop_tables(result.rows, result.manifest["privileged"]):
+        privileged = result.manifest["privileged"]
+        for table in (
+            *open_loop_tables(result.rows, privileged),
+            *regret_tables(result.rows, privileged, planner=self.planner),
+        ):
             console.print(table)
         console.print(f"wrote {self.out}/report.html")
 
@@ -104,9 +128,9 @@ class OpenLoopResult:
     """Lines of `metrics.csv`."""
     manifest: dict[str, Any]
     scores: ForecastScores
-    """Metrics of every snippet, for paired comparisons."""
+    """Metrics of every snippet by the name of the run, for paired comparisons."""
     examples: ForecastExamples
-    """Forecasts that the report shows."""
+    """Forecasts that the report shows; of a method of several runs those of the first run."""
 
 
 def evaluate(config: Evaluate) -> OpenLoopResult:
@@ -117,11 +141,19 @@ def evaluate(config: Evaluate) -> OpenLoopResult:
     """
     recordings = open_data(config.data)
     horizon = ticks(config.horizon, config.dt)
-    loaded = load_predictors(config.predictors, horizon=horizon, dt_s=config.dt)
+    planner = None if config.planner in NO_PLANNER else load_candidate_planner(config.planner)
+    runs = expand_runs(config.predictors)
+    names = [run for members in runs.values() for run in members]
+    loaded = load_predictors(names, horizon=horizon, dt_s=config.dt)
     allowed, part = ticks_to_evaluate(recordings, loaded, config.part, dt_s=config.dt)
-    index = index_snippets(recordings, dt_s=config.dt, horizon_s=config.horizon)
+    index = index_snippets(
+        recordings,
+        dt_s=config.dt,
+        horizon_s=config.horizon,
+        history_s=max(HISTORY_S, *(predictor.history * config.dt for predictor in loaded)),
+    )
     index = snippets_within(index, allowed)
-    predictors = dict(zip(config.predictors, loaded, strict=True))
+    predictors = dict(zip(names, loaded, strict=True))
     scenes: Sequence[Any] = recordings
     if config.history == "causal":
         scenes = causal_histories(recordings)
@@ -129,13 +161,26 @@ def evaluate(config: Evaluate) -> OpenLoopResult:
         predictors, index, scenes=scenes, recorded=recordings, best_by=config.best_by
     )
     moving = scores.subsets["moving"]
+    regrets = (
+        None
+        if planner is None
+        else _regrets(config, planner, predictors, recordings, scenes, allowed)
+    )
     return OpenLoopResult(
-        rows=make_rows(scores, predictors, data=config.data, horizon_s=config.horizon),
+        rows=make_rows(
+            scores,
+            predictors,
+            runs,
+            data=config.data,
+            horizon_s=config.horizon,
+            regrets=regrets,
+        ),
         manifest={
             "data": config.data,
             "data_hash": recordings.data_hash(),
             "predictors": {name: dict(p.metadata) for name, p in predictors.items()},
-            "privileged": [name for name, p in predictors.items() if p.privileged],
+            "runs": {name: list(members) for name, members in runs.items() if members != (name,)},
+            "privileged": [name for name, (run, *_) in runs.items() if predictors[run].privileged],
             "horizon_s": config.horizon,
             "dt_s": config.dt,
             "part": part,
@@ -143,25 +188,70 @@ def evaluate(config: Evaluate) -> OpenLoopResult:
             "recordings": len(np.unique(index.recording)),
             "snippets": len(index),
             "moving snippets": int(moving.sum()),
+            "planner": config.planner if regrets is not None else "none",
+            "states": 0 if regrets is None else len(regrets.recording),
             "best_by": config.best_by,
             "best-of-3": f"of the three most probable modes, {MODE_RULES[config.best_by]}",
-            "intervals": "95 %, bootstrap over recordings",
+            "intervals": "95 %, bootstrap over recordings and, with several, over training runs",
         },
         scores=scores,
-        examples=_examples(scenes, recordings, index, moving, predictors),
+        examples=_examples(
+            scenes,
+            recordings,
+            index,
+            moving,
+            {name: predictors[run] for name, (run, *_) in runs.items()},
+        ),
+    )
+
+
+def _regrets(
+    config: Evaluate,
+    planner: CandidatePlanner[Any],
+    predictors: Mapping[str, Predictor],
+    recordings: Recordings,
+    scenes: Sequence[Any],
+    allowed: Sequence[Bool[np.ndarray, " _"]],
+) -> RegretScores | None:
+    """Planning regret at states of all scenarios within the allowed ticks; None without any."""
+    scenarios = find_scenarios(
+        recordings,
+        source=config.data,
+        dt_s=config.dt,
+        history=ticks(HISTORY_S, config.dt),
+        allowed=allowed,
+    )
+    if not len(scenarios):
+        return None
+    return score_regrets(
+        predictors,
+        scenarios,
+        planner,
+        scenes=scenes,
+        recorded=recordings,
+        horizon=ticks(config.horizon, config.dt),
+        max_states=config.max_states,
     )
 
 
 def make_rows(
-    scores: ForecastScores, predictors: Mapping[str, Predictor], *, data: str, horizon_s: float
+    scores: ForecastScores,
+    predictors: Mapping[str, Predictor],
+    runs: Mapping[str, Sequence[str]],
+    *,
+    data: str,
+    horizon_s: float,
+    regrets: RegretScores | None = None,
 ) -> list[Row]:
     """Means with intervals: a row for each predictor, selection, subset and metric that occurs.
 
     Args:
-        scores: metrics of all snippets.
-        predictors: the predictors by name.
+        scores: metrics of all snippets, by the name of the run.
+        predictors: the predictors by the name of their run.
+        runs: names of the runs that are averaged, by the name of the row.
         data: DATA as given.
         horizon_s: forecast horizon in seconds.
+        regrets: planning regret of the predictors, if it was measured.
     """
     reference = {
         each.selection: each
@@ -169,23 +259,28 @@ def make_rows(
         if each.name == REFERENCE and each.metric == "FDE"
     }
     rows: list[Row] = []
-    for name, predictor in predictors.items():
+    for stream, (name, members) in enumerate(runs.items()):
         estimates: list[tuple[str, str, str, Estimate]] = []
+        columns: dict[tuple[str, str], list[MetricValues]] = {}
         for each in scores.metrics:
-            if each.name == name:
-                estimates += _estimates(each, scores, reference.get(each.selection))
-        for modes in scores.modes:
-            if modes.name == name:
-                estimates += _calibration(modes, scores)
-        metadata = predictor.metadata
+            if each.name in members:
+                columns.setdefault((each.selection, each.metric), []).append(each)
+        for group in columns.values():
+            estimates += _estimates(group, scores, reference.get(group[0].selection), stream)
+        modes = [each for each in scores.modes if each.name in members]
+        if modes:
+            estimates += _calibration(modes, scores, stream)
+        if regrets is not None:
+            estimates += [(ALL_MODES, *each) for each in regrets.estimates(*members, stream=stream)]
+        loaded = [predictors[run] for run in members]
         rows += [
             Row(
                 data=data,
                 predictor=name,
-                trained_on=metadata.get("trained_on", ""),
-                view=metadata.get("view", ""),
-                recipe=metadata.get("preset", ""),
-                chaining=metadata.get("chaining", ""),
+                trained_on=shared_metadata(loaded, "trained_on"),
+                view=shared_metadata(loaded, "view"),
+                recipe=shared_metadata(loaded, "preset"),
+                chaining=shared_metadata(loaded, "chaining"),
                 horizon_s=horizon_s,
                 selection=selection,
                 subset=subset,
@@ -194,6 +289,7 @@ def make_rows(
                 low=estimate.low,
                 high=estimate.high,
                 n=estimate.n,
+                runs=len(members),
             )
             for selection, subset, metric, estimate in estimates
         ]
@@ -201,25 +297,40 @@ def make_rows(
 
 
 def _estimates(
-    column: MetricValues, scores: ForecastScores, reference: MetricValues | None
+    runs: Sequence[MetricValues],
+    scores: ForecastScores,
+    reference: MetricValues | None,
+    stream: int,
 ) -> Iterator[tuple[str, str, str, Estimate]]:
     """(selection, subset, metric, estimate) of one metric and of its ratio to the reference."""
-    groups, values, selection = scores.recording, column.values, column.selection
-    compared = column.metric == "FDE" and column.name != REFERENCE
-    for subset, rows in _subset_rows(scores, column.valid):
-        yield selection, subset, column.metric, statistics.mean(values[rows], groups[rows])
+    selection, metric = runs[0].selection, runs[0].metric
+    values = np.stack([each.values for each in runs])
+    valid = np.stack([each.valid for each in runs])
+    compared = metric == "FDE" and runs[0].name != REFERENCE
+    for subset, rows in _subset_rows(scores, valid.any(axis=0)):
+        groups, known = scores.recording[rows], valid[:, rows]
+        sums = np.where(known, values[:, rows], 0)
+        mean = statistics.ratio_over_runs(sums, known, groups, stream=stream)
+        yield selection, subset, metric, mean
         if compared and reference is not None and reference.values[rows].any():
-            ratio = statistics.ratio(values[rows], reference.values[rows], groups[rows])
+            ratio = statistics.ratio_over_runs(
+                values[:, rows], reference.values[rows], groups, stream=stream
+            )
             yield selection, subset, RATIO, ratio
 
 
 def _calibration(
-    modes: ModeProbabilities, scores: ForecastScores
+    runs: Sequence[ModeProbabilities], scores: ForecastScores, stream: int
 ) -> Iterator[tuple[str, str, str, Estimate]]:
-    sums = calibration_sums(modes.probabilities, modes.nearest)
-    for subset, rows in _subset_rows(scores, modes.valid):
-        estimate = statistics.from_sums(sums[rows], scores.recording[rows], calibration_error)
-        yield ALL_MODES, subset, ECE, estimate
+    """The calibration error, which is computed for every run and then averaged."""
+    sums = np.stack([calibration_sums(each.probabilities, each.nearest) for each in runs])
+    valid = np.all([each.valid for each in runs], axis=0)
+    for subset, rows in _subset_rows(scores, valid):
+        by_run = statistics.run_sums(sums[:, rows], scores.recording[rows])
+        with np.errstate(invalid="ignore", divide="ignore"):
+            errors = calibration_error(by_run)
+        draws = statistics.average_runs(errors, stream=stream)
+        yield ALL_MODES, subset, ECE, statistics.interval(draws, n=len(rows))
 
 
 def _subset_rows(

@@ -9,12 +9,15 @@ import pytest
 from asp_env.data.classes import AgentClass
 from asp_env.data.road_map import Ragged, RoadMap
 from asp_env.data.scenarios.scenario import ScenarioSet, find_scenarios
-from asp_env.data.scenarios.tags import roundabout_points
+from asp_env.data.scenarios.tags import TAGS, roundabout_points
 from asp_env.data.source import open_data
 from tests.builders import Drive, make_map, make_recording
 from tests.real_data import real_data
 
 RADIUS_M = 15.0
+
+
+RING = [TAGS.index(tag) for tag in ("roundabout", "roundabout-entry", "roundabout-exit")]
 
 
 def lanes_map(lanes: list[np.ndarray], successors: list[tuple[int, int]]) -> RoadMap:
@@ -115,7 +118,7 @@ def test_along_the_ring(y: float, heading: float, expected: bool) -> None:
     """Straight past it, within 2 m for 11.5 m and for 9.7 m; against its direction."""
     start = (-40.0 if heading == 0 else 40.0, y, heading, 5.0)
     found = driven(Drive(kind=AgentClass.CAR, start=start))
-    assert found.tags[0, -3:].tolist() == [expected] * 3
+    assert found.tags[0, RING].tolist() == [expected] * 3
 
 
 def test_vehicle_that_enters_and_circles() -> None:
@@ -123,7 +126,7 @@ def test_vehicle_that_enters_and_circles() -> None:
     angle = math.atan(2 * math.tan(math.asin(1.35 / RADIUS_M)))  # steers a circle of 15 m
     enters = Drive(kind=AgentClass.CAR, start=(-40, -15, 0, 5), phases=((8, 0, 0), (60, 0, angle)))
     found = driven(enters, duration_s=20.0)
-    assert found.tags[0, -3:].tolist() == [True, True, False]
+    assert found.tags[0, RING].tolist() == [True, True, False]
     assert found.column("turn_deg")[0] > 180
     assert not found.has("u-turn")[0]
     later = found.select(found.start_tick > 40)

@@ -259,7 +259,7 @@ def test_every_scenario_has_one_turn() -> None:
 
 @pytest.mark.parametrize("dt_s", [0.1, 0.5, 1.0])
 def test_other_time_steps(dt_s: float) -> None:
-    """A leader 2 s ahead at 25 m/s, and a bicycle that crosses."""
+    """A leader 2 s ahead at 25 m/s, and a bicycle that crosses 1.1 s before the ego arrives."""
     drives = (
         car(0, 0, 0, 25),
         car(54, 0, 0, 25),
@@ -267,4 +267,4 @@ def test_other_time_steps(dt_s: float) -> None:
     )
     recording = make_recording(drives=drives, duration_s=20.0, frame_rate_hz=10.0)
     found = find_scenarios([recording], source="", dt_s=dt_s, history=round(3 / dt_s))
-    assert set(found[0].tags) == {"straight", "following", "crossing-vru"}
+    assert set(found[0].tags) == {"straight", "following", "crossing-vru", "interactive"}
