@@ -18,8 +18,8 @@ VEHICLES_PER_HOUR = {
     "two-lane-roundabout": (1050.0, 1400.0),
 }
 DENSE_VEHICLES_PER_HOUR = {
-    "crossroads": (1250.0, 1700.0),
-    "t-junction": (1250.0, 1700.0),
+    "crossroads": (1400.0, 1900.0),
+    "t-junction": (1400.0, 1900.0),
     "roundabout": (1400.0, 1900.0),
     "two-lane-roundabout": (2000.0, 2600.0),
 }

@@ -2,7 +2,7 @@
 
 import numpy as np
 
-TEMPERAMENTS = {"courteous": 0.20, "ordinary": 0.35, "pushing": 0.35, "hesitant": 0.10}
+TEMPERAMENTS = {"courteous": 0.10, "ordinary": 0.40, "pushing": 0.45, "hesitant": 0.05}
 """Shares of the drivers. Chosen by hand.
 
 `courteous` accepts long gaps only; `ordinary` is the driver of normal traffic with a wider range of
@@ -27,26 +27,26 @@ def dense_driver(rng: np.random.Generator) -> dict[str, float]:
     temperament = str(rng.choice(list(TEMPERAMENTS), p=list(TEMPERAMENTS.values())))
     match temperament:
         case "courteous":
-            gap_s, impatience, ignore = rng.uniform(0.7, 1.4), rng.uniform(0.2, 0.5), 0.0
+            gap_s, impatience, ignore = rng.uniform(0.5, 1.0), rng.uniform(0.4, 0.8), 0.0
             speed, tau_s = rng.normal(0.92, 0.08), rng.uniform(1.2, 2.0)
             accel, delay_s = rng.uniform(1.2, 1.9), rng.uniform(0.0, 0.6)
         case "ordinary":
-            gap_s, impatience, ignore = rng.uniform(0.3, 0.9), rng.uniform(0.5, 0.9), 0.2
+            gap_s, impatience, ignore = rng.uniform(0.0, 0.5), rng.uniform(0.7, 1.0), 0.5
             speed, tau_s = rng.normal(1.0, 0.10), rng.uniform(0.9, 1.6)
-            accel, delay_s = rng.uniform(1.5, 2.6), rng.uniform(0.0, 0.4)
+            accel, delay_s = rng.uniform(1.4, 2.2), rng.uniform(0.0, 0.4)
         case "pushing":
-            gap_s, impatience, ignore = rng.uniform(0.0, 0.3), rng.uniform(0.8, 1.0), 0.7
+            gap_s, impatience, ignore = rng.uniform(0.0, 0.2), rng.uniform(0.9, 1.0), 1.0
             speed, tau_s = rng.normal(1.15, 0.10), rng.uniform(0.7, 1.1)
-            accel, delay_s = rng.uniform(2.2, 3.2), 0.0
+            accel, delay_s = rng.uniform(1.8, 2.4), 0.0
         case _:
-            gap_s, impatience, ignore = rng.uniform(1.2, 2.2), rng.uniform(0.0, 0.3), 0.0
+            gap_s, impatience, ignore = rng.uniform(1.0, 2.0), rng.uniform(0.2, 0.5), 0.0
             speed, tau_s = rng.normal(0.85, 0.08), rng.uniform(1.3, 2.2)
             accel, delay_s = rng.uniform(1.0, 1.6), rng.uniform(0.5, 1.5)
     return {
         "jmTimegapMinor": gap_s,
         "impatience": impatience,
         "jmIgnoreFoeProb": ignore,
-        "jmIgnoreFoeSpeed": float(rng.uniform(4.0, 9.0)),
+        "jmIgnoreFoeSpeed": float(rng.uniform(6.0, 12.0)),
         "speedFactor": float(np.clip(speed, 0.65, 1.35)),
         "tau": tau_s,
         "accel": accel,

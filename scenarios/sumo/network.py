@@ -24,7 +24,7 @@ from scenarios.sumo.sites import Site
 STEP_S = 0.1
 """Simulation step; the frames in between are interpolated."""
 
-IMPATIENT_AFTER_S = 30.0
+IMPATIENT_AFTER_S = 15.0
 """A driver in dense traffic that has waited for this long makes vehicles on the priority road
 brake. Balances near misses against jams on the side roads. Chosen by hand."""
 
