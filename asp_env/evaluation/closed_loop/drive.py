@@ -56,7 +56,7 @@ class Drive:
     """Folder in the inD/rounD or INTERACTION layout, or sample:…, synthetic:… or highway:…."""
     out: Path
     """Folder to write; it must not exist, or be empty."""
-    planner: str = "sampling"
+    planner: str = "contingency"
     """Planner that drives the ego."""
     predictors: Annotated[tuple[str, ...], tyro.conf.arg(metavar="NAME[:RUN] …")] = (
         "constant-velocity",
