@@ -3,12 +3,14 @@
 import math
 import re
 from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
 import pytest
 
-from asp_env import ReplayEnv
+from asp_env import Planner, ReplayEnv
+from asp_env.data.classes import AgentClass
 from examples import (
     held_out,
     own_predictor,
@@ -18,6 +20,8 @@ from examples import (
     train_ppo_raster,
     train_ppo_vectors,
 )
+from tests.builders import Drive
+from tests.planning.situations import STEPS, approach, two_modes
 
 EXAMPLES = sorted(Path(own_predictor.__file__).parent.glob("*.py"))
 
@@ -27,14 +31,37 @@ def test_examples_have_at_most_80_lines(path: Path) -> None:
     assert len(path.read_text().splitlines()) <= 80
 
 
-@pytest.mark.parametrize("page", ["environment.md", "rl.md"])
+@pytest.mark.parametrize("page", ["environment.md", "planners.md", "rl.md"])
 def test_python_code_in_the_documentation_runs(page: str) -> None:
     """The blocks of a page run one after another, except the one that trains for long."""
-    text = (Path(own_predictor.__file__).parents[1] / "docs" / page).read_text()
     names: dict[str, object] = {}
-    for code in re.findall(r"```python\n(.*?)```", text, re.DOTALL):
+    for code in _python_blocks(page):
         if "PPO" not in code:
             exec(code, names)
+
+
+def test_the_planner_of_the_documentation() -> None:
+    """At most 30 lines; it brakes by 3 m/s² from a probability of 20 % on."""
+    code = _python_blocks("planners.md")[0]
+    assert len(code.splitlines()) <= 30
+    names: dict[str, Any] = {}
+    exec(code, names)
+    planner = names["Cautious"]()
+    assert isinstance(planner, Planner)
+    walker = Drive(kind=AgentClass.PEDESTRIAN, start=(-40.0, -9.0, np.pi / 2, 0.0), appears_s=0.2)
+    scene = approach(walker).world.scene()
+    crossing = np.tile(np.array([-40.0, -1.75, 1.57, 0.0], dtype=np.float32), (STEPS, 1))
+    rare, likely = (
+        planner.plan(scene, two_modes(scene, crossing, probability)) for probability in (0.1, 0.3)
+    )
+    assert (likely.actions[0, :, 0] == -3.0).all()
+    assert (rare.actions[0, :, 0] > 0.0).all()
+    assert likely.states[0, -1, 3] == pytest.approx(10.0 - 3.0 * 0.2 * STEPS, abs=1e-3)
+
+
+def _python_blocks(page: str) -> list[str]:
+    text = (Path(own_predictor.__file__).parents[1] / "docs" / page).read_text()
+    return re.findall(r"```python\n(.*?)```", text, re.DOTALL)
 
 
 def test_every_episode_of_random_actions_has_a_named_ending() -> None:

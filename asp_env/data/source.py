@@ -4,6 +4,7 @@ import hashlib
 import re
 import warnings
 from collections.abc import Iterable, Iterator, Sequence
+from dataclasses import replace
 from importlib import resources
 from pathlib import Path
 from typing import Any, SupportsIndex, overload
@@ -23,6 +24,7 @@ class Recordings(Sequence[Any]):  # not of Recording: run-time checks of its ite
     Attributes:
         source: the data as the user named them.
         names: the recordings' ids, such as `00`.
+        files: the files of each recording.
     """
 
     def __init__(
@@ -41,7 +43,7 @@ class Recordings(Sequence[Any]):  # not of Recording: run-time checks of its ite
         """
         self.source = source
         self.names = tuple(each.name for each in files)
-        self._files = tuple(files)
+        self.files = tuple(files)
         self._opened = ReaderState() if opened is None else opened
 
     def __deepcopy__(self, memo: dict[int, Any]) -> "Recordings":
@@ -51,11 +53,11 @@ class Recordings(Sequence[Any]):  # not of Recording: run-time checks of its ite
 
     def __reduce__(self) -> tuple[Any, ...]:
         """A copy in another process opens its files again, mapped from the same cache."""
-        return Recordings, (self.source, self._files)
+        return Recordings, (self.source, self.files)
 
     def __len__(self) -> int:
         """Number of recordings."""
-        return len(self._files)
+        return len(self.files)
 
     @overload
     def __getitem__(self, index: SupportsIndex) -> Recording: ...
@@ -69,7 +71,7 @@ class Recordings(Sequence[Any]):  # not of Recording: run-time checks of its ite
         """
         if isinstance(index, slice):
             return self.subset(range(len(self))[index])
-        return open_recording(self._files[index], self._opened)
+        return open_recording(self.files[index], self._opened)
 
     def __iter__(self) -> Iterator[Recording]:
         """Opens one recording after the other."""
@@ -77,12 +79,12 @@ class Recordings(Sequence[Any]):  # not of Recording: run-time checks of its ite
 
     def subset(self, indices: Iterable[SupportsIndex]) -> "Recordings":
         """The recordings at some indices, sharing those that are open."""
-        files = [self._files[index] for index in indices]
+        files = [self.files[index] for index in indices]
         return Recordings(self.source, files, opened=self._opened)
 
     def tracks_path(self, index: SupportsIndex) -> Path:
         """The file with the tracks of one recording; worlds may store more files beside it."""
-        return self._files[index].tracks
+        return self.files[index].tracks
 
     def hashes(self) -> tuple[str, ...]:
         """A hash of the content of each recording's files and map.
@@ -90,7 +92,7 @@ class Recordings(Sequence[Any]):  # not of Recording: run-time checks of its ite
         Raises:
             DataError: a file is missing.
         """
-        return tuple(content_hash(files, self._opened) for files in self._files)
+        return tuple(content_hash(files, self._opened) for files in self.files)
 
     def data_hash(self) -> str:
         """A hash of the content of all recordings, independent of the folder's name.
@@ -135,6 +137,31 @@ def open_data(data: str | Path) -> Recordings:
             "put each layout in a folder of its own"
         )
     return Recordings(source, files)
+
+
+def join_data(parts: Sequence[Recordings]) -> Recordings:
+    """The recordings of several data sets as one sequence.
+
+    Args:
+        parts: at least one data set. If there are several, the names of recordings start with the
+            number of their data set, counted from 1 (`2-00`), because names may be equal.
+
+    Raises:
+        DataError: a recording is in two of them.
+    """
+    if len(parts) == 1:
+        return parts[0]
+    files, found = [], dict[str, str]()
+    for number, part in enumerate(parts, start=1):
+        for each, content in zip(part.files, part.hashes(), strict=True):
+            if content in found:
+                raise DataError(
+                    f"recording {each.name} of {part.source!r} is in {found[content]!r} too: give "
+                    "each recording once"
+                )
+            found[content] = part.source
+            files.append(replace(each, name=f"{number}-{each.name}"))
+    return Recordings(", ".join(part.source for part in parts), files)
 
 
 def load(path: str | Path) -> Recordings:

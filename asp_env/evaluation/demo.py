@@ -1,6 +1,7 @@
-"""`asp-env demo`: the whole workflow on synthetic traffic, from recordings to a report."""
+"""`asp-env demo`: does a predictor make the car drive better? From recordings to a report."""
 
 import json
+import os
 import shutil
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -13,39 +14,59 @@ from rich.console import Console
 
 from asp_env import registry
 from asp_env.errors import AspEnvError
-from asp_env.evaluation.closed_loop.drive import Drive, drive, save_rollouts
+from asp_env.evaluation.closed_loop.drive import ClosedLoopResult, Drive, drive, save_rollouts
 from asp_env.evaluation.closed_loop.scenario_table import write_scenario_table
-from asp_env.evaluation.open_loop.evaluate import Evaluate, evaluate
+from asp_env.evaluation.open_loop.evaluate import Evaluate, OpenLoopResult, evaluate
 from asp_env.evaluation.report import check_report_possible, write_report
 from asp_env.evaluation.results import write_manifest, write_metrics
-from asp_env.evaluation.tables import driving_tables, open_loop_tables
+from asp_env.evaluation.tables import driving_tables, headlines, open_loop_tables, regret_tables
 from asp_env.files import atomic_folder
 from asp_env.metrics.driving.rules import DEFAULT_RULES, RULES
 
-SITE = "intersection"
+TRAFFIC = {"site": "intersection", "traffic": "dense"}
+"""Options of `asp-env synthesize` for all traffic of the demo."""
+HELD_OUT = {"recordings": 20, "locations": 20, "minutes": 1.5, "seed": 48_271}
+"""Recordings to evaluate on. Every one has a location of its own, because scenarios of one
+location resemble each other."""
+TRAINING = {"recordings": 12, "locations": 12, "minutes": 2.0, "seed": 0}
+"""Recordings that the predictor is trained on; another seed gives other locations."""
+
 PREDICTOR = "ffw-asp"
-RECIPE = "ours"
-TRAINING = {"recordings": 30, "minutes": 2.5, "seed": 0, "locations": 6}
-"""Options of `asp-env synthesize` for the traffic that the predictor is trained on."""
-HELD_OUT = {"recordings": 9, "minutes": 2.0, "seed": 48_271}
-"""Recordings to evaluate on; another seed gives other locations."""
-SCENARIOS = 48
-"""Number of scenarios that each method drives."""
+RECIPE = {"recipe": "ours", "view": "vectors", "split": "blocks", "epochs": 2}
+"""Options of `asp-env train`: two epochs instead of the recipe's eight. Every recording is split
+into blocks of time, so that all locations are trained on."""
+PRETRAINED = f"{PREDICTOR}:pretrained"
+
+PHYSICAL = ("constant-velocity", "constant-turn-rate")
+"""Predictors that are compared with the trained ones in open loop. In closed loop these are the
+controls of `asp-env drive --controls`."""
+
+PLANNER = "sampling"
+SCENARIOS = "interactive"
+"""Filter of the scenarios that every method drives."""
+MAX_SCENARIOS = 160
 
 PLAN = {
-    "site": SITE,
+    "traffic": TRAFFIC,
     "training": TRAINING,
     "held_out": HELD_OUT,
     "predictor": PREDICTOR,
-    "preset": RECIPE,
+    "recipe": RECIPE,
     "asp-env": metadata.version("asp-env"),
 }
 """Options of a demo. Its folder contains them, so that only the same demo is resumed there."""
 
+TITLE = "Does the predictor make the car drive better?"
+FIRST_LEAD = (
+    f"The pretrained predictor {PRETRAINED} forecasts synthetic traffic at locations that it was "
+    "not trained on, and its forecasts are compared with the recorded future. Another predictor is "
+    "being trained; this report is then replaced by one that also has the driving."
+)
 LEAD = (
-    "A predictor is trained on synthetic traffic. On traffic at other locations, its forecasts are "
-    "compared with the recorded future, and a planner drives the ego with them. The method expert "
-    "replays the recorded drives; its scores are the reference for all others."
+    "Two predictors, one pretrained and one trained briefly, forecast synthetic traffic at "
+    "locations that neither was trained on. Their forecasts are compared with the recorded future, "
+    "and a planner drives the ego with them. The oracle is the recorded future, and the method "
+    "expert replays the recorded drives; their scores are the references for all others."
 )
 
 
@@ -68,59 +89,91 @@ class Demo:
         check_report_possible()
         console = Console()
         _claim(self.out)
-        training, held_out = self.out / "traffic", self.out / "held-out"
-        for folder, options in ((training, TRAINING), (held_out, HELD_OUT)):
-            if not folder.exists():
-                console.rule(f"Simulating traffic: {folder}")
-                _run_command("synthesize", out=folder, site=SITE, **options)
-        run = self.out / PREDICTOR
+        held_out, run = self.out / "held-out", self.out / PREDICTOR
+        _simulate(console, held_out, HELD_OUT)
         if not (run / "config.json").exists():
+            console.rule(f"Evaluating the forecasts of {PRETRAINED}")
+            first = self._forecast(held_out, PRETRAINED, planner="none")
+            _show(console, self.out, first, lead=FIRST_LEAD)
+            training = self.out / "traffic"
+            _simulate(console, training, TRAINING)
             console.rule(f"Training the predictor {PREDICTOR}")
-            _run_command("train", predictor=PREDICTOR, data=str(training), out=run, recipe=RECIPE)
+            _run_command("train", predictor=PREDICTOR, data=(str(training),), out=run, **RECIPE)
         console.rule("Evaluating forecasts and driving")
-        trained = f"{PREDICTOR}:{run}"
-        open_loop = evaluate(
-            Evaluate(
-                data=str(held_out),
-                out=self.out,
-                predictors=("constant-velocity", "constant-turn-rate", trained),
-            )
-        )
+        learned = (PRETRAINED, f"{PREDICTOR}:{run}")
         closed_loop = drive(
             Drive(
                 data=str(held_out),
                 out=self.out,
-                predictors=("oracle", "constant-velocity", trained),
-                max_scenarios=SCENARIOS,
+                planner=PLANNER,
+                predictors=learned,
+                controls=True,
+                scenarios=SCENARIOS,
+                max_scenarios=MAX_SCENARIOS,
+                jobs=os.cpu_count() or 1,
             )
         )
-        open_privileged = open_loop.manifest["privileged"]
-        closed_privileged = closed_loop.manifest["privileged"]
-        with _replacing(self.out) as folder:
-            write_metrics(folder, [*open_loop.rows, *closed_loop.rows])
-            privileged = sorted({*open_privileged, *closed_privileged})
-            write_manifest(
-                folder,
-                "demo",
-                plan=PLAN,
-                privileged=privileged,
-                open_loop=open_loop.manifest,
-                closed_loop=closed_loop.manifest,
+        open_loop = self._forecast(held_out, *learned, planner=PLANNER)
+        _show(console, self.out, open_loop, closed_loop, lead=LEAD)
+
+    def _forecast(self, data: Path, *learned: str, planner: str) -> OpenLoopResult:
+        """Evaluates trained predictors beside physical ones, and the regret of a planner."""
+        return evaluate(
+            Evaluate(
+                data=str(data), out=self.out, predictors=(*PHYSICAL, *learned), planner=planner
             )
+        )
+
+
+def _simulate(console: Console, folder: Path, options: dict[str, Any]) -> None:
+    """Generates traffic, unless the folder exists."""
+    if not folder.exists():
+        console.rule(f"Simulating traffic: {folder}")
+        jobs = os.cpu_count() or 1
+        _run_command("synthesize", out=folder, jobs=jobs, **TRAFFIC, **options)
+
+
+def _show(
+    console: Console,
+    out: Path,
+    open_loop: OpenLoopResult,
+    closed_loop: ClosedLoopResult | None = None,
+    *,
+    lead: str,
+) -> None:
+    """Writes the results that there are, and prints their tables."""
+    results = [open_loop] if closed_loop is None else [open_loop, closed_loop]
+    manifests = [result.manifest for result in results]
+    with _replacing(out) as folder:
+        write_metrics(folder, [row for result in results for row in result.rows])
+        write_manifest(
+            folder,
+            "demo",
+            plan=PLAN,
+            privileged=sorted({name for each in manifests for name in each["privileged"]}),
+            **dict(zip(("open_loop", "closed_loop"), manifests, strict=False)),
+        )
+        if closed_loop is not None:
             write_scenario_table(folder, closed_loop.scenarios, closed_loop.methods)
             save_rollouts(folder, closed_loop)
-            write_report(
-                folder,
-                title="Does the predictor make the car drive better?",
-                lead=LEAD,
-                maps=closed_loop.maps,
-                examples=open_loop.examples,
-            )
-        tables = open_loop_tables(open_loop.rows, open_privileged)
-        shown = RULES[DEFAULT_RULES].shown
-        for table in (*tables, *driving_tables(closed_loop.rows, closed_privileged, shown)):
+        write_report(
+            folder,
+            title=TITLE,
+            lead=lead,
+            maps={} if closed_loop is None else closed_loop.maps,
+            examples=open_loop.examples,
+        )
+    for table in open_loop_tables(open_loop.rows, open_loop.manifest["privileged"]):
+        console.print(table)
+    if closed_loop is not None:
+        for table in regret_tables(open_loop.rows, planner=PLANNER):
             console.print(table)
-        console.print(f"wrote {self.out / 'report.html'}")
+        rows, privileged = closed_loop.rows, closed_loop.manifest["privileged"]
+        for table in driving_tables(rows, privileged, RULES[DEFAULT_RULES].shown):
+            console.print(table)
+        for sentence in headlines(rows, privileged):
+            console.print(sentence)
+    console.print(f"wrote {out / 'report.html'}")
 
 
 def _run_command(name: str, **options: Any) -> None:

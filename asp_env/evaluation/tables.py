@@ -44,12 +44,21 @@ DRIVING_VALUES: Headings = {
     "speed": "speed",
     "comfort": "comf",
     "log divergence": "to log m",
+    "no near miss": "no near",
+    "near misses": "near",
+    "min TTC": "TTC s",
+    "required deceleration": "brake",
+    "safety margin": "margin",
+    "uncomfortable ticks": "harsh",
+    "smoothness": "smooth",
+    "time lost": "lost s",
+    "driving cost": "cost s",
 }
 
 SUBSETS = ("all", "interactive")
 """Subsets of scenarios that are printed, as far as they occur."""
 
-MAX_PADDED_COLUMNS = 6
+MAX_PADDED_COLUMNS = 5
 """With more metrics than this, columns have no padding, so that a table fits 80 columns."""
 
 MARK = " *"

@@ -6,11 +6,13 @@ import numpy as np
 from jaxtyping import Float
 
 from asp_env.data.predictor import Forecast
+from asp_env.data.road_map import RoadMap
 from asp_env.data.scene import EGO, Scene
 from asp_env.dynamics import rollout
 from asp_env.dynamics.car_following import IDM, follow_paths, speed_limits
 from asp_env.errors import AspEnvError
 from asp_env.geometry import route_coordinates
+from asp_env.metrics import lanes
 from asp_env.planning.planner import Plan
 
 DESIRED_MPS = 50 / 3.6
@@ -31,13 +33,15 @@ class Routes(NamedTuple):
 class RouteCache:
     """Computes the desired speeds along routes, and stores them while the routes stay the same."""
 
-    def __init__(self, idm: IDM) -> None:
+    def __init__(self, idm: IDM, *, map_limits: bool = False) -> None:
         """Creates an empty cache.
 
         Args:
             idm: limits the speeds before and in bends.
+            map_limits: whether the speed limits of lanes apply, where the map has them.
         """
         self._idm = idm
+        self._map_limits = map_limits
         self._routes = Routes(
             points=np.zeros((0, 0, 2), dtype=np.float32),
             counts=np.zeros(0, dtype=np.int64),
@@ -57,7 +61,11 @@ class RouteCache:
         if not (np.array_equal(known.points, scene.route) and np.array_equal(known.counts, counts)):
             limits = np.zeros(scene.route.shape[:2], dtype=np.float32)
             for b, count in enumerate(counts):
-                limits[b, :count] = speed_limits(scene.route[b, :count], DESIRED_MPS, self._idm)
+                route = scene.route[b, :count]
+                limits[b, :count] = speed_limits(route, DESIRED_MPS, self._idm)
+                if self._map_limits:
+                    road_map = scene.maps[int(scene.map_index[b])]
+                    limits[b, :count] = _with_map_limits(route, road_map, self._idm)
             self._routes = Routes(points=scene.route, counts=counts, speed_limits=limits)
         return self._routes
 
@@ -102,6 +110,30 @@ class IDMPlanner:
         held = np.repeat(actions[:, None], forecast.states.shape[2], axis=1)
         lengths = np.maximum(scene.sizes[:, EGO, 0], 0.1)
         return Plan(actions=held, states=rollout(states[:, EGO], held, lengths, scene.dt_s))
+
+
+def _with_map_limits(
+    route: Float[np.ndarray, "p 2"], road_map: RoadMap, idm: IDM
+) -> Float[np.ndarray, " p"]:
+    """Desired speed at each point of a route: the speed limit, lower in and before bends.
+
+    A point without a known limit has that of the last known one before it, else of the first one
+    after it. Without any, the desired speed is `DESIRED_MPS`.
+    """
+    step = np.gradient(route, axis=0)
+    heading = np.arctan2(step[:, 1], step[:, 0])
+    on_route = np.concatenate([route, heading[:, None], np.zeros((len(route), 1))], axis=1)
+    known = lanes.speed_limits(road_map, on_route)
+    if not known.valid.any():
+        return speed_limits(route, DESIRED_MPS, idm)
+    points = np.arange(len(route))
+    latest = np.maximum.accumulate(np.where(known.valid, points, known.valid.argmax()))
+    by_lane = known.value[latest]
+    limits = np.minimum(speed_limits(route, float(by_lane.max()), idm), by_lane)
+    # braking to the limit of a point j ahead is possible from v² = limit[j]² + 2 b (j - i)
+    falling = 2.0 * idm.comfortable_braking_mps2 * points
+    square = np.minimum.accumulate((limits**2 + falling)[::-1])[::-1] - falling
+    return np.sqrt(square)
 
 
 def _route_arcs(scene: Scene) -> Float[np.ndarray, " b"]:

@@ -50,29 +50,16 @@ class Planner(Protocol):
         ...
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Candidates:
-    """C plans for each of B situations, of which a planner chooses one.
-
-    A planner that needs more of them for their costs extends this class.
-    """
-
-    actions: Float[np.ndarray, "b c t 2"]
-    """[acceleration m/s², steering rad]."""
-    states: Float[np.ndarray, "b c t 4"]
-    """[x m, y m, heading rad, speed m/s] after each action."""
-
-
-CandidatesT = TypeVar("CandidatesT", bound=Candidates)
+CandidatesT = TypeVar("CandidatesT")
 
 
 @runtime_checkable
 class CandidatePlanner(Planner, Protocol[CandidatesT]):
-    """A planner that chooses the cheapest of finitely many candidates.
+    """A planner that executes the cheapest of C candidates, which do not depend on the forecast.
 
-    The candidates do not depend on the forecast, and `plan` returns the first of the cheapest ones.
     So the same candidates can be rated by several forecasts, as planning regret does
-    (`asp_env.planning.regret`).
+    (`asp_env.planning.regret`). A candidate is what is decided now: a plan, or a first phase that
+    several continuations may follow. The class of the candidates is the planner's own.
     """
 
     def candidates(self, scene: Scene, steps: int) -> CandidatesT:

@@ -17,7 +17,7 @@ from asp_env.geometry import overlaps, project, route_coordinates, wrap_angle
 from asp_env.metrics.boxes import AT_REST_MPS, is_behind, touching_trailers
 from asp_env.metrics.drivable import OFF_ROAD_M, off_road_m
 from asp_env.planning.idm import RouteCache
-from asp_env.planning.planner import Candidates, Plan
+from asp_env.planning.planner import Plan
 
 FIRST_MPS2 = (-5.0, -2.5, -1.0, 0.0, 0.7, 1.4)
 """Accelerations of the candidates up to `SWITCH_S`. Chosen by hand."""
@@ -68,9 +68,13 @@ class SamplingWeights:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class RouteCandidates(Candidates):
+class RouteCandidates:
     """C candidates along the route for each of B egos over T ticks."""
 
+    actions: Float[np.ndarray, "b c t 2"]
+    """[acceleration m/s², steering rad]."""
+    states: Float[np.ndarray, "b c t 4"]
+    """[x m, y m, heading rad, speed m/s] after each action."""
     gained_m: Float[np.ndarray, "b c"]
     """Arc length along the route from the first to the last action."""
     offset_m: Float[np.ndarray, "b c"]

@@ -161,9 +161,9 @@ class Job:
         self.check()
         if self.train is not None and not self.trained:
             options = dict(self.train)
-            for name in ("out", "start"):
-                if options.get(name) is not None:
-                    options[name] = Path(options[name])
+            for name in ("data", "validation"):
+                options[name] = () if options.get(name) is None else (options[name],)
+            options["out"] = Path(options["out"])
             Train(**options).run()
         if self.evaluation is not None and not self.evaluation.done:
             self.evaluation.execute()

@@ -169,7 +169,7 @@ class Table:
         """
         if cell.seed is None:
             return {}
-        config = Train(**self._options(cell), data="", out=Path()).config_for(cell.horizon_s)
+        config = Train(**self._options(cell), data=(), out=Path()).config_for(cell.horizon_s)
         fields = {"recipe": asdict(config), "defaults": _defaults(config)}
         return json.loads(json.dumps(fields))
 

@@ -22,6 +22,7 @@ from asp_env.errors import AspEnvError, CheckpointError, unknown_name
 from asp_env.files import atomic_file, remove_stale
 from asp_env.views import BinaryView, SceneView, view_from_config
 from predictors.inference.model_card import model_card
+from predictors.inference.pretrained import PRETRAINED, pretrained_folder, pretrained_names
 from predictors.inference.trained import TrainedPredictor
 from predictors.models.chaining import CHAININGS, Chaining
 from predictors.models.network import AbstractNetwork, NetworkConfig, NetworkShape
@@ -55,13 +56,15 @@ class PredictorSpec:
         """Loads the predictor from the folder of a finished run.
 
         Args:
-            argument: The folder, and optionally an @ and a chaining, for a run of several segments:
-                `RUN@beam` (the default), `RUN@top1`, `RUN@full`, or the privileged `RUN@oracle`.
+            argument: The folder, or `pretrained` for the weights that ship with this package, and
+                optionally an @ and a chaining, for a run of several segments: `RUN@beam` (the
+                default), `RUN@top1`, `RUN@full`, or the privileged `RUN@oracle`.
             horizon: Ignored; a trained predictor keeps its own.
             dt_s: Time step of the scenes to forecast.
 
         Raises:
-            CheckpointError: The folder holds no finished run of this predictor.
+            CheckpointError: The folder holds no finished run of this predictor, or there are no
+                pretrained weights of it.
             AspEnvError: It was trained for another time step, or the chaining does not apply.
         """
         del horizon
@@ -118,7 +121,7 @@ def load_trained(
 
     Args:
         spec: The expected kind of predictor.
-        argument: The folder, and optionally an @ and a chaining.
+        argument: The folder, or `pretrained`, and optionally an @ and a chaining.
         dt_s: Time step of the scenes to forecast; None for the run's own.
 
     Raises:
@@ -127,9 +130,9 @@ def load_trained(
     """
     if not argument:
         raise CheckpointError(
-            f"predictor {spec.name} is trained: name its run as {spec.name}:RUN_DIR"
+            f"predictor {spec.name} is trained: name its run as {spec.name}:RUN_DIR{_shipped(spec)}"
         )
-    folder, chaining = folder_and_chaining(argument)
+    folder, chaining = folder_and_chaining(spec.name, argument)
     config = read_config(folder)
     if config["predictor"] != spec.name:
         raise CheckpointError(
@@ -175,23 +178,34 @@ def load_trained(
     )
 
 
-def folder_and_chaining(argument: str) -> tuple[Path, Chaining | None]:
-    """Splits `RUN@chaining` at the last @.
+def folder_and_chaining(predictor: str, argument: str) -> tuple[Path, Chaining | None]:
+    """Splits `RUN@chaining` at the last @ and finds the run's folder.
 
-    The name of a folder may contain an @: an existing folder is taken as a whole.
+    The name of a folder may contain an @: an existing folder is taken as a whole. The run
+    `pretrained` is the predictor's pretrained weights.
 
     Raises:
+        CheckpointError: The predictor has no pretrained weights.
         AspEnvError: The chaining is unknown.
     """
+    run, chaining = _split_chaining(argument)
+    return pretrained_folder(predictor) if run == PRETRAINED else Path(run), chaining
+
+
+def _split_chaining(argument: str) -> tuple[str, Chaining | None]:
     before, separator, after = argument.rpartition("@")
     if not separator or Path(argument).is_dir():
-        return Path(argument), None
+        return argument, None
     for chaining in CHAININGS:
         if after == chaining:
-            return Path(before), chaining
-    if Path(before).is_dir():
+            return before, chaining
+    if before == PRETRAINED or Path(before).is_dir():
         raise unknown_name("chaining", after, CHAININGS)
-    return Path(argument), None
+    return argument, None
+
+
+def _shipped(spec: PredictorSpec) -> str:
+    return f", or {spec.name}:{PRETRAINED}" if spec.name in pretrained_names() else ""
 
 
 def weights_hash(folder: Path) -> str:

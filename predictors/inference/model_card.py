@@ -128,7 +128,7 @@ def _data(provenance: dict[str, Any]) -> dict[str, object]:
     standing_share = training.get("standing_share")
     return {
         "data": f"`{trained_on['source']}`",
-        "validation data": f"`{validation}`" if validation else None,
+        "validation data": f"`{', '.join(validation)}`" if validation else None,
         "split": trained_on["split"],
         "recordings": _counts(parts),
         "snippets": _counts(snippets),

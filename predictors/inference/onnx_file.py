@@ -99,7 +99,7 @@ def write_onnx(name: str, out: Path) -> float:
             f"{name} reads the recorded future, which users of the file do not have: take another "
             "chaining"
         )
-    folder, _ = folder_and_chaining(argument)
+    folder, _ = folder_and_chaining(kind, argument)
     config = read_config(folder)
     metadata = {"config": json.dumps(config, sort_keys=True)} | _metadata(predictor)
     content = _to_onnx(predictor, metadata)

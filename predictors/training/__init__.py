@@ -10,8 +10,8 @@ if TYPE_CHECKING:
     from predictors.training.data import Batches, DatasetSplit, TrainingData, open_training_data
     from predictors.training.data_loading import BatchSource, BatchWorkers, batch_workers
     from predictors.training.fitting import train, train_stages
+    from predictors.training.initial_weights import InitialWeights
     from predictors.training.lightning_parts import BestCheckpoint, EpochLogger, TrainingModule
-    from predictors.training.pretrained import PretrainedWeights
     from predictors.training.recipes import RECIPES, TrainingConfig, recipe
     from predictors.training.trainer import Hardware, make_trainer
     from predictors.training.variants import VARIANTS, Variant, variant, warm_starts_from_3s
@@ -26,7 +26,7 @@ __all__ = [
     "DatasetSplit",
     "EpochLogger",
     "Hardware",
-    "PretrainedWeights",
+    "InitialWeights",
     "TrainingConfig",
     "TrainingData",
     "TrainingModule",
@@ -45,8 +45,8 @@ _MODULES = {
     "data": ("Batches", "DatasetSplit", "TrainingData", "open_training_data"),
     "data_loading": ("BatchSource", "BatchWorkers", "batch_workers"),
     "fitting": ("train", "train_stages"),
+    "initial_weights": ("InitialWeights",),
     "lightning_parts": ("BestCheckpoint", "EpochLogger", "TrainingModule"),
-    "pretrained": ("PretrainedWeights",),
     "recipes": ("RECIPES", "TrainingConfig", "recipe"),
     "trainer": ("Hardware", "make_trainer"),
     "variants": ("VARIANTS", "Variant", "variant", "warm_starts_from_3s"),

@@ -17,8 +17,9 @@ class Train:
 
     predictor: Annotated[tyro.conf.Positional[str], tyro.conf.arg(metavar="PREDICTOR")]
     """Predictor to train: mtp, dkm, ffw-asp or ssp-asp."""
-    data: Annotated[tyro.conf.Positional[str], tyro.conf.arg(metavar="DATA")]
-    """Folder in the inD/rounD or INTERACTION layout, or sample:…, synthetic:… or highway:…."""
+    data: Annotated[tyro.conf.Positional[tuple[str, ...]], tyro.conf.arg(metavar="DATA …")]
+    """Folders in the inD/rounD or INTERACTION layout, or
+    sample:…, synthetic:… or highway:…. Several are trained on together."""
     out: Path
     """Folder of the run."""
     recipe: str = "cpu"
@@ -33,9 +34,11 @@ class Train:
     """Horizon of the forecasts in seconds. Above 3 s, ssp-asp
     and the variant staged of the others start from a run for
     3 s in OUT/3s."""
-    start: Path | None = None
-    """A finished run to start from, or a safetensors file of ResNet18 weights."""
-    validation: str | None = None
+    start: str | None = None
+    """What to start from: a finished run, pretrained (the
+    weights that ship with this package), or a safetensors
+    file of ResNet18 weights."""
+    validation: Annotated[tuple[str, ...], tyro.conf.arg(metavar="DATA …")] = ()
     """Separate validation data. All of DATA is then used for training."""
     history: Literal["recorded", "causal"] = "recorded"
     """Histories that the network observes: as recorded
@@ -75,6 +78,7 @@ class Train:
             AspEnvError: An option, the data or the folder is bad.
         """
         try:
+            from predictors.inference.pretrained import PRETRAINED, pretrained_folder
             from predictors.training.fitting import train, train_stages
             from predictors.training.trainer import Hardware, is_first_process
             from predictors.training.variants import warm_starts_from_3s
@@ -88,18 +92,21 @@ class Train:
             compiled=self.compile,
             num_workers=self.num_workers,
         )
+        start = None if self.start is None else Path(self.start)
+        if self.start == PRETRAINED:
+            start = pretrained_folder(self.predictor)
         if warm_starts_from_3s(self.predictor, self.variant):
             run = train_stages(
                 self.config_for,
                 self.horizon,
                 self.data,
                 self.out,
-                start=self.start,
+                start=start,
                 hardware=hardware,
             )
         else:
             config = self.config_for(self.horizon)
-            run = train(config, self.data, self.out, start=self.start, hardware=hardware)
+            run = train(config, self.data, self.out, start=start, hardware=hardware)
         if is_first_process():
             Console().print(f"wrote {run}: name it as {self.predictor}:{run}")
 

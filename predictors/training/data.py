@@ -6,12 +6,12 @@ from dataclasses import dataclass
 from typing import final
 
 import numpy as np
-from jaxtyping import Bool, Int
+from jaxtyping import Bool, Int, Shaped
 
 from asp_env.data.causal import causal_histories
 from asp_env.data.recording import Recording
 from asp_env.data.snippets import SnippetIndex, gather_future, gather_present, index_snippets
-from asp_env.data.source import Recordings, open_data
+from asp_env.data.source import Recordings, join_data, open_data
 from asp_env.data.split import TrainedOn, snippet_parts
 from asp_env.dynamics import MAX_ACCELERATION_MPS2, MAX_STEERING_RAD, inverse
 from asp_env.errors import AspEnvError
@@ -168,27 +168,33 @@ class TrainingData:
     """Hash of separate validation data, if there are any."""
 
 
-def open_training_data(config: TrainingConfig, data: str) -> TrainingData:
+def open_all(data: str | Sequence[str]) -> list[Recordings]:
+    """Opens one or several DATA."""
+    return [open_data(each) for each in ([data] if isinstance(data, str) else data)]
+
+
+def open_training_data(config: TrainingConfig, data: str | Sequence[str]) -> TrainingData:
     """Opens the data and splits them, or takes all of them if validation data are given.
 
     Args:
         config: The configuration.
-        data: DATA, as `open_data` takes it.
+        data: One or several DATA, as `open_data` takes them. Each is split on its own.
 
     Raises:
-        AspEnvError: The data are bad, a part is empty, or a recording is in both data sets.
+        AspEnvError: The data are bad, a part is empty, or a recording is in two data sets.
     """
-    recordings = open_data(data)
+    opened = open_all(data)
+    recordings = join_data(opened)
     index = _index(recordings, config)
-    if config.validation is None:
-        parts, trained_on = snippet_parts(recordings, index, config.split)
+    if not config.validation:
+        parts, trained_on = _split(opened, recordings.source, config)
         training, validation = (
             DatasetSplit(recordings=recordings, snippets=index.select(parts == part))
             for part in ("train", "validation")
         )
         validation_hash = None
     else:
-        separate = open_data(config.validation)
+        separate = join_data(open_all(config.validation))
         training = DatasetSplit(recordings=recordings, snippets=index)
         validation = DatasetSplit(recordings=separate, snippets=_index(separate, config))
         trained_on = _separate_parts(recordings, separate)
@@ -326,6 +332,16 @@ def _chunks(snippets: SnippetIndex) -> Iterator[SnippetIndex]:
 
 def _index(recordings: Recordings, config: TrainingConfig) -> SnippetIndex:
     return index_snippets(recordings, dt_s=config.dt_s, horizon_s=config.horizon_s)
+
+
+def _split(
+    opened: Sequence[Recordings], source: str, config: TrainingConfig
+) -> tuple[Shaped[np.ndarray, " n"], TrainedOn]:
+    """The parts of the snippets of several data sets, in the order of their joined recordings."""
+    splits = [snippet_parts(each, _index(each, config), config.split) for each in opened]
+    by_hash = {key: part for _, trained_on in splits for key, part in trained_on.parts.items()}
+    parts = np.concatenate([of_data for of_data, _ in splits])
+    return parts, TrainedOn(source=source, split=config.split, parts=by_hash)
 
 
 def _separate_parts(training: Recordings, validation: Recordings) -> TrainedOn:

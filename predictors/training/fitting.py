@@ -5,7 +5,7 @@ import dataclasses
 import json
 import platform
 import shutil
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager, nullcontext
 from importlib.metadata import version
 from pathlib import Path
@@ -16,7 +16,7 @@ import torch
 from safetensors.torch import load_file
 
 from asp_env import registry
-from asp_env.data.source import open_data
+from asp_env.data.source import join_data
 from asp_env.errors import AspEnvError
 from asp_env.views import make_view
 from predictors.inference.calibration import calibrate
@@ -28,10 +28,15 @@ from predictors.inference.checkpoint import (
     shape_for,
     write_json,
 )
-from predictors.training.data import VALIDATION_BATCH, action_range, open_training_data
+from predictors.training.data import (
+    VALIDATION_BATCH,
+    action_range,
+    open_all,
+    open_training_data,
+)
 from predictors.training.data_loading import batch_workers
+from predictors.training.initial_weights import InitialWeights
 from predictors.training.lightning_parts import BestCheckpoint, EpochLogger, TrainingModule
-from predictors.training.pretrained import PretrainedWeights
 from predictors.training.recipes import SEGMENT_S, TrainingConfig
 from predictors.training.trainer import LOGS, Hardware, SafetensorsIO, make_trainer, quiet
 
@@ -49,7 +54,7 @@ ONE_PROCESS = Hardware()
 
 def train(
     config: TrainingConfig,
-    data: str,
+    data: str | Sequence[str],
     out: Path,
     *,
     start: Path | None = None,
@@ -63,7 +68,7 @@ def train(
 
     Args:
         config: Everything that decides the weights, besides the data and the start.
-        data: DATA, as `open_data` takes it.
+        data: One or several DATA, as `open_data` takes them.
         out: The run's folder. It holds `logs` and, until the run is finished, `unfinished`; then
             `config.json`, `weights.safetensors` and `README.md`, of the epoch with the lowest
             `validation FDE moving`.
@@ -84,17 +89,17 @@ def train(
         run["validation_hash"] = chosen.validation_hash
     spec: PredictorSpec = registry.find("predictors", config.predictor)
     view = make_view(config.view, pixels=config.pixels)
-    pretrained = None
+    initial = None
     if start is not None:
-        pretrained = PretrainedWeights.read(start, spec, view=view, dt_s=config.dt_s)
-        run["start"] = pretrained.weights_hash
+        initial = InitialWeights.read(start, spec, view=view, dt_s=config.dt_s)
+        run["start"] = initial.weights_hash
     resumed = _resumes(out, run, staged=start == out / FIRST_STAGE)
 
     training = chosen.training
-    if pretrained is None or pretrained.action_range is None:
+    if initial is None or initial.action_range is None:
         scale = action_range(training.recordings, training.snippets)
     else:
-        scale = pretrained.action_range
+        scale = initial.action_range
     shape = shape_for(
         view,
         history=training.snippets.history,
@@ -105,10 +110,10 @@ def train(
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(config.seed)
         network = spec.network(config.network, shape)
-    not_loaded = [] if pretrained is None else pretrained.apply(network)
+    not_loaded = [] if initial is None else initial.apply(network)
     trained_on = chosen.trained_on
-    if pretrained is not None and pretrained.trained_on is not None:
-        trained_on = trained_on.continued_from(pretrained.trained_on)
+    if initial is not None and initial.trained_on is not None:
+        trained_on = trained_on.continued_from(initial.trained_on)
     batches = [
         split.batches(view, size=size, later_ticks=network.later_ticks, config=config)
         for split, size in (
@@ -170,7 +175,7 @@ def train(
 def train_stages(
     config_for: Callable[[float], TrainingConfig],
     horizon_s: float,
-    data: str,
+    data: str | Sequence[str],
     out: Path,
     *,
     start: Path | None = None,
@@ -183,7 +188,7 @@ def train_stages(
     Args:
         config_for: Maps a horizon in seconds to the configuration.
         horizon_s: The horizon of the predictor.
-        data: DATA, as `open_data` takes it.
+        data: One or several DATA, as `open_data` takes them.
         out: The run's folder.
         start: Where to start from instead of a first stage.
         hardware: Devices and nodes.
@@ -204,12 +209,12 @@ def train_stages(
     return train(config, data, out, start=start, hardware=hardware)
 
 
-def _check_first_stage(start: Path, config: TrainingConfig, data: str) -> None:
+def _check_first_stage(start: Path, config: TrainingConfig, data: str | Sequence[str]) -> None:
     """Refuses a first stage of other data, possibly the test recordings, or another recipe."""
     provenance = read_config(start).get("provenance", {})
     expected = {
         "config": json.loads(json.dumps(dataclasses.asdict(config))),
-        "data_hash": open_data(data).data_hash(),
+        "data_hash": join_data(open_all(data)).data_hash(),
     }
     if other := [name for name, value in expected.items() if provenance.get(name) != value]:
         raise AspEnvError(

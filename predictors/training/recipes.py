@@ -44,8 +44,8 @@ class TrainingConfig:
     horizon_s: float
     dt_s: float = DEFAULT_DT_S
     split: Split = "recording"
-    validation: str | None = None
-    """Separate validation data; all of DATA is trained on then."""
+    validation: tuple[str, ...] = ()
+    """Separate validation data; all of DATA is trained on if there are any."""
     history: Literal["recorded", "causal"] = "recorded"
     """Whether inputs show the histories as recorded, smoothed with later frames, or filtered
     forward."""

@@ -2,7 +2,8 @@
 
 All registered predictors are tested. Trained ones have random weights and read rasters or vectors;
 those that chain segments are tested with every chaining at 6 s. The recipes `ours` are tested on
-vectors. A predictor with an argument is tested with each of `ARGUMENTS`.
+vectors. A predictor with an argument is tested with each of `ARGUMENTS`. The pretrained ones are
+tested with their own weights.
 """
 
 import re
@@ -24,6 +25,7 @@ from asp_env.data.snippets import (
     gather_scene,
     index_snippets,
 )
+from predictors.inference.pretrained import PRETRAINED, pretrained_names
 from predictors.models.chaining import CHAININGS
 from predictors.training.recipes import RECIPES
 from tests.builders import make_recording
@@ -86,6 +88,7 @@ OURS = tuple(Case(name, "vectors", preset="ours") for name, of in RECIPES.items(
 OURS_CHAINED = tuple(Case("ssp-asp", "vectors", chaining, "ours") for chaining in CHAININGS)
 DELAYED = tuple(Case(f"delayed:2:{name}", "vectors") for name in ("ffw-asp", "mtp"))
 TRAINED = ONE_SEGMENT + CHAINED + OURS + OURS_CHAINED
+SHIPPED = tuple(Case(f"{name}:{PRETRAINED}") for name in pretrained_names())
 
 
 def with_predictors(cases: tuple[Case, ...]) -> pytest.MarkDecorator:
@@ -94,7 +97,7 @@ def with_predictors(cases: tuple[Case, ...]) -> pytest.MarkDecorator:
     return pytest.mark.parametrize("predictor", cases, ids=labels, indirect=True)
 
 
-every = with_predictors(PHYSICAL + TRAINED + DELAYED)
+every = with_predictors(PHYSICAL + TRAINED + DELAYED + SHIPPED)
 
 
 @cache

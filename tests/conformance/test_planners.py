@@ -176,6 +176,28 @@ def test_the_plan_is_the_first_of_the_cheapest_candidates(name, scene):
 
 
 @pytest.mark.parametrize("name", PLANNERS)
+def test_equal_modes_are_one_mode(name, scene):
+    """Four equally probable modes that are alike yield the plan of one."""
+    planner = load_planner(name)
+    one, four = (planner.plan(scene, straight_ahead(scene, modes=modes)) for modes in (1, 4))
+    assert four.actions == pytest.approx(one.actions, abs=1e-5)
+    assert four.states == pytest.approx(one.states, abs=1e-4)
+
+
+@pytest.mark.parametrize("name", PLANNERS)
+def test_plans_are_as_long_as_the_forecast(name, scene):
+    """Horizons of 2 and 7 ticks."""
+    whole = straight_ahead(scene)
+    for steps in (2, 7):
+        forecast = dataclasses.replace(
+            whole, states=whole.states[:, :, :steps], actions=whole.actions[:, :, :steps]
+        )
+        plan = load_planner(name).plan(scene, forecast)
+        assert plan.actions.shape == (4, steps, 2)
+        assert np.isfinite(plan.states).all()
+
+
+@pytest.mark.parametrize("name", PLANNERS)
 def test_a_scene_without_a_route_is_refused(name):
     """Scenes of snippets have no routes."""
     recordings = [make_recording()]

@@ -11,7 +11,7 @@ import pytest
 from asp_env import registry
 from asp_env.data.readers import layout, opening
 from asp_env.data.recording import Recording
-from asp_env.data.source import Recordings, load, open_data
+from asp_env.data.source import Recordings, join_data, load, open_data
 from asp_env.errors import AspEnvError, DataError
 from tests.data.levelx_files import write_folder, write_map, write_recording
 
@@ -322,3 +322,23 @@ def test_from_inside_the_data_folder(folder: Path, monkeypatch: pytest.MonkeyPat
     recordings = open_data(".")
     assert recordings.source == "."
     assert len(recordings[0].road_map.lanes) == 2
+
+
+def test_joined_data_are_the_recordings_of_each(folder: Path, tmp_path: Path) -> None:
+    """In order, with the number of their data set before equal names, and the same content."""
+    other = write_folder(tmp_path / "other", recordings=4)
+    parts = [open_data(folder), open_data(other)[3:]]
+    joined = join_data(parts)
+    assert joined.names == ("1-00", "1-01", "1-02", "2-03")
+    assert joined.hashes() == (*parts[0].hashes(), *parts[1].hashes())
+    assert joined.source == f"{folder}, {other}"
+    for one, same in zip(joined, [*parts[0], *parts[1]], strict=True):
+        assert equal(one, same)
+    assert join_data(parts[:1]) is parts[0]
+
+
+def test_recording_in_two_data_sets_is_refused(folder: Path, tmp_path: Path) -> None:
+    """By content, under whatever name the folder has."""
+    copy = write_folder(tmp_path / "copy", recordings=1)
+    with pytest.raises(DataError, match=f"recording 00 of '{copy}' is in '{folder}' too"):
+        join_data([open_data(folder), open_data(copy)])

@@ -18,6 +18,8 @@ DT_S = 0.2
 def record(*, active: int = TICKS, dt_s: float = DT_S, **changes: object) -> EpisodeRecord:
     """One episode at 5 m/s that is perfect except for its progress of 40 m out of 50 m.
 
+    The logged ego is 10 m ahead at every tick, from 43 to 50 m.
+
     Fields of `EpisodeRecord` and `MapContext` are given as one value for all ticks or as arrays.
     `limit_mps` is `None` without a speed limit, `against_m` on maps without lanes.
     """
@@ -34,6 +36,11 @@ def record(*, active: int = TICKS, dt_s: float = DT_S, **changes: object) -> Epi
         "route_m": np.linspace(33, 40, TICKS)[None],
         "route_offset_m": zeros,
         "goal_m": np.array([50.0]),
+        "log_route_m": np.linspace(43, 50, TICKS)[None],
+        "scenario_ticks": np.array([TICKS - 1]),
+        "near_miss": no,
+        "conflict_s": np.full((1, TICKS), 3.0),
+        "required_mps2": zeros,
         "outside_m": zeros,
         "several_lanes": no,
         "at_crossing": no,

@@ -13,7 +13,14 @@ from asp_env.data.rollout import Rollout
 from asp_env.data.scenarios.scenario import Scenario
 from asp_env.data.scene import EGO, Scene
 from asp_env.data.snippets import Future
+from asp_env.metrics.drivable import OFF_ROAD_M
+from asp_env.metrics.driving.cost import log_route_m
 from asp_env.metrics.driving.map_context import map_context
+from asp_env.metrics.driving.margins import (
+    conflict_time_s,
+    near_misses,
+    required_deceleration,
+)
 from asp_env.metrics.driving.realism import realism, realism_features
 from asp_env.metrics.driving.rules import Rules
 from asp_env.metrics.driving.scores import (
@@ -205,25 +212,37 @@ def _measure(
         ),
     )
     lane_is_ambiguous = context.several_lanes | context.at_crossing
+    agents = (states, valid, episodes.sizes)
+    shared: dict[str, Any] = {
+        "contacts": contacts,
+        "ignored": episodes.own_trailer,
+        "num_ticks": active.sum(axis=1),
+        "dt_s": world.dt_s,
+    }
+    margins: dict[str, Any] = shared | {
+        "wide_sector": lane_is_ambiguous | (off_road_m > OFF_ROAD_M)
+    }
     return EpisodeRecord(
         states=states[:, :, EGO],
         log_states=episodes.log_states[:, ticks, EGO],
         contacts=contacts,
         off_road_m=off_road_m,
         ttc_s=time_to_collision(
-            states,
-            valid,
-            episodes.sizes,
-            contacts=contacts,
-            ignored=episodes.own_trailer,
+            *agents,
             wide_sector=lane_is_ambiguous | (off_road_m > rules.off_road_m),
-            num_ticks=active.sum(axis=1),
             rule=rules.ttc,
-            dt_s=world.dt_s,
+            **shared,
         ),
         route_m=np.stack([each.route_m for each in events], axis=1),
         route_offset_m=np.stack([each.route_offset_m for each in events], axis=1),
         goal_m=events[0].goal_m,
+        log_route_m=log_route_m(
+            episodes.route, episodes.route_valid, episodes.log_states[:, world.history :, EGO]
+        ),
+        scenario_ticks=episodes.length.copy(),
+        near_miss=near_misses(*agents, ignored=episodes.own_trailer),
+        conflict_s=conflict_time_s(*agents, **margins),
+        required_mps2=required_deceleration(*agents, **margins),
         map_context=context,
         active=active,
         dt_s=world.dt_s,

@@ -32,7 +32,7 @@ class MetricNote:
 
     label: str
     unit: str
-    """`m`, `m²`, `%` (the value is a share of one), or empty."""
+    """`m`, `m²`, `s`, `m/s²`, `%` (the value is a share of one), or empty."""
     better: Better
     text: str
     """Definition in a sentence; empty for an unknown metric."""
@@ -444,6 +444,66 @@ METRIC_NOTES = {
         "higher",
         "Share of episodes within nuPlan's bounds on acceleration, jerk, yaw rate and yaw "
         "acceleration.",
+    ),
+    "no near miss": _note(
+        "No near miss",
+        "%",
+        "higher",
+        "Share of episodes without a near miss: an agent within 0.5 m plus 0.2 s at the ego's "
+        "speed ahead of its box, or 0.3 m beside it, that comes closer by over 0.5 m/s.",
+    ),
+    "near misses": _note(
+        "Near misses", "%", "lower", "Share of the ticks of an episode that are near misses."
+    ),
+    "min TTC": _note(
+        "Min. TTC",
+        "s",
+        "higher",
+        "Smallest time to collision at constant velocity in an episode, at most 3 s; 0 s in a "
+        "collision.",
+    ),
+    "required deceleration": _note(
+        "Required braking",
+        "m/s²",
+        "lower",
+        "Largest braking in an episode that the ego would have needed to avoid an agent at "
+        "constant velocity, at most 8 m/s².",
+    ),
+    "safety margin": _note(
+        "Safety margin",
+        "%",
+        "higher",
+        "Smallest time to collision as a share of 1.9 s, at most 100 %: the threshold of TTC, "
+        "0.95 s, widened to a ramp with 50 % in its middle.",
+    ),
+    "uncomfortable ticks": _note(
+        "Uncomfortable",
+        "%",
+        "lower",
+        "Share of the ticks of an episode at which one of nuPlan's comfort bounds is exceeded.",
+    ),
+    "smoothness": _note(
+        "Smoothness",
+        "%",
+        "higher",
+        "The bounds of comfort widened to a ramp: 100 % up to half of every bound, 50 % at a "
+        "bound, 0 % from 1.5 times a bound on.",
+    ),
+    "time lost": _note(
+        "Time lost",
+        "s",
+        "lower",
+        "Elapsed time at the end of an episode less the time at which the recorded ego was at the "
+        "same place, to the end of the scenario where the ego does not reach the goal; negative "
+        "if the ego gained time.",
+    ),
+    "driving cost": _note(
+        "Driving cost",
+        "s",
+        "lower",
+        "Time lost, plus 5 s per second of conflict of full severity, which is (1 - TTC / 3 s)², "
+        "plus the uncomfortable time, plus 30 s for an at-fault collision or for leaving the "
+        "road.",
     ),
     "log divergence": _note(
         "Log distance",

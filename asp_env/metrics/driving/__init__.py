@@ -1,7 +1,25 @@
 """Metrics of driven episodes: scores, comfort, time to collision and realism of the traffic."""
 
-from asp_env.metrics.driving.comfort import comfort_signals, comfortable
+from asp_env.metrics.driving.comfort import (
+    comfort_signals,
+    comfortable,
+    share_of_bounds,
+    within_bounds,
+)
+from asp_env.metrics.driving.cost import (
+    DrivingCostWeights,
+    driving_cost_s,
+    log_route_m,
+    severity,
+    time_lost_s,
+)
 from asp_env.metrics.driving.map_context import MapContext, map_context
+from asp_env.metrics.driving.margins import (
+    CONFLICT_TTC,
+    conflict_time_s,
+    near_misses,
+    required_deceleration,
+)
 from asp_env.metrics.driving.realism import (
     REALISM_FEATURES,
     RealismFeature,
@@ -12,6 +30,7 @@ from asp_env.metrics.driving.realism import (
 )
 from asp_env.metrics.driving.rules import (
     DEFAULT_RULES,
+    GRADED,
     NUPLAN,
     PDMS,
     RULES,
@@ -30,13 +49,16 @@ from asp_env.metrics.driving.scores import (
 from asp_env.metrics.driving.ttc import TtcRule, time_to_collision
 
 __all__ = [
+    "CONFLICT_TTC",
     "DEFAULT_RULES",
+    "GRADED",
     "NUPLAN",
     "PDMS",
     "REALISM_FEATURES",
     "RULES",
     "STRICT",
     "WAYMAX",
+    "DrivingCostWeights",
     "EpisodeRecord",
     "MapContext",
     "RealismFeature",
@@ -46,13 +68,22 @@ __all__ = [
     "at_fault",
     "comfort_signals",
     "comfortable",
+    "conflict_time_s",
+    "driving_cost_s",
     "driving_metrics",
     "feature_likelihood",
     "find_rules",
+    "log_route_m",
     "map_context",
+    "near_misses",
     "nearest_distance_and_ttc",
     "overspeed_mps",
     "realism",
     "realism_features",
+    "required_deceleration",
+    "severity",
+    "share_of_bounds",
+    "time_lost_s",
     "time_to_collision",
+    "within_bounds",
 ]

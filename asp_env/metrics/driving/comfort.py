@@ -1,5 +1,7 @@
 """nuPlan's comfort bounds on the motion of a vehicle, from its states at consecutive ticks."""
 
+from collections.abc import Mapping
+
 import numpy as np
 from jaxtyping import Bool, Float
 
@@ -80,6 +82,31 @@ def comfort_signals(states: Float[np.ndarray, "*batch t 4"], dt_s: float) -> dic
     return dict(zip(BOUNDS, values, strict=True))
 
 
+def within_bounds(signals: Mapping[str, Float[np.ndarray, "*shape"]]) -> Bool[np.ndarray, "*shape"]:
+    """Where every signal is within its bounds.
+
+    Args:
+        signals: `comfort_signals`.
+    """
+    inside = [(v >= BOUNDS[name][0]) & (v <= BOUNDS[name][1]) for name, v in signals.items()]
+    return np.logical_and.reduce(inside)
+
+
+def share_of_bounds(
+    signals: Mapping[str, Float[np.ndarray, "*shape"]],
+) -> Float[np.ndarray, "*shape"]:
+    """The largest of the signals as shares of their bounds: 1 at a bound, 0 without any motion.
+
+    Args:
+        signals: `comfort_signals`.
+    """
+    shares = []
+    for name, value in signals.items():
+        low, high = BOUNDS[name]
+        shares.append(np.where(value < 0, value / (low or -high), value / high))
+    return np.maximum.reduce(shares)
+
+
 def comfortable(
     states: Float[np.ndarray, "*batch t 4"], dt_s: float, long_enough: Bool[np.ndarray, "*batch"]
 ) -> Masked:
@@ -94,8 +121,5 @@ def comfortable(
         return Masked(
             value=np.zeros(states.shape[:-2]), valid=np.zeros(states.shape[:-2], dtype=bool)
         )
-    within = np.ones(states.shape[:-1], dtype=bool)
-    for name, value in comfort_signals(states, dt_s).items():
-        low, high = BOUNDS[name]
-        within &= (value >= low) & (value <= high)
+    within = within_bounds(comfort_signals(states, dt_s))
     return Masked(value=np.asarray(within.all(axis=-1), dtype=np.float64), valid=long_enough)

@@ -47,6 +47,15 @@ _NUPLAN_TTC = TtcRule(
     ignore_after_contact=True,
     standing_mps=0.005,
 )
+_PDMS_TTC = TtcRule(
+    futures="recorded",
+    step_s=0.3,
+    horizon_s=0.9,  # the last step within NAVSIM's window of 1 s
+    min_ttc_s=0.95,
+    sector=True,
+    ignore_after_contact=True,
+    standing_mps=0.005,
+)
 _PDMS_WEIGHTS = {"progress": 5.0, "TTC": 5.0, "comfort": 2.0}
 
 NUPLAN = Rules(
@@ -69,15 +78,7 @@ PDMS = Rules(
     description="NAVSIM's predictive driver model score over a whole closed-loop episode",
     off_road_m=OFF_ROAD_M,
     any_side_is_fault=False,
-    ttc=TtcRule(
-        futures="recorded",
-        step_s=0.3,
-        horizon_s=0.9,  # the last step within NAVSIM's window of 1 s
-        min_ttc_s=0.95,
-        sector=True,
-        ignore_after_contact=True,
-        standing_mps=0.005,
-    ),
+    ttc=_PDMS_TTC,
     min_progress_m=1.0,
     lifts_ego=False,
     multipliers=("no at-fault collision", "on road"),
@@ -125,7 +126,24 @@ STRICT = Rules(
     shown=("no at-fault collision", "on mapped road", "TTC", "progress", "comfort"),
 )
 
-RULES = {rules.name: rules for rules in (NUPLAN, PDMS, WAYMAX, STRICT)}
+GRADED = Rules(
+    name="graded",
+    version=1,
+    description="PDMS with continuous measures in place of the thresholds of TTC and comfort",
+    off_road_m=OFF_ROAD_M,
+    any_side_is_fault=False,
+    ttc=_PDMS_TTC,
+    min_progress_m=1.0,
+    lifts_ego=False,
+    multipliers=("no at-fault collision", "on road"),
+    weights={"progress": 5.0, "safety margin": 5.0, "smoothness": 2.0},
+    shown=(
+        *("no at-fault collision", "on road", "safety margin", "progress", "smoothness"),
+        "driving cost",
+    ),
+)
+
+RULES = {rules.name: rules for rules in (NUPLAN, PDMS, WAYMAX, STRICT, GRADED)}
 DEFAULT_RULES = PDMS.name
 
 

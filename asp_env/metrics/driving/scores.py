@@ -7,9 +7,20 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 
 from asp_env.metrics.boxes import Contact
-from asp_env.metrics.driving.comfort import comfortable, window_ticks
+from asp_env.metrics.driving.comfort import (
+    comfort_signals,
+    share_of_bounds,
+    window_ticks,
+    within_bounds,
+)
+from asp_env.metrics.driving.cost import (
+    DrivingCostWeights,
+    driving_cost_s,
+    time_lost_s,
+)
 from asp_env.metrics.driving.map_context import MapContext
-from asp_env.metrics.driving.rules import Rules
+from asp_env.metrics.driving.margins import CONFLICT_TTC
+from asp_env.metrics.driving.rules import NUPLAN, Rules
 from asp_env.metrics.forecast.feasibility import infeasible_ticks
 from asp_env.metrics.masked import Masked
 
@@ -52,6 +63,16 @@ class EpisodeRecord:
     """Lateral offset from the logged route."""
     goal_m: Float[np.ndarray, " b"]
     """Arc length of the logged ego at the end."""
+    log_route_m: Float[np.ndarray, "b l"]
+    """Arc length of the logged ego on its route at the ticks of the scenario, from the first on."""
+    scenario_ticks: Int[np.ndarray, " b"]
+    """Number of steps that each scenario provides."""
+    near_miss: Bool[np.ndarray, "b t"]
+    """Values of `near_misses`."""
+    conflict_s: Float[np.ndarray, "b t"]
+    """Values of `conflict_time_s`, the same under all rules."""
+    required_mps2: Float[np.ndarray, "b t"]
+    """Values of `required_deceleration`."""
     map_context: MapContext
     active: Bool[np.ndarray, "b t"]
     """Ticks that belong to each episode: the first ones."""
@@ -79,6 +100,16 @@ def driving_metrics(record: EpisodeRecord, rules: Rules) -> dict[str, Masked]:
       tick.
     - `log divergence`, `route deviation`: mean distance to the logged ego at the same ticks, and
       mean absolute offset from its route, m.
+    - `no near miss`: 1 or 0; `near misses`: share of the ticks that are near misses.
+    - `min TTC`: the smallest time to collision at constant velocity (`CONFLICT_TTC`), s, at most 3.
+    - `required deceleration`: the largest over ticks, m/s², at most 8.
+    - `safety margin`: the threshold of `TTC`, 0.95 s, widened to a ramp: min TTC / 1.9 s, up to 1.
+    - `uncomfortable ticks`: share of the ticks beyond a comfort bound.
+    - `smoothness`: the thresholds of `comfort` widened to a ramp: 1 up to half of every bound, 0.5
+      at a bound, 0 from 1.5 times a bound on. Both are missing where `comfort` is.
+    - `time lost`: against the log, s.
+    - `driving cost`: `driving_cost_s` with `DrivingCostWeights`, s; faults are nuPlan's under all
+      rules.
     - `score`: the product of the multipliers times the weighted mean of the rules; missing metrics
       are left out of both.
 
@@ -106,17 +137,20 @@ def driving_metrics(record: EpisodeRecord, rules: Rules) -> dict[str, Masked]:
         "progress": progress,
         "making progress": (progress >= MIN_PROGRESS).astype(np.float64),
         "TTC": 1.0 - short_ttc.any(axis=1),
-        "log divergence": np.where(active, divergence, 0).sum(axis=1) / np.maximum(count, 1),
-        "route deviation": np.where(active, np.abs(record.route_offset_m), 0).sum(axis=1)
-        / np.maximum(count, 1),
+        "log divergence": _mean_over_ticks(divergence, active),
+        "route deviation": _mean_over_ticks(np.abs(record.route_offset_m), active),
     }
+    uncomfortable, share_of_bound = _comfort_over_ticks(record)
     metrics = {name: Masked(value=value, valid=has_ticks) for name, value in values.items()}
     metrics |= {
         "direction": _direction(record),
         "speed": _speed(record),
-        "comfort": _comfort(record),
+        "comfort": Masked(
+            value=np.asarray(1.0 - uncomfortable.value.any(axis=1)), valid=share_of_bound.valid
+        ),
         "feasible": _feasible(record),
     }
+    metrics |= _continuous(record, uncomfortable, share_of_bound)
     if rules.weights:
         metrics = {"score": _score(metrics, rules, has_ticks), **metrics}
     return metrics
@@ -169,6 +203,60 @@ def _score(
     return Masked(value=product * total / np.maximum(weights, 1.0), valid=has_ticks)
 
 
+def _continuous(
+    record: EpisodeRecord, uncomfortable: Masked, share_of_bound: Masked
+) -> dict[str, Masked]:
+    """The continuous measures, which do not depend on the rules.
+
+    Args:
+        record: the driven episodes.
+        uncomfortable: see `_comfort_over_ticks`.
+        share_of_bound: see `_comfort_over_ticks`.
+    """
+    active = record.active
+    count = active.sum(axis=1)
+    lost_s = time_lost_s(
+        record.route_m, count, record.log_route_m, record.scenario_ticks, record.dt_s
+    )
+    off_road = (record.off_road_m > NUPLAN.off_road_m) & active
+    cost_s = driving_cost_s(
+        time_lost_s=lost_s,
+        ttc_s=record.conflict_s,
+        uncomfortable=uncomfortable.value > 0,
+        fault=np.asarray((at_fault(record, NUPLAN) | off_road).any(axis=1)),
+        active=active,
+        dt_s=record.dt_s,
+        weights=DrivingCostWeights(),
+    )
+    near = record.near_miss & active
+    horizon_s = CONFLICT_TTC.horizon_s
+    min_ttc_s = np.where(active, record.conflict_s, horizon_s).min(axis=1, initial=horizon_s)
+    braking = np.where(active, record.required_mps2, 0.0).max(axis=1, initial=0.0)
+    values = {
+        "no near miss": 1.0 - near.any(axis=1),
+        "near misses": _mean_over_ticks(near, active),
+        "min TTC": min_ttc_s,
+        "required deceleration": braking,
+        "safety margin": np.minimum(0.5 * min_ttc_s / CONFLICT_TTC.min_ttc_s, 1.0),
+        "time lost": lost_s,
+        "driving cost": cost_s,
+    }
+    by_comfort = {
+        "uncomfortable ticks": _mean_over_ticks(uncomfortable.value, active),
+        "smoothness": np.asarray(np.clip(1.5 - share_of_bound.value, 0.0, 1.0)),
+    }
+    has_ticks = np.asarray(count > 0)
+    return {name: Masked(value=value, valid=has_ticks) for name, value in values.items()} | {
+        name: Masked(value=value, valid=share_of_bound.valid) for name, value in by_comfort.items()
+    }
+
+
+def _mean_over_ticks(
+    values: Bool[np.ndarray, "b t"] | Float[np.ndarray, "b t"], active: Bool[np.ndarray, "b t"]
+) -> Float[np.ndarray, " b"]:
+    return np.where(active, values, 0).sum(axis=1) / np.maximum(active.sum(axis=1), 1)
+
+
 def _progress(record: EpisodeRecord, rules: Rules) -> Float[np.ndarray, " b"]:
     last = np.maximum(record.active.sum(axis=1) - 1, 0)
     reached = record.route_m[np.arange(len(last)), last]
@@ -194,14 +282,22 @@ def _speed(record: EpisodeRecord) -> Masked:
     return Masked(value=value, valid=np.asarray(count > 0))
 
 
-def _comfort(record: EpisodeRecord) -> Masked:
+def _comfort_over_ticks(record: EpisodeRecord) -> tuple[Masked, Masked]:
+    """Ticks (b, t) beyond a comfort bound, 1 or 0, and the largest share (b,) of any bound.
+
+    Both are missing for short episodes, and the ticks after the end.
+    """
     ticks, needed = record.active.sum(axis=1), window_ticks(record.dt_s)
-    value = np.zeros(len(ticks))
-    for b, count in enumerate(ticks):
-        if count >= needed:
-            enough = np.ones((), dtype=bool)
-            value[b] = comfortable(record.states[b, :count], record.dt_s, enough).value
-    return Masked(value=value, valid=np.asarray(ticks >= needed))
+    beyond, share = np.zeros(record.active.shape), np.zeros(len(ticks))
+    for b in np.flatnonzero(ticks >= needed).tolist():
+        signals = comfort_signals(record.states[b, : ticks[b]], record.dt_s)
+        beyond[b, : ticks[b]] = ~within_bounds(signals)
+        share[b] = share_of_bounds(signals).max()
+    long_enough = np.asarray(ticks >= needed)
+    return (
+        Masked(value=beyond, valid=record.active & long_enough[:, None]),
+        Masked(value=share, valid=long_enough),
+    )
 
 
 def _feasible(record: EpisodeRecord) -> Masked:

@@ -125,7 +125,7 @@ def _write_ttc(states, valid, sizes, skipped, wide_sector, num_ticks, parameters
                     continue
                 x_o, y_o = states[b, k, a, 0], states[b, k, a, 1]
                 wide = wide_sector[b, k]
-                if not _counts(x, y, heading, length, x_o, y_o, parameters.sector, wide):
+                if not agent_counts(x, y, heading, length, x_o, y_o, parameters.sector, wide):
                     continue
                 overlap_s = _first_overlap_s(
                     episode_states, episode_valid, episode_sizes, k, a, last, parameters, out[b, k]
@@ -135,7 +135,7 @@ def _write_ttc(states, valid, sizes, skipped, wide_sector, num_ticks, parameters
 
 @njit(cache=True)
 @no_type_check
-def _counts(x, y, heading, length, x_o, y_o, sector, wide):
+def agent_counts(x, y, heading, length, x_o, y_o, sector, wide):
     """Whether an agent with its centre at (x_o, y_o) m counts for a vehicle (m, rad): `TtcRule`."""
     cos, sin = math.cos(heading), math.sin(heading)
     if not sector:

@@ -63,8 +63,12 @@ def test_on_synthetic_traffic(site: str, rules: Rules) -> None:
     assert metrics["speed"].min() > 0.95
     assert metrics["TTC"].mean() > 0.8
     assert metrics["comfort"].mean() > 0.9
+    assert metrics["near misses"].mean() < 0.005
+    assert metrics["required deceleration"].max() < 6
+    assert np.abs(metrics["time lost"]).max() == 0
+    assert metrics["driving cost"].max() < 10
     if rules.weights:
-        assert 0.9 < metrics["score"].mean() <= 1
+        assert 0.88 < metrics["score"].mean() <= 1
         assert metrics["on road"].tolist() == [1.0] * len(driven.rollouts)
     assert set(driven.endings.tolist()) == {int(Ending.GOAL)}
 
@@ -120,6 +124,8 @@ def test_on_a_real_map_with_gaps() -> None:
     assert metrics["no at-fault collision"].mean() > 0.97
     assert Ending.OFF_ROAD not in driven.endings
     assert metrics["log divergence"].max() == 0
+    assert metrics["near misses"].mean() < 0.005
+    assert np.median(np.abs(metrics["time lost"])) == 0
 
 
 def test_episodes_side_by_side_score_as_alone() -> None:

@@ -9,7 +9,16 @@ import pytest
 from asp_env.errors import AspEnvError
 from asp_env.geometry import from_frame
 from asp_env.metrics.boxes import Contact
-from asp_env.metrics.driving.rules import NUPLAN, PDMS, RULES, STRICT, WAYMAX, Rules, find_rules
+from asp_env.metrics.driving.rules import (
+    GRADED,
+    NUPLAN,
+    PDMS,
+    RULES,
+    STRICT,
+    WAYMAX,
+    Rules,
+    find_rules,
+)
 from asp_env.metrics.driving.scores import driving_metrics
 from tests.metrics.records import TICKS, at_tick, contact, joined, record, values
 
@@ -20,13 +29,19 @@ def test_good_episode(rules: Rules) -> None:
     perfect = {
         *("no collision", "no at-fault collision", "no hit from behind", "on road", "direction"),
         *("on mapped road", "right way", "making progress", "TTC", "speed", "comfort", "feasible"),
+        *("no near miss", "safety margin", "smoothness"),
     }
-    scores = {"nuplan": 15 / 16, "pdms": 11 / 12, "strict": 11 / 12}
+    absent = ("near misses", "required deceleration", "uncomfortable ticks")
+    scores = {"nuplan": 15 / 16, "pdms": 11 / 12, "strict": 11 / 12, "graded": 11 / 12}
     expected = dict.fromkeys(perfect, 1.0) | {
         **({"score": scores[rules.name]} if rules.name in scores else {}),
         "progress": 0.8,
         "log divergence": 0,
         "route deviation": 0,
+        **dict.fromkeys(absent, 0.0),
+        "min TTC": 3.0,
+        "time lost": 1.4,  # all seven ticks: the log starts 10 m ahead
+        "driving cost": 1.4,
     }
     assert values(record(), rules) == pytest.approx(expected)
     assert set(rules.shown) <= set(expected)
@@ -35,9 +50,11 @@ def test_good_episode(rules: Rules) -> None:
 def test_no_score_is_above_one() -> None:
     """A perfect episode that continues beyond the goal has the score 1, not 1.5 or 16/12."""
     beyond = record(route_m=at_tick(TICKS - 1, 80.0))
-    for rules in (NUPLAN, PDMS, STRICT):
-        assert values(beyond, rules)["score"] == pytest.approx(1.0)
-        assert all(0 <= value <= 1 for value in values(beyond, rules).values())
+    for rules in (NUPLAN, PDMS, STRICT, GRADED):
+        found = values(beyond, rules)
+        assert found["score"] == pytest.approx(1.0)
+        in_seconds = {"min TTC", "time lost"}
+        assert all(0 <= value <= 1 for name, value in found.items() if name not in in_seconds)
 
 
 @pytest.mark.parametrize(
@@ -305,7 +322,7 @@ def test_scores_do_not_depend_on_order_padding_and_pose(rules: Rules) -> None:
 def test_rules_have_labels_and_name_metrics_that_exist() -> None:
     known = set(driving_metrics(record(), NUPLAN))
     assert [rules.label for rules in RULES.values()] == [
-        *("nuplan 1", "pdms 1", "waymax 1", "strict 1")
+        *("nuplan 1", "pdms 1", "waymax 1", "strict 1", "graded 1")
     ]
     for rules in RULES.values():
         assert {*rules.multipliers, *rules.weights, *rules.shown} <= known

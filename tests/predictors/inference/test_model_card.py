@@ -22,7 +22,7 @@ PROVENANCE = {
     "config": {
         "preset": "cpu",
         "history": "causal",
-        "validation": "others",
+        "validation": ["others"],
         "learning_rate": 0.002,
         "threads": None,
     },

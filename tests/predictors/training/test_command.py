@@ -17,7 +17,7 @@ def data(tmp_path_factory: pytest.TempPathFactory) -> str:
 def command(predictor: str, data: str, out: Path, variant: str | None = None) -> Train:
     """The command for 6 s, one epoch of one batch."""
     return Train(
-        predictor=predictor, data=data, out=out, view="vectors", horizon=6.0, epochs=1,
+        predictor=predictor, data=(data,), out=out, view="vectors", horizon=6.0, epochs=1,
         max_snippets=8, variant=variant,
     )  # fmt: skip
 

@@ -1,6 +1,8 @@
 """Training data: choice and order of snippets, range of actions, batches."""
 
+import dataclasses
 import math
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -19,8 +21,10 @@ from predictors.training.data import (
     choose_snippets,
     epoch_rows,
     moving_snippets,
+    open_training_data,
 )
 from tests.builders import Drive, make_recording
+from tests.predictors.tiny import tiny_config, write_data
 
 EAST = Drive(kind=AgentClass.CAR, start=(-50.0, 2.0, 0.0, 10.0))
 WAITING = Drive(kind=AgentClass.CAR, start=(20.0, -2.0, 0.0, 0.0), appears_s=0.4)
@@ -176,3 +180,26 @@ def test_error_in_the_loading_thread_is_raised() -> None:
     index = index_snippets(recordings, dt_s=0.2, horizon_s=3.0, history_s=1.0)
     with pytest.raises(ValueError, match="needs 15 past ticks"):
         next(iter(Batches(recordings, index, view=SMALL, batch_size=4)))
+
+
+def test_several_data_are_split_each_on_its_own(tmp_path: Path) -> None:
+    """The parts of every recording are those of its own data set, though locations are equal."""
+    folders = [write_data(tmp_path / str(cars), cars=cars) for cars in (2, 4)]
+    config = tiny_config()
+    alone = [open_training_data(config, folder) for folder in folders]
+    both = open_training_data(config, folders)
+    expected = {**alone[0].trained_on.parts, **alone[1].trained_on.parts}
+    assert dict(both.trained_on.parts) == expected
+    assert sorted(expected.values()) == ["test"] * 2 + ["train"] * 2 + ["validation"] * 2
+    assert both.trained_on.source == ", ".join(folders)
+    for part in ("training", "validation"):
+        counts = [len(getattr(each, part).snippets) for each in (*alone, both)]
+        assert counts[0] + counts[1] == counts[2] > 0
+
+
+def test_several_validation_data(tmp_path: Path) -> None:
+    """All of DATA is trained on, and all of the validation data are validated on."""
+    first, second, third = (write_data(tmp_path / str(cars), cars=cars) for cars in (2, 3, 4))
+    config = dataclasses.replace(tiny_config(), validation=(second, third))
+    parts = open_training_data(config, first).trained_on.parts
+    assert sorted(parts.values()) == ["train"] * 3 + ["validation"] * 6

@@ -12,7 +12,7 @@ from asp_env import registry
 from asp_env.errors import CheckpointError
 from asp_env.views import make_view
 from predictors.inference.checkpoint import PredictorSpec
-from predictors.training.pretrained import PretrainedWeights
+from predictors.training.initial_weights import InitialWeights
 from tests.predictors.tiny import (
     PIXELS,
     RANGE,
@@ -31,10 +31,10 @@ def spec_of(predictor: str) -> PredictorSpec:
 
 def read(
     run: Path, predictor: str, view: str = "chauffeurnet", dt_s: float = 0.2
-) -> PretrainedWeights:
+) -> InitialWeights:
     """The weights for a run of a predictor on a view."""
     drawn = make_view(view, pixels=pixels_of(view))
-    return PretrainedWeights.read(run, spec_of(predictor), view=drawn, dt_s=dt_s)
+    return InitialWeights.read(run, spec_of(predictor), view=drawn, dt_s=dt_s)
 
 
 NOT_LOADED: dict[str, set[str]] = {
@@ -139,4 +139,4 @@ def test_rasters_of_another_size_are_another_view(tmp_path: Path) -> None:
     run = save_random(tmp_path / "run", "dkm")
     drawn = make_view("chauffeurnet", pixels=(2 * PIXELS[0], 2 * PIXELS[1]))
     with pytest.raises(CheckpointError, match="another view"):
-        PretrainedWeights.read(run, spec_of("dkm"), view=drawn, dt_s=0.2)
+        InitialWeights.read(run, spec_of("dkm"), view=drawn, dt_s=0.2)

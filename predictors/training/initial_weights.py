@@ -16,7 +16,7 @@ from predictors.models.network import AbstractNetwork
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class PretrainedWeights:
+class InitialWeights:
     """The weights of a finished run of the same predictor, or of a ResNet18."""
 
     path: Path
@@ -31,7 +31,7 @@ class PretrainedWeights:
     @classmethod
     def read(
         cls, path: Path, spec: PredictorSpec, *, view: SceneView, dt_s: float
-    ) -> "PretrainedWeights":
+    ) -> "InitialWeights":
         """Reads the folder of a run; a file is taken for ResNet18 weights.
 
         Args:
@@ -97,7 +97,7 @@ class PretrainedWeights:
             load_resnet18(network, self.path)
             return []
         own = network.state_dict()
-        # A second encoder that the pretrained run had not starts as a copy of the first.
+        # A second encoder that the earlier run had not starts as a copy of the first.
         copies = {f"target_{name}": value for name, value in self.weights.items()}
         weights = copies | self.weights
         fitting = {
