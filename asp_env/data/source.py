@@ -119,7 +119,7 @@ def open_data(data: str | Path) -> Recordings:
         DataError: the folder does not exist, or has no recordings.
     """
     source = str(data)
-    folder = _resolve(source)
+    folder = source_folder(source)
     if not folder.is_dir():
         what = "is a file" if folder.exists() else "does not exist"
         raise DataError(f"data {source!r}: {folder} {what}; expected a folder with recordings")
@@ -180,7 +180,15 @@ def scheme_of(source: str) -> str | None:
     return None if match is None or Path(source).exists() else match.group(1)
 
 
-def _resolve(source: str) -> Path:
+def source_folder(source: str) -> Path:
+    """The folder that a source stands for; one of a registered source may be made first.
+
+    Args:
+        source: the data as the user named them. A folder need not exist.
+
+    Raises:
+        AspEnvError: the source is unknown.
+    """
     scheme = scheme_of(source)
     if scheme is None:
         path = Path(source).expanduser().absolute()

@@ -16,7 +16,7 @@ from asp_env.data.scenarios import choose_scenarios, save_scenarios
 from asp_env.data.snippets import HISTORY_S
 from asp_env.data.source import open_data
 from asp_env.errors import unknown_name
-from scenarios.suites.suite import MADE, SUITES, Suite, make_suite
+from scenarios.suites.suite import MADE, SUITES, make_suite
 
 FILTER = "interactive"
 """The scenarios of a suite; the tag depends on the recording alone."""
@@ -47,27 +47,26 @@ class Freeze:
         for name in self.names:
             if name not in SUITES:
                 raise unknown_name("suite", name, SUITES)
-            freeze(SUITES[name], self.out)
+            with tempfile.TemporaryDirectory() as scratch:
+                folder = Path(scratch) / name
+                folder.mkdir()
+                make_suite(SUITES[name], folder)
+                freeze(folder, self.out / f"{name}.json")
 
 
-def freeze(suite: Suite, out: Path) -> None:
-    """Makes the traffic of a suite and writes its list of scenarios to `out/NAME.json`.
+def freeze(folder: Path, path: Path) -> None:
+    """Writes the list of scenarios of a suite.
 
     Args:
-        suite: the suite.
-        out: an existing folder.
+        folder: the traffic, made by `make_suite`.
+        path: the file to write.
     """
-    with tempfile.TemporaryDirectory() as scratch:
-        folder = Path(scratch) / suite.name
-        folder.mkdir()
-        make_suite(suite, folder)
-        recordings = open_data(folder)
-        ticks = round(HISTORY_S / DEFAULT_DT_S)
-        found = choose_scenarios(recordings, FILTER, dt_s=DEFAULT_DT_S, history=ticks)
-        path = out / f"{suite.name}.json"
-        save_scenarios(path, found.evenly_spaced(MOST_SCENARIOS), recordings)
-        facts = json.dumps({"suite": json.loads((folder / MADE).read_text())})
-        path.write_text(facts[:-1] + ", " + path.read_text()[1:])
+    recordings = open_data(folder)
+    history = round(HISTORY_S / DEFAULT_DT_S)
+    found = choose_scenarios(recordings, FILTER, dt_s=DEFAULT_DT_S, history=history)
+    save_scenarios(path, found.evenly_spaced(MOST_SCENARIOS), recordings)
+    facts = json.dumps({"suite": json.loads((folder / MADE).read_text())})
+    path.write_text(facts[:-1] + ", " + path.read_text()[1:])
 
 
 if __name__ == "__main__":
