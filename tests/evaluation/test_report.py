@@ -15,6 +15,7 @@ from selenium.webdriver.support.ui import WebDriverWait
 from asp_env.errors import AspEnvError, DataError, MissingExtraError
 from asp_env.evaluation.report import ForecastExamples, metric_note, write_report
 from asp_env.evaluation.report.payload import MapTable, examples_payload
+from asp_env.evaluation.report.results import COLUMNS
 from asp_env.metrics.driving.rules import PDMS
 from asp_env.metrics.driving.scores import driving_metrics
 from tests.builders import make_recording
@@ -296,3 +297,59 @@ def test_the_report_works_in_a_browser(report: Path, browser: webdriver.Chrome) 
     urls = requests(browser)
     assert report.as_uri() in urls
     assert [url for url in urls if url.startswith(("http", "ws"))] == []
+
+
+def comparison(predictor: str, metric: str, value: float, **cells: object) -> dict[str, object]:
+    """A row of a comparison, like those of `drive`."""
+    common = {"data": "d", "planner": "sampling", "predictor": predictor, "subset": "all", "n": 480}
+    return {**dict.fromkeys(COLUMNS, ""), **common, "metric": metric, "value": value, **cells}
+
+
+def test_comparisons_come_first_with_verdicts(tmp_path: Path) -> None:
+    """Of a gain of 1.1 % with an MDE of 2.47 %, 480 (2.47 / 1.1)² = 2420.2 scenarios are needed."""
+    gain, pattern = "score - constant-velocity", "ffw-asp:runs/*"
+    rows = [
+        comparison(pattern, gain, 0.011, low=-0.002, high=0.021, mde=0.0247, p_holm=0.2, runs=3),
+        comparison(pattern, "oracle share", 0.4, low=0.25, high=0.55, runs=3),
+        comparison(pattern, "headroom", 0.35, low=0.2, high=0.5, runs=3),
+        comparison(pattern, "TTC - constant-velocity", 0.02, low=-0.01, high=0.05, runs=3),
+        comparison("oracle", gain, 0.046, low=0.023, high=0.061, mde=0.028, p_holm=1e-5, runs=1),
+        comparison("mtp:a", gain, 0.0, low=0.0, high=0.0, mde=0.0, p_holm=1.0, runs=1),
+        comparison("mtp:a", "headroom", float("nan"), runs=1),
+    ]
+    rows = [row for row in metric_rows() if row["planner"]] + rows
+    write_tables(tmp_path, rows)
+    page = write_report(tmp_path, title="x").read_text()
+    driving = page.partition('<section id="driving">')[2].partition("</section>")[0]
+    assert driving.index("score less constant-velocity") < driving.index("<th></th>")
+    header, *table = rows_of(driving, "score less constant-velocity")
+    assert header[1:] == ["Difference", "MDE", "p", "Verdict", "Oracle share", "Headroom"]
+    assert table == [
+        ["sampling + oracle", "4.6", "2.8", "&lt; 0.001", "resolved", "&ndash;", "&ndash;"],
+        ["sampling + ffw-asp", "1.1", "2.5", "0.200", "not resolved", "40.0", "35.0"],
+        ["sampling + mtp", "0.0", "0.0", "1.000", "equal", "&ndash;", "not resolved"],
+    ]
+    assert "n ≈ 2,500 needed" in driving
+    assert "mean of 3 runs" in driving
+    assert rows_of(driving, "less constant-velocity")[2] == ["sampling + ffw-asp", "2.0"]
+    sentences = re.findall(r'<p class="sentence">(.*?)</p>', driving)
+    assert sentences == [
+        "sampling + ffw-asp · runs/* · mean of 3 runs drives like a 40 % oracle [25, 55]: "
+        "score +1.1 % [-0.2, 2.1] against constant-velocity, not resolved (n ≈ 2,500 needed).",
+        "sampling + mtp · a: score +0.0 % [0.0, 0.0] against constant-velocity, equal.",
+    ]
+    headings = rows_of(driving, "")[0]
+    assert not {"Oracle share", "Headroom", "Score - CV"} & set(headings)
+
+
+def test_run_folders_without_the_columns_of_comparisons_still_load(tmp_path: Path) -> None:
+    """Folders of before lack `runs`, `mde` and `p_holm`; their differences have no verdict."""
+    write_tables(tmp_path, [comparison("mtp:a", "score - constant-velocity", 0.1, low=0, high=0.2)])
+    lines = (tmp_path / "metrics.csv").read_text().splitlines()
+    assert lines[0].endswith(",rules,runs,mde,p_holm")
+    old = [lines[0].removesuffix(",runs,mde,p_holm"), *(line[:-3] for line in lines[1:])]
+    (tmp_path / "metrics.csv").write_text("\n".join(old) + "\n")
+    page = write_report(tmp_path, title="x").read_text()
+    assert rows_of(page, "score less constant-velocity")[1][:3] == [
+        "sampling + mtp", "10.0", "&ndash;",
+    ]  # fmt: skip

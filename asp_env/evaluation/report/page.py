@@ -31,6 +31,7 @@ from asp_env.evaluation.report.tables import (
     comparison_figures,
     result_figures,
 )
+from asp_env.evaluation.results import SCORE, difference_of
 from asp_env.evaluation.selection import split_name
 from asp_env.files import atomic_file
 
@@ -161,7 +162,10 @@ def _sections(context: Mapping[str, Any]) -> dict[str, str]:
         "forecasts": ("Forecast errors", context["forecast_figures"]),
         "breakdown": ("Forecast errors by kind of target", context["breakdown_figures"]),
         "examples": ("Example forecasts", data["pictures"]),
-        "driving": ("Closed-loop driving", context["driving_figures"]),
+        "driving": (
+            "Closed-loop driving",
+            [*context["comparison_figures"], *context["driving_figures"]],
+        ),
         "rollouts": ("Rollouts", data["drives"]),
         "metrics": ("Metrics", context["notes"]),
         "manifest": ("Manifest", True),
@@ -260,5 +264,11 @@ def _card(heading: str, winner: Result, comparison: str) -> Card:
 
 
 def _notes(results: Results) -> list[MetricNote]:
+    """Notes of all metrics; of the differences, only those of the score are explained."""
     names = distinct(result.metric for result in (*results.open_loop, *results.driving))
-    return [metric_note(name) for name in names if metric_note(name).text]
+    differences = {name: difference_of(name) for name in names}
+    return [
+        metric_note(name)
+        for name, pair in differences.items()
+        if metric_note(name).text and (pair is None or pair[0] == SCORE)
+    ]
