@@ -151,8 +151,7 @@ class Blend(_RecordedFuture):
         straight = constant_velocity(scene, steps=self.horizon).astype(np.float64)
         straight = np.where(oracle.valid[:, None, None], straight, 0)
         states = between_states(straight, oracle.states[:, 0].astype(np.float64), self.share)
-        states[..., 2] = wrap_angle(states[..., 2])
-        return with_inferred_actions(scene, states.astype(np.float32), oracle.valid)
+        return with_inferred_actions(scene, _wrapped(states), oracle.valid)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -218,9 +217,9 @@ class NoisyOracle(_RecordedFuture):
         factor = (1 + size / math.sqrt(2) * (z[:, 0] + 1j * z[:, 1]))[:, None]
         moved = ahead * factor
         states[..., 0], states[..., 1] = now[..., 0] + moved.real, now[..., 1] + moved.imag
-        states[..., 2] = wrap_angle(states[..., 2] + np.angle(factor))
+        states[..., 2] += np.angle(factor)
         states[..., 3] *= np.abs(factor)
-        return with_inferred_actions(scene, states.astype(np.float32), oracle.valid)
+        return with_inferred_actions(scene, _wrapped(states), oracle.valid)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -263,11 +262,11 @@ class ShuffledOracle(_RecordedFuture):
         motion = states_to_frame(oracle.states[other, 0].astype(np.float64), now[other])
         states = motion.copy()
         states[..., :2] = from_frame(motion[..., :2], now)
-        states[..., 2] = wrap_angle(motion[..., 2] + now[..., 2])
+        states[..., 2] += now[..., 2]
         alone = (other == np.arange(len(other)))[:, None, None]
         states = np.where(alone, constant_velocity(scene, steps=self.horizon), states)
         states = np.where(oracle.valid[:, None, None], states, 0)
-        return with_inferred_actions(scene, states.astype(np.float32), oracle.valid)
+        return with_inferred_actions(scene, _wrapped(states), oracle.valid)
 
 
 def persistent_noise(
@@ -334,6 +333,13 @@ def _next_in_circle(
     other = np.arange(len(ids))
     other[order] = order[following]
     return other
+
+
+def _wrapped(states: Float[np.ndarray, "t steps 4"]) -> Float[np.ndarray, "t steps 4"]:
+    """The states as 32-bit numbers, with headings in [-π, π)."""
+    rounded = states.astype(np.float32)  # first, since ±π rounds to the other side
+    rounded[..., 2] = wrap_angle(rounded[..., 2])
+    return rounded
 
 
 def _number(argument: str) -> float:

@@ -14,10 +14,11 @@ from rich.console import Console
 from asp_env import registry
 from asp_env.errors import AspEnvError
 from asp_env.evaluation.closed_loop.drive import Drive, drive, save_rollouts
+from asp_env.evaluation.closed_loop.scenario_table import write_scenario_table
 from asp_env.evaluation.open_loop.evaluate import Evaluate, evaluate
 from asp_env.evaluation.report import check_report_possible, write_report
 from asp_env.evaluation.results import write_manifest, write_metrics
-from asp_env.evaluation.tables import driving_table, open_loop_tables
+from asp_env.evaluation.tables import driving_tables, open_loop_tables
 from asp_env.files import atomic_folder
 from asp_env.metrics.driving.rules import DEFAULT_RULES, RULES
 
@@ -106,6 +107,7 @@ class Demo:
                 open_loop=open_loop.manifest,
                 closed_loop=closed_loop.manifest,
             )
+            write_scenario_table(folder, closed_loop.scenarios, closed_loop.methods)
             save_rollouts(folder, closed_loop)
             write_report(
                 folder,
@@ -116,7 +118,7 @@ class Demo:
             )
         tables = open_loop_tables(open_loop.rows, open_privileged)
         shown = RULES[DEFAULT_RULES].shown
-        for table in (*tables, driving_table(closed_loop.rows, closed_privileged, shown)):
+        for table in (*tables, *driving_tables(closed_loop.rows, closed_privileged, shown)):
             console.print(table)
         console.print(f"wrote {self.out / 'report.html'}")
 

@@ -86,16 +86,30 @@ class RegretScores:
     recording: Int[np.ndarray, " n"]
     """Index of each state's recording, over which intervals are resampled."""
 
-    def estimates(self, name: str) -> Iterator[tuple[str, str, Estimate]]:
-        """Subset, metric and estimate of a predictor's metrics."""
+    def estimates(self, *runs: str, stream: int = 0) -> Iterator[tuple[str, str, Estimate]]:
+        """Subset, metric and estimate of the metrics of a method.
+
+        Args:
+            *runs: names of the method's training runs, or the name of one predictor.
+            stream: number of the sequence of random numbers that resamples runs.
+        """
         for subset, member in self.subsets.items():
-            regret, groups = self.regrets[name][member], self.recording[member]
-            yield subset, REGRET, statistics.mean(regret, groups)
-            yield subset, LOG_REGRET, statistics.mean(np.log1p(regret), groups)
+            regret, groups = (
+                np.stack([self.regrets[run] for run in runs])[:, member],
+                self.recording[member],
+            )
+            ones = np.ones(len(groups))
+            for metric, values in ((REGRET, regret), (LOG_REGRET, np.log1p(regret))):
+                yield (
+                    subset,
+                    metric,
+                    statistics.ratio_over_runs(values, ones, groups, stream=stream),
+                )
             reference = self.regrets[REFERENCE][member]
-            if name != REFERENCE and reference.any():
-                parts = np.stack([regret, reference], axis=-1)
-                removed = statistics.from_sums(parts, groups, lambda s: 1 - s[..., 0] / s[..., 1])
+            if runs != (REFERENCE,) and reference.any():
+                removed = statistics.ratio_over_runs(
+                    reference - regret, reference, groups, stream=stream
+                )
                 yield subset, REMOVED, removed
 
 

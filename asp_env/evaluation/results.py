@@ -14,6 +14,29 @@ from asp_env.files import atomic_file
 PACKAGES = ("asp-env", "numpy", "numba", "torch", "gymnasium", "eclipse-sumo")
 """Packages whose versions the manifest states, as far as they are installed."""
 
+SCORE = "score"
+"""Metric: the score of the driving rules."""
+
+ORACLE_SHARE = "oracle share"
+"""Metric: position of a method's score on the ladder from constant velocity (0) to the oracle (1),
+see `asp_env.evaluation.ladder`."""
+
+HEADROOM = "headroom"
+"""Metric: gain of a method's score over constant velocity as a share of the oracle's gain."""
+
+_DIFFERENCE = " - "
+
+
+def difference_name(metric: str, reference: str) -> str:
+    """Name of the difference of a metric to that of a reference, paired by scenario."""
+    return f"{metric}{_DIFFERENCE}{reference}"
+
+
+def difference_of(metric: str) -> tuple[str, str] | None:
+    """The metric and the reference of a difference, None if the name is not that of one."""
+    name, separator, reference = metric.partition(_DIFFERENCE)
+    return (name, reference) if separator else None
+
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Row:
@@ -52,9 +75,15 @@ class Row:
     high: float | None = None
     """Upper bound of the 95 % interval."""
     n: int
-    """Number of snippets or episodes."""
+    """Number of snippets or scenarios."""
     rules: str = ""
     """Driving rules and their version, such as `nuplan 1`; empty in open loop."""
+    runs: int | None = None
+    """Number of training runs that are averaged; 1 for a predictor without training."""
+    mde: float | None = None
+    """Minimal detectable effect of a difference, in the unit of the metric."""
+    p_holm: float | None = None
+    """Two-sided p value of a difference, adjusted by Holm's method over all methods."""
 
 
 def write_metrics(folder: Path, rows: Sequence[Row]) -> None:

@@ -1,8 +1,10 @@
 """Which predictors are evaluated, and which part of DATA they are evaluated on."""
 
+import glob
+import re
 from collections import Counter
 from collections.abc import Callable, Sequence
-from pathlib import PurePath
+from pathlib import Path, PurePath
 from typing import Literal
 
 import numpy as np
@@ -23,6 +25,53 @@ from asp_env.errors import AspEnvError
 PartChoice = Literal["auto", "train", "validation", "test", "all"]
 
 
+def expand_runs(names: Sequence[str]) -> dict[str, tuple[str, ...]]:
+    """The training runs that each name stands for.
+
+    A name such as `ffw-asp:runs/*` is one method of several runs: all folders that match the
+    pattern behind the last colon before it, sorted by path. `*`, `?` and `[…]` match within one
+    level of folders. A pattern that is itself a path is no pattern, and an option behind `@`, as in
+    `ssp-asp:runs/*@beam`, applies to every run.
+
+    Args:
+        names: registered names, with `:RUN` for a trained predictor.
+
+    Returns:
+        The names of the runs by name as given, in the order of `names`; a name without a pattern
+        stands for itself.
+
+    Raises:
+        AspEnvError: a name is given twice, no folder matches, or a pattern contains `**`.
+    """
+    for name, count in Counter(names).items():
+        if count > 1:
+            raise _named_repeatedly(name, count)
+    return {name: _matching_runs(name) for name in names}
+
+
+def _matching_runs(name: str) -> tuple[str, ...]:
+    wildcard = min((name.find(c) for c in "*?[" if c in name), default=-1)
+    if wildcard < 0:
+        return (name,)
+    start = name.rfind(":", 0, wildcard) + 1
+    pattern, at, option = name[start:].partition("@")
+    if not start or Path(pattern).exists():
+        return (name,)
+    if "**" in pattern:
+        raise AspEnvError(f"{name}: ** is not supported; use one * for each level of folders")
+    folders = sorted(path for path in glob.glob(pattern) if Path(path).is_dir())
+    if not folders:
+        raise AspEnvError(
+            f"{name}: no folder matches {pattern}; give the folders of finished runs, with the "
+            "pattern in quotes"
+        )
+    return tuple(f"{name[:start]}{folder}{at}{option}" for folder in folders)
+
+
+def _named_repeatedly(name: str, count: int) -> AspEnvError:
+    return AspEnvError(f"--predictors: {name} is named {count} times; name it once")
+
+
 def load_predictors(names: Sequence[str], *, horizon: int, dt_s: float) -> list[Predictor]:
     """Loads predictors by name.
 
@@ -39,7 +88,7 @@ def load_predictors(names: Sequence[str], *, horizon: int, dt_s: float) -> list[
         raise AspEnvError("--predictors: none given; expected at least one, such as oracle")
     name, count = Counter(names).most_common(1)[0]
     if count > 1:
-        raise AspEnvError(f"--predictors: {name} is named {count} times; name it once")
+        raise _named_repeatedly(name, count)
     predictors = [load_predictor(name, horizon=horizon, dt_s=dt_s) for name in names]
     for name, predictor in zip(names, predictors, strict=True):
         if predictor.horizon < horizon:
@@ -50,23 +99,49 @@ def load_predictors(names: Sequence[str], *, horizon: int, dt_s: float) -> list[
     return predictors
 
 
+def shared_metadata(predictors: Sequence[Predictor], key: str) -> str:
+    """An entry of the metadata of the runs of a method; different entries are joined by ` | `.
+
+    Args:
+        predictors: the predictor of each run.
+        key: key of `Predictor.metadata`.
+    """
+    return " | ".join(dict.fromkeys(each.metadata.get(key, "") for each in predictors))
+
+
 def short_names(names: Sequence[str]) -> dict[str, str]:
     """The shortest distinct labels of predictors, by their full names.
 
-    A label is the name without its run folder (`mtp`). Where that is ambiguous, the last part of
-    the folder is added (`mtp 1`), and where that is ambiguous too, the whole path (`mtp a-1`).
+    A label is the name without its run folder (`mtp`), as `split_name` cuts it off. Where that is
+    ambiguous, the last part of the folder is added (`mtp 1`), and where that is ambiguous too, the
+    whole path (`mtp a-1`).
     """
-    labels = {name: name.partition(":")[0] for name in names}
-    labels = _lengthen(labels, lambda name: PurePath(name.partition(":")[2]).name)
-    return _lengthen(labels, lambda name: name.partition(":")[2].strip("/").replace("/", "-"))
+    labels = {name: split_name(name)[0] for name in names}
+    labels = _lengthen(labels, lambda run: PurePath(run).name)
+    return _lengthen(labels, lambda run: run.strip("/").replace("/", "-"))
+
+
+def split_name(name: str) -> tuple[str, str]:
+    """The label of a predictor and its run folder, which is empty for a predictor without one.
+
+    Numbers in the name belong to the label: `noisy-oracle:2` is `noisy-oracle 2`, and
+    `delayed:2:mtp:runs/1` is `delayed 2 mtp` with the folder `runs/1`.
+    """
+    kind, _, argument = name.partition(":")
+    number, _, inner = argument.partition(":")
+    if not re.fullmatch(r"[0-9.]+", number):
+        return kind, argument
+    label, run = split_name(inner)
+    return f"{kind} {number} {label}".strip(), run
 
 
 def _lengthen(labels: dict[str, str], suffix: Callable[[str], str]) -> dict[str, str]:
     counts = Counter(labels.values())
-    return {
-        name: f"{name.partition(':')[0]} {suffix(name)}".strip() if counts[label] > 1 else label
-        for name, label in labels.items()
-    }
+    lengthened = {}
+    for name, label in labels.items():
+        short, run = split_name(name)
+        lengthened[name] = f"{short} {suffix(run)}".strip() if counts[label] > 1 else label
+    return lengthened
 
 
 def ticks_to_evaluate(

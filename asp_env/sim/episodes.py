@@ -18,6 +18,7 @@ from numba import njit
 from asp_env.data.recording import Recording, frames_per_tick
 from asp_env.data.scenarios.scenario import Scenario
 from asp_env.data.scene import EGO
+from asp_env.data.snippets import HISTORY_S
 from asp_env.errors import AspEnvError
 from asp_env.geometry import route_along, route_coordinates
 from asp_env.metrics.boxes import ego_contacts, touching_trailers
@@ -173,6 +174,9 @@ def initialize(
 ) -> EpisodeInit:
     """Looks up what an episode starts from: all agents seen in the scenario or its history.
 
+    The ego must be present in the scenario and throughout the history, of which only the last 3 s
+    count, so that a longer history suits the same scenarios.
+
     Args:
         recording: the scenario's recording.
         scenario: where and when the episode starts, and which track is the ego.
@@ -190,14 +194,15 @@ def initialize(
         )
     ego = int(matches[0])
     first_tick = scenario.start_tick - history
+    needed_tick = scenario.start_tick - min(history, round(HISTORY_S / dt_s))
     last_tick = scenario.start_tick + scenario.length
     if (
         scenario.length < 1
-        or first_tick * stride < recording.first_frames[ego]
+        or needed_tick * stride < recording.first_frames[ego]
         or last_tick * stride > recording.last_frames[ego]
     ):
         raise AspEnvError(
-            f"scenario {scenario.name}: ticks {first_tick} to {last_tick} are needed, the "
+            f"scenario {scenario.name}: ticks {needed_tick} to {last_tick} are needed, the "
             f"track of the ego spans {-(-int(recording.first_frames[ego]) // stride)} to "
             f"{int(recording.last_frames[ego]) // stride}"
         )

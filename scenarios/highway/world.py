@@ -135,7 +135,8 @@ class HighwayWorld(World):
         """Writes the exact history; the recording is rounded, and may be noisy."""
         run, slots, states = self._runs[b], self._slots[b], self.episodes.states[b]
         assert run is not None
-        for back in range(self.history + 1):
+        recorded = min(self.history, run.frame // self._stride)
+        for back in range(recorded + 1):
             rows, _ = run.history.at(run.frame - back * self._stride)
             at = [slots[track] for track in rows["track"].tolist()]
             states[self.history - back, at] = _states_of(rows)

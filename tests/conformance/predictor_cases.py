@@ -2,9 +2,10 @@
 
 All registered predictors are tested. Trained ones have random weights and read rasters or vectors;
 those that chain segments are tested with every chaining at 6 s. The recipes `ours` are tested on
-vectors.
+vectors. A predictor with an argument is tested with each of `ARGUMENTS`.
 """
 
+import re
 from functools import cache
 from pathlib import Path
 from typing import NamedTuple
@@ -30,6 +31,13 @@ from tests.predictors.tiny import save_random
 
 VIEWS = ("chauffeurnet", "vectors")
 SEGMENT = 15
+HISTORY = 15
+ARGUMENTS = {
+    "blend": ("0.25",),
+    "noisy-oracle": ("2",),
+    "delayed": ("2:constant-turn-rate", "3:oracle", "1:delayed:1:blend:0.5"),
+}
+"""Arguments of the predictors that need one."""
 RECORDING = make_recording()
 
 
@@ -61,15 +69,22 @@ class Case(NamedTuple):
         run = folder / self.label
         if not run.exists():
             preset = self.preset or "cpu"
-            save_random(run, self.name, self.view, horizon=self.horizon, seed=seed, preset=preset)
+            kind = self.name.rpartition(":")[2]
+            save_random(run, kind, self.view, horizon=self.horizon, seed=seed, preset=preset)
         return f"{self.name}:{run}" + (f"@{self.chaining}" if self.chaining else "")
 
 
-PHYSICAL = tuple(Case(name) for name in registry.names("predictors") if name not in RECIPES)
+PHYSICAL = tuple(
+    Case(":".join(part for part in (name, argument) if part))
+    for name in registry.names("predictors")
+    if name not in RECIPES
+    for argument in ARGUMENTS.get(name, ("",))
+)
 ONE_SEGMENT = tuple(Case(name, view) for name in RECIPES for view in VIEWS)
 CHAINED = tuple(Case("ssp-asp", "vectors", chaining) for chaining in CHAININGS)
 OURS = tuple(Case(name, "vectors", preset="ours") for name, of in RECIPES.items() if "ours" in of)
 OURS_CHAINED = tuple(Case("ssp-asp", "vectors", chaining, "ours") for chaining in CHAININGS)
+DELAYED = tuple(Case(f"delayed:2:{name}", "vectors") for name in ("ffw-asp", "mtp"))
 TRAINED = ONE_SEGMENT + CHAINED + OURS + OURS_CHAINED
 
 
@@ -79,18 +94,34 @@ def with_predictors(cases: tuple[Case, ...]) -> pytest.MarkDecorator:
     return pytest.mark.parametrize("predictor", cases, ids=labels, indirect=True)
 
 
-every = with_predictors(PHYSICAL + TRAINED)
+every = with_predictors(PHYSICAL + TRAINED + DELAYED)
 
 
 @cache
-def snippets(horizon: int) -> SnippetIndex:
-    """All snippets with a future of this many ticks."""
-    return index_snippets([RECORDING], dt_s=0.2, horizon_s=horizon * 0.2)
+def snippets(horizon: int, history: int = HISTORY) -> SnippetIndex:
+    """All snippets with a history and a future of this many ticks."""
+    return index_snippets([RECORDING], dt_s=0.2, horizon_s=horizon * 0.2, history_s=history * 0.2)
+
+
+def snippets_for(predictor: Predictor) -> SnippetIndex:
+    """All snippets with the predictor's horizon and at least its history."""
+    return snippets(predictor.horizon, max(HISTORY, predictor.history))
+
+
+def forecasts_all_classes(predictor: Predictor) -> bool:
+    """Whether it also forecasts agents that trained predictors do not, such as pedestrians."""
+    kind = re.sub(r"delayed:\d+:", "", predictor.name).partition(":")[0]
+    return kind in ("oracle", "blind", "blend", "noisy-oracle", "shuffled-oracle")
+
+
+def has_inferred_actions(predictor: Predictor) -> bool:
+    """Whether its actions are inferred from recorded states, so that they may exceed the limits."""
+    return predictor.privileged and predictor.trained_on is None
 
 
 def situations(predictor: Predictor, recording: Recording = RECORDING) -> tuple[Scene, Future]:
     """Scene and future of all snippets with the predictor's horizon."""
-    index = snippets(predictor.horizon)
+    index = snippets_for(predictor)
     return gather_scene([recording], index), gather_future([recording], index)
 
 

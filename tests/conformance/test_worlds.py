@@ -74,6 +74,27 @@ def test_episodes_side_by_side_equal_episodes_alone(case, traffic):
     assert (over.elapsed == over.length).sum() == 2
 
 
+@every_world
+def test_a_longer_history_adds_earlier_ticks_only(case):
+    """The last 15 ticks equal those of a world that shows 15; some others precede the recording."""
+    scenarios = case.scenarios()
+    longer = min(each.start_tick for each in scenarios) + 5
+    actions = np.stack([_actions(b) for b in range(len(scenarios))])
+    scenes = []
+    for history in (HISTORY, longer):
+        simulation = case.simulate(scenarios, history=history)
+        for k in range(4):
+            _step(simulation, actions[:, k])
+        scenes.append(simulation.world.scene())
+    short, long = scenes
+    np.testing.assert_array_equal(short.tick, long.tick)
+    for b, slot in np.argwhere(short.ids >= 0):
+        (at,) = np.flatnonzero(long.ids[b] == short.ids[b, slot])
+        for name in ("states", "valid", "actions"):
+            later = getattr(long, name)[b, at, longer - HISTORY :]
+            np.testing.assert_array_equal(later, getattr(short, name)[b, slot], name)
+
+
 @every_traffic
 def test_a_reset_touches_only_the_chosen_rows(case, traffic):
     """Row 1 restarts with more agents and a longer scenario; rows 0 and 2 do not change."""

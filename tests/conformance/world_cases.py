@@ -38,11 +38,14 @@ class WorldCase:
     """Ticks after which two of the four episodes are over."""
 
     def simulate(
-        self, scenarios: Sequence[Scenario] | Scenario, traffic: str | None = None
+        self,
+        scenarios: Sequence[Scenario] | Scenario,
+        traffic: str | None = None,
+        history: int = HISTORY,
     ) -> Simulation:
         """Episodes that have just started, by default with all agents left to the world."""
         name = self.traffics[0] if traffic is None else traffic
-        return simulate(self.recordings(), scenarios, name, self.world_class())
+        return simulate(self.recordings(), scenarios, name, self.world_class(), history)
 
 
 @cache

@@ -7,7 +7,7 @@ from asp_env.evaluation.results import Row, write_manifest, write_metrics
 
 COLUMNS = (
     "data,predictor,trained_on,view,recipe,chaining,planner,traffic,latency_ticks,horizon_s,"
-    "selection,subset,metric,value,low,high,n,rules"
+    "selection,subset,metric,value,low,high,n,rules,runs,mde,p_holm"
 )
 
 
@@ -27,14 +27,17 @@ def test_columns_of_the_metrics(tmp_path):
             high=0.75,
             n=2,
             rules="nuplan 1",
+            runs=3,
+            mde=0.28,
+            p_holm=0.01,
         ),
     ]
     write_metrics(tmp_path, rows)
     lines = (tmp_path / "metrics.csv").read_text().splitlines()
     assert lines == [
         COLUMNS,
-        '"x,y",oracle,,,,,,,,3,,all,FDE,0.333333,,,7,',
-        "d,,,,,,idm,log,0,,,left,score,0.5,0.25,0.75,2,nuplan 1",
+        '"x,y",oracle,,,,,,,,3,,all,FDE,0.333333,,,7,,,,',
+        "d,,,,,,idm,log,0,,,left,score,0.5,0.25,0.75,2,nuplan 1,3,0.28,0.01",
     ]
     with (tmp_path / "metrics.csv").open(newline="") as file:
         assert [row["n"] for row in csv.DictReader(file)] == ["7", "2"]

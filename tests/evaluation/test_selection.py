@@ -9,7 +9,12 @@ from asp_env.data.snippets import index_snippets
 from asp_env.data.source import Recordings
 from asp_env.data.split import TrainedOn, num_ticks, part_of_ticks
 from asp_env.errors import AspEnvError
-from asp_env.evaluation.selection import PartChoice, snippets_within, ticks_to_evaluate
+from asp_env.evaluation.selection import (
+    PartChoice,
+    expand_runs,
+    snippets_within,
+    ticks_to_evaluate,
+)
 from predictors.physical import ConstantVelocity
 
 _NAMED: tuple[PartChoice, ...] = ("train", "validation", "test")
@@ -120,3 +125,55 @@ def test_a_part_of_a_split_by_blocks_consists_of_blocks(recordings):
     allowed, _ = _ticks(recordings, predictor, part="test")
     for ticks in allowed:
         assert ticks.tolist() == (part_of_ticks(len(ticks)) == "test").tolist()
+
+
+@pytest.fixture
+def runs(tmp_path, monkeypatch):
+    """Folders `runs/b`, `runs/a`, `runs/[x]` and `runs/10`, and a file, in the present folder."""
+    monkeypatch.chdir(tmp_path)
+    for name in ("b", "a", "[x]", "10"):
+        (tmp_path / "runs" / name).mkdir(parents=True)
+    (tmp_path / "runs" / "notes.txt").write_text("no run")
+
+
+@pytest.mark.usefixtures("runs")
+def test_a_pattern_is_one_method_of_several_runs():
+    """Folders only, sorted by path; options and registered names around the pattern remain."""
+    names = (
+        "oracle",
+        "mtp:runs/?",
+        "ssp-asp:runs/[ab]@beam",
+        "delayed:2:mtp:runs/1*",
+        "mtp:runs/a",
+    )
+    assert expand_runs(names) == {
+        "oracle": ("oracle",),
+        "mtp:runs/?": ("mtp:runs/a", "mtp:runs/b"),
+        "ssp-asp:runs/[ab]@beam": ("ssp-asp:runs/a@beam", "ssp-asp:runs/b@beam"),
+        "delayed:2:mtp:runs/1*": ("delayed:2:mtp:runs/10",),
+        "mtp:runs/a": ("mtp:runs/a",),
+    }
+    assert expand_runs(["mtp:runs/*"])["mtp:runs/*"] == (
+        "mtp:runs/10", "mtp:runs/[x]", "mtp:runs/a", "mtp:runs/b",
+    )  # fmt: skip
+
+
+@pytest.mark.usefixtures("runs")
+def test_a_folder_whose_name_looks_like_a_pattern_is_itself():
+    assert expand_runs(["mtp:runs/[x]"]) == {"mtp:runs/[x]": ("mtp:runs/[x]",)}
+
+
+@pytest.mark.usefixtures("runs")
+@pytest.mark.parametrize(
+    ("names", "what"),
+    [
+        (["mtp:runs/**"], r"mtp:runs/\*\*: \*\* is not supported; use one \* for each level"),
+        (["mtp:other/*"], r"mtp:other/\*: no folder matches other/\*; give the folders of"),
+        (["mtp:runs/*.txt"], "no folder matches"),
+        (["mtp:runs/a", "mtp:runs/a"], "mtp:runs/a is named 2 times"),
+    ],
+)
+def test_patterns_without_runs_are_errors_of_one_line(names, what):
+    with pytest.raises(AspEnvError, match=what) as caught:
+        expand_runs(names)
+    assert "\n" not in str(caught.value)

@@ -8,7 +8,14 @@ from rich.table import Table
 
 from asp_env.evaluation.results import Row
 from asp_env.evaluation.selection import short_names
-from asp_env.evaluation.tables import driving_table, open_loop_tables, regret_tables
+from asp_env.evaluation.tables import (
+    driving_table,
+    driving_tables,
+    headlines,
+    open_loop_tables,
+    regret_tables,
+)
+from asp_env.evaluation.verdicts import verdict_text
 from asp_env.metrics.driving.rules import PDMS, RULES
 
 SHOWN = PDMS.shown
@@ -137,12 +144,122 @@ def test_a_value_without_bounds_has_no_interval():
     assert "[" not in _printed(driving_table(rows, (), SHOWN))[-1]
 
 
+LADDER = ("blind", "constant-velocity", "blend:0.25", "blend:0.5", "blend:0.75", "oracle")
+PRIVILEGED = ("expert", "oracle", "blend:0.25", "blend:0.5", "blend:0.75")
+
+
+def _compared(*subsets: str) -> list[Row]:
+    """The ladder, a resolved method, and one of three runs that is not resolved."""
+    rows = []
+    for subset in subsets:
+        common = {"planner": "sampling", "subset": subset, "rules": "pdms 1", "n": 480}
+        rows.append(_row("score", 0.95, **(common | {"planner": "expert"})))
+        for name in (*LADDER, "constant-turn-rate", "ffw-asp:runs/*"):
+            several = name.startswith("ffw")
+            about = common | {"predictor": name, "runs": 3 if several else 1}
+            rows.append(_row("score", 0.9, **about))
+            if name == "constant-velocity":
+                continue
+            gain = {"value": 0.011, "low": -0.002, "high": 0.021} if several else {
+                "value": 0.046, "low": 0.023, "high": 0.061}  # fmt: skip
+            mde = 0.0247 if several else 0.028
+            metric = "score - constant-velocity"
+            rows.append(Row(data="d", metric=metric, mde=mde, p_holm=0.01, **about, **gain))
+            if name not in LADDER:
+                share = {"value": 0.4, "low": 0.25, "high": 0.549}
+                rows.append(Row(data="d", metric="oracle share", **about, **share))
+    return rows
+
+
+def test_differences_are_shown_with_their_verdicts():
+    """Of a difference of 0.011 with an MDE of 0.0247: 480 (0.0247 / 0.011)² = 2420.2 scenarios."""
+    tables = driving_tables(_compared("all"), PRIVILEGED, SHOWN)
+    assert len(tables) == 2
+    lines = _printed(tables[0])
+    assert max(len(line) for line in lines) <= 80
+    assert lines[0].strip() == "all 480 scenarios, sampling: score less that of constant-velocity"
+    texts = [" ".join(line.split()) for line in lines]
+    assert "constant-turn-rate +0.046 [0.023, 0.061] 0.028 resolved 40 % [25, 55]" in texts
+    number = texts.index("ffw-asp (3 runs) +0.011 [-0.002, 0.021] 0.025 not resolved 40 % [25, 55]")
+    assert texts[number + 1] == "n ≈ 2,500"
+    assert "blend 0.25 * +0.046 [0.023, 0.061] 0.028 resolved" in texts
+    assert not any(text.startswith("constant-velocity") for text in texts)
+
+
+def test_interactive_scenarios_are_beside_all():
+    """Two tables of each, wherever the tag occurs; other tags are in `metrics.csv` only."""
+    tables = driving_tables(_compared("all", "left", "interactive"), PRIVILEGED, SHOWN)
+    titles = [_printed(table)[0].strip() for table in tables]
+    assert [title.partition(" scenarios")[0] for title in titles] == [
+        "all 480", "all 480", "480 interactive", "480 interactive",
+    ]  # fmt: skip
+    assert all(max(len(line) for line in _printed(table)) <= 80 for table in tables)
+
+
+def test_without_differences_there_is_one_table():
+    (table,) = driving_tables([_row("score", 0.9, planner="expert")], (), SHOWN)
+    assert "driving by" in _printed(table)[0]
+
+
+def test_headlines_are_of_the_methods_under_test():
+    """Not of controls, privileged predictors and the expert; of interactive scenarios if any."""
+    assert headlines(_compared("all"), PRIVILEGED) == [
+        "All 480 scenarios: constant-turn-rate drives like a 40 % oracle [25, 55]: "
+        "score +0.046 [0.023, 0.061] against constant-velocity, resolved.",
+        "All 480 scenarios: ffw-asp (3 runs) drives like a 40 % oracle [25, 55]: "
+        "score +0.011 [-0.002, 0.021] against constant-velocity, "
+        "not resolved (n ≈ 2,500 needed).",
+    ]
+    sentences = headlines(_compared("all", "interactive"), PRIVILEGED)
+    assert len(sentences) == 2
+    assert sentences[0].startswith("480 interactive scenarios: constant-turn-rate drives")
+
+
+@pytest.mark.parametrize(
+    ("value", "low", "high", "mde", "text"),
+    [
+        (0.05, 0.01, 0.09, 0.04, "resolved"),
+        (0.0, 0.0, 0.0, 0.0, "equal"),
+        (0.0, -0.1, 0.1, 0.2, "not resolved (difference 0)"),
+        (0.05, None, None, None, "not resolved (one recording)"),
+        (0.05, -0.01, 0.09, 0.04, "not resolved (0 in interval)"),
+        (0.01, -0.01, 0.03, 0.02, "not resolved (n ≈ 48 needed)"),
+        (0.001, -0.01, 0.03, 0.02, "not resolved (n ≈ 4,800 needed)"),
+    ],
+)
+def test_verdicts(value, low, high, mde, text):
+    row = _row("score - constant-velocity", value, low=low, high=high, mde=mde)
+    assert verdict_text(row) == text
+
+
 def test_short_names_are_as_short_as_they_can_be():
     """The name alone, with its folder, or with the whole path."""
     assert short_names(["oracle", "mtp:runs/1"]) == {"oracle": "oracle", "mtp:runs/1": "mtp"}
     assert short_names(["mtp:a/1", "mtp:a/2/"]) == {"mtp:a/1": "mtp 1", "mtp:a/2/": "mtp 2"}
     assert short_names(["mtp:a/1", "mtp:/b/1"]) == {"mtp:a/1": "mtp a-1", "mtp:/b/1": "mtp b-1"}
     assert short_names(["oracle", "oracle"]) == {"oracle": "oracle"}
+    assert short_names(["blend:0.25", "delayed:2:mtp:a", "mtp:b"]) == {
+        "blend:0.25": "blend 0.25",
+        "delayed:2:mtp:a": "delayed 2 mtp",
+        "mtp:b": "mtp",
+    }
+
+
+def test_short_names_contain_numbers():
+    """The numbers of controls and delays are part of the label, and run folders are not."""
+    names = {
+        "blend:0.25": "blend 0.25",
+        "blend:1": "blend 1",
+        "noisy-oracle:2": "noisy-oracle 2",
+        "delayed:2:oracle": "delayed 2 oracle",
+        "delayed:2:blend:0.5": "delayed 2 blend 0.5",
+        "delayed:1:delayed:2:mtp:runs/1": "delayed 1 delayed 2 mtp",
+        "delayed:2:ffw-asp:runs/1": "delayed 2 ffw-asp 1",
+        "delayed:2:ffw-asp:runs/2": "delayed 2 ffw-asp 2",
+        "ffw-asp:runs/1": "ffw-asp",
+        "dkm:2": "dkm 2",
+    }
+    assert short_names([*names]) == names
 
 
 def test_privileged_planners_are_marked():

@@ -150,6 +150,25 @@ def test_a_scenario_that_does_not_fit_is_refused(unfit, message):
     assert "\n" not in str(caught.value)
 
 
+def test_a_history_of_over_3_s_suits_the_same_scenarios():
+    """The ego's track and the recording begin 3 s before the start; the world shows 4 s.
+
+    The ticks before are empty, all later ones are those of a world that shows 3 s.
+    """
+    scenes = []
+    for history in (15, 20):
+        simulation = simulate(on_road(car(-50, 5)), scenario(length=4), history=history)
+        drive(simulation, [(1.0, 0.1)] * 2)
+        scenes.append(simulation.world.scene())
+    short, long = scenes
+    assert long.valid[0, :, :3].tolist() == [[False] * 3] * 2
+    for name in ("states", "valid"):
+        later = getattr(long, name)[:, :, 5:]
+        np.testing.assert_array_equal(later, getattr(short, name))
+    np.testing.assert_array_equal(long.actions[:, :, 5:], short.actions)
+    np.testing.assert_array_equal(long.tick, short.tick)
+
+
 def test_a_refused_reset_changes_nothing():
     """A scenario that does not fit leaves all episodes unchanged, also those before it."""
     simulation = simulate(on_road(), [scenario(), scenario()])

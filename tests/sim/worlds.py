@@ -58,6 +58,7 @@ def simulate(
     scenarios: Sequence[Scenario] | Scenario,
     traffic: TrafficSpec = "log",
     world_class: type[World] = ReplayWorld,
+    history: int = HISTORY,
 ) -> Simulation:
     """Episodes that have just started."""
     recordings = [recordings] if isinstance(recordings, Recording) else recordings
@@ -67,7 +68,7 @@ def simulate(
         make_traffic(traffic),
         num_episodes=len(scenarios),
         dt_s=DT_S,
-        history=HISTORY,
+        history=history,
         world_class=world_class,
     )
     simulation.reset(scenarios, [np.random.default_rng(each.seed) for each in scenarios])

@@ -43,20 +43,23 @@ EXPERT = "expert"
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Method:
-    """A planner with a predictor."""
+    """A planner with a predictor, or with one training run of a predictor of several runs."""
 
     planner: Planner
     predictor: Predictor
     predictor_name: str
-    """Name of the predictor as given; empty if the planner uses no forecasts."""
+    """Name of the predictor as given, which several runs share; empty if the planner uses no
+    forecasts."""
+    run: str
+    """Name of the training run; that of the predictor if it has one run."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class WorkUnit:
-    """Scenarios that one method drives side by side."""
+    """Scenarios that one method, or one run of it, drives side by side."""
 
     method: int
-    """Index of the method."""
+    """Index in `Methods.all`."""
     numbers: Int[np.ndarray, " b"]
     """Indices of the scenarios among all."""
     scenarios: tuple[Scenario, ...]
@@ -77,11 +80,12 @@ class Methods:
     """The methods of a comparison.
 
     These are the expert, and the planner with each predictor, or alone if it uses no forecasts.
-    Pickled methods are loaded again by their names.
+    Pickled methods are loaded again by the names of their runs.
 
     Attributes:
-        all: the methods; the expert is the first.
-        predictors: the predictors by name.
+        all: the methods; the expert is the first. A method of several training runs has an item for
+            each of them, one after the other.
+        predictors: the predictors by the name of their run.
         settings: settings of all episodes.
     """
 
@@ -90,7 +94,7 @@ class Methods:
         *,
         data: str,
         planner: str,
-        predictors: tuple[str, ...],
+        predictors: Mapping[str, tuple[str, ...]],
         traffic: str | None,
         rules: str,
         horizon_s: float,
@@ -101,7 +105,8 @@ class Methods:
         Args:
             data: DATA, which determines the world.
             planner: name of the planner.
-            predictors: names of the predictors.
+            predictors: names of the training runs of each predictor, by its name as given; see
+                `asp_env.evaluation.selection.expand_runs`.
             traffic: drivers of the other agents; None for the default of the world.
             rules: name of the driving rules.
             horizon_s: horizon of forecasts and plans in seconds.
@@ -129,16 +134,24 @@ class Methods:
             dt_s=dt_s,
         )
         chosen = load_planner(planner)
-        loaded = load_predictors(predictors, horizon=self.settings.horizon, dt_s=dt_s)
-        self.predictors: Mapping[str, Predictor] = dict(zip(predictors, loaded, strict=True))
-        methods = [Method(planner=load_planner(EXPERT), predictor=loaded[0], predictor_name="")]
+        runs = [run for names in predictors.values() for run in names]
+        loaded = load_predictors(runs, horizon=self.settings.horizon, dt_s=dt_s)
+        self.predictors: Mapping[str, Predictor] = dict(zip(runs, loaded, strict=True))
+        alone = partial(Method, predictor=loaded[0], predictor_name="", run="")
+        methods = [alone(planner=load_planner(EXPERT))]
         if chosen.uses_forecasts:
             methods += [
-                Method(planner=chosen, predictor=predictor, predictor_name=name)
-                for name, predictor in self.predictors.items()
+                Method(
+                    planner=chosen,
+                    predictor=self.predictors[run],
+                    predictor_name=name,
+                    run=run,
+                )
+                for name, names in predictors.items()
+                for run in names
             ]
         elif not chosen.privileged:
-            methods.append(Method(planner=chosen, predictor=loaded[0], predictor_name=""))
+            methods.append(alone(planner=chosen))
         self.all: tuple[Method, ...] = tuple(methods)
 
     def __reduce__(self) -> tuple[Any, ...]:
@@ -191,7 +204,7 @@ def work_units(scenarios: ScenarioSet, methods: int) -> list[WorkUnit]:
 
     Args:
         scenarios: all scenarios.
-        methods: number of methods.
+        methods: number of methods, with each run of a method of several runs.
     """
     order = np.argsort(-scenarios.length, kind="stable")
     chunks = np.array_split(order, -(-len(order) // EPISODES_AT_ONCE))
@@ -208,7 +221,8 @@ def work_units(scenarios: ScenarioSet, methods: int) -> list[WorkUnit]:
 class ComparisonScores:
     """Scores of all methods in all scenarios, and the rollouts of the worst scenarios.
 
-    The worst scenarios have the lowest mean score over the methods. The expert counts only if it
+    A method of several training runs counts once for each of them. The worst scenarios have the
+    lowest mean score over the methods. The expert counts only if it
     is the only method. Rules without a score use the product of three metrics instead: no
     collision, on road and progress.
     """

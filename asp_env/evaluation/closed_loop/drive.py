@@ -5,11 +5,9 @@ from collections.abc import Callable, Mapping, Sequence
 from contextlib import nullcontext
 from dataclasses import dataclass, replace
 from functools import partial
-from itertools import product
 from pathlib import Path
 from typing import Annotated, Any
 
-import numpy as np
 import tyro
 from rich.console import Console
 from rich.progress import Progress
@@ -19,33 +17,35 @@ from asp_env.data.road_map import RoadMap
 from asp_env.data.rollout import Rollout
 from asp_env.data.scenarios.scenario import ScenarioSet
 from asp_env.data.scenarios.selection import save_scenarios
-from asp_env.data.scenarios.tags import TAGS
 from asp_env.data.source import Recordings, open_data
 from asp_env.errors import AspEnvError
-from asp_env.evaluation import statistics
 from asp_env.evaluation.closed_loop.comparison import (
     EXPERT,
     ComparisonScores,
     EpisodeScores,
-    Method,
     Methods,
     WorkUnit,
     work_units,
 )
+from asp_env.evaluation.closed_loop.scenario_table import write_scenario_table
+from asp_env.evaluation.closed_loop.summary import Comparison, MethodScores, comparison_rows
 from asp_env.evaluation.hard import HARD_NOTE, is_hard, select_scenarios
+from asp_env.evaluation.ladder import BASELINE, missing_controls
 from asp_env.evaluation.report import check_report_possible, write_report
-from asp_env.evaluation.results import Row, write_manifest, write_metrics
-from asp_env.evaluation.selection import PartChoice, no_data_error, short_names, ticks_to_evaluate
-from asp_env.evaluation.tables import driving_table
+from asp_env.evaluation.results import SCORE, Row, write_manifest, write_metrics
+from asp_env.evaluation.selection import (
+    PartChoice,
+    expand_runs,
+    no_data_error,
+    short_names,
+    ticks_to_evaluate,
+)
+from asp_env.evaluation.tables import driving_tables, headlines
 from asp_env.files import atomic_folder
 from asp_env.metrics.driving.rules import DEFAULT_RULES, RULES, Rules
-from asp_env.metrics.masked import Masked
+from asp_env.sim.traffic.log import LogDriver
 from asp_env.sim.world import world_class
 from asp_env.workers import WorkerPool
-
-REFERENCE = "constant-velocity"
-"""If this predictor takes part, the scores of all other methods are also stated as differences to
-the score with it, paired by scenario."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -61,7 +61,14 @@ class Drive:
     predictors: Annotated[tuple[str, ...], tyro.conf.arg(metavar="NAME[:RUN] …")] = (
         "constant-velocity",
     )
-    """Predictors by name; trained ones with their run folder. Each is compared."""
+    """Predictors by name; trained ones with their run folder. Each is compared.
+    A pattern in quotes, such as 'ffw-asp:runs/*', is one method of several runs."""
+    controls: bool = False
+    """Add the controls, against which methods are calibrated: blind,
+    constant-velocity, blend:0.25, blend:0.5, blend:0.75 and oracle."""
+    reference: Annotated[str | None, tyro.conf.arg(metavar="NAME[:RUN]")] = None
+    """One of the predictors, to which differences are stated.
+    The default is constant-velocity, if it takes part."""
     traffic: str | None = None
     """Driver of all other agents: log, log-actions, idm, hybrid,
     predictor:NAME, or a table such as default=idm,truck=log.
@@ -99,12 +106,16 @@ class Drive:
             write_metrics(folder, result.rows)
             write_manifest(folder, "drive", **result.manifest)
             save_scenarios(folder / "scenarios.json", result.scenarios, result.recordings)
+            write_scenario_table(folder, result.scenarios, result.methods)
             save_rollouts(folder, result)
             title = f"Driving on {Path(self.data).name}"
             write_report(folder, title=title, lead=note, maps=result.maps)
         console = Console()
         shown = RULES[self.rules].shown
-        console.print(driving_table(result.rows, result.manifest["privileged"], shown))
+        for table in driving_tables(result.rows, result.manifest["privileged"], shown):
+            console.print(table)
+        for sentence in headlines(result.rows, result.manifest["privileged"]):
+            console.print(sentence)
         console.print(f"wrote {self.out}/report.html")
 
 
@@ -114,6 +125,8 @@ class ClosedLoopResult:
 
     rows: list[Row]
     """Lines of `metrics.csv`."""
+    methods: list[MethodScores]
+    """Scores of all methods in every scenario; the expert is the first."""
     manifest: dict[str, Any]
     rollouts: Mapping[str, tuple[Rollout, ...]]
     """Rollouts of the worst scenarios, by method; the scenarios are the same for all methods."""
@@ -133,40 +146,42 @@ def drive(config: Drive) -> ClosedLoopResult:
     if config.jobs < 1:
         raise AspEnvError(f"--jobs {config.jobs}: expected at least 1 process")
     config = replace(config, traffic=config.traffic or world_class(config.data).traffic)
+    runs = _runs_to_drive(config)
     methods = Methods(  # raises errors before anything is computed
         data=config.data,
         planner=config.planner,
-        predictors=config.predictors,
+        predictors=runs,
         traffic=config.traffic,
         rules=config.rules,
         horizon_s=config.horizon,
         dt_s=config.dt,
     )
+    if config.controls and not any(method.run for method in methods.all):
+        raise AspEnvError(
+            f"--controls: the planner {config.planner} uses no forecasts; leave it out"
+        )
     recordings = open_data(config.data)
     run_unit = partial(methods.drive, recordings)
     with WorkerPool(run_unit, config.jobs) if config.jobs > 1 else nullcontext() as pool:
         chosen, part = _choose_scenarios(config, recordings, methods)
         scores = _drive_all(pool, run_unit, chosen, methods)
-    by_method = [(method, scores.of(number)) for number, method in enumerate(methods.all)]
-    short = short_names(config.predictors)
-    labels = [
-        f"{method.planner.name} + {short[method.predictor_name]}"
-        if method.predictor_name
-        else method.planner.name
-        for method in methods.all
-    ]
+    by_run = [scores.of(number) for number in range(len(methods.all))]
+    by_method = _by_method(methods, by_run)
+    labels = _labels(methods)
     rules, predictors = methods.settings.rules, methods.predictors
     worst = [chosen[number] for number in scores.worst]
     return ClosedLoopResult(
-        rows=_rows(config, rules, by_method, chosen),
+        rows=comparison_rows(_comparison(config, rules, by_method, chosen)),
+        methods=by_method,
         manifest={
             "data": config.data,
             "data_hash": recordings.data_hash(),
             "planner": config.planner,
             "predictors": {name: dict(p.metadata) for name, p in predictors.items()},
+            "runs": {name: list(each) for name, each in runs.items() if each != (name,)},
             "privileged": [
                 EXPERT,
-                *(name for name, p in predictors.items() if p.privileged),
+                *(name for name, (run, *_) in runs.items() if predictors[run].privileged),
             ],
             "traffic": config.traffic,
             "metrics": {"preset": rules.name, "version": rules.version, "about": rules.description},
@@ -178,14 +193,80 @@ def drive(config: Drive) -> ClosedLoopResult:
             "scenarios": {scenario.name: {"seed": scenario.seed} for scenario in chosen},
             "endings": {
                 label: dict(Counter(kind.name for kind in each.endings))
-                for label, (_, each) in zip(labels, by_method, strict=True)
+                for label, each in zip(labels, by_run, strict=True)
             },
-            "intervals": "95 %, bootstrap over recordings",
+            "intervals": "95 %, bootstrap over recordings and, with several, over training runs",
         },
-        rollouts={label: each.rollouts for label, (_, each) in zip(labels, by_method, strict=True)},
+        rollouts={label: each.rollouts for label, each in zip(labels, by_run, strict=True)},
         maps={each.recording_name: recordings[each.recording].road_map for each in worst},
         scenarios=chosen,
         recordings=recordings,
+    )
+
+
+def _runs_to_drive(config: Drive) -> dict[str, tuple[str, ...]]:
+    """Training runs of every predictor, with those of `--controls`, by the name as given.
+
+    Raises:
+        AspEnvError: a name is given twice, no folder matches, or the reference does not take part.
+    """
+    runs = expand_runs(config.predictors)
+    if config.controls:
+        runs |= {name: (name,) for name in missing_controls(config.predictors)}
+    if config.reference is not None and config.reference not in runs:
+        raise AspEnvError(
+            f"--reference {config.reference}: expected one of the predictors, {', '.join(runs)}"
+        )
+    return runs
+
+
+def _by_method(methods: Methods, by_run: Sequence[EpisodeScores]) -> list[MethodScores]:
+    """The scores of all runs, grouped by method."""
+    groups: dict[tuple[str, str], list[int]] = {}
+    for number, method in enumerate(methods.all):
+        groups.setdefault((method.planner.name, method.predictor_name), []).append(number)
+    return [
+        MethodScores(
+            planner=planner,
+            predictor=predictor,
+            runs={
+                methods.all[i].run: methods.all[i].predictor if predictor else None for i in numbers
+            },
+            scores=[by_run[i] for i in numbers],
+            stream=position,
+        )
+        for position, ((planner, predictor), numbers) in enumerate(groups.items())
+    ]
+
+
+def _labels(methods: Methods) -> list[str]:
+    """A short name for every run of every method."""
+    short = short_names([*methods.predictors])
+    return [
+        " + ".join([method.planner.name, *([short[method.run]] if method.run else [])])
+        for method in methods.all
+    ]
+
+
+def _comparison(
+    config: Drive, rules: Rules, methods: Sequence[MethodScores], scenarios: ScenarioSet
+) -> Comparison:
+    return Comparison(
+        methods=methods,
+        scenarios=scenarios,
+        common=Row(
+            data=config.data,
+            traffic=config.traffic or "",
+            latency_ticks=0,
+            horizon_s=config.horizon,
+            rules=rules.label,
+            metric="",
+            value=0.0,
+            n=0,
+        ),
+        compared=[*([SCORE] if rules.weights else []), *rules.shown],
+        reference=config.reference or BASELINE,
+        replayed=config.traffic == LogDriver.name,
     )
 
 
@@ -226,66 +307,6 @@ def _drive_all(
             scores.add(unit, unit_scores)
             progress.advance(task, len(unit.numbers))
     return scores
-
-
-def _rows(
-    config: Drive,
-    rules: Rules,
-    by_method: Sequence[tuple[Method, EpisodeScores]],
-    scenarios: ScenarioSet,
-) -> list[Row]:
-    """Rows of every method, for all scenarios and for those with each tag."""
-    reference = next(
-        (scores for method, scores in by_method if method.predictor_name == REFERENCE), None
-    )
-    rows = []
-    for method, scores in by_method:
-        values = dict(scores.metrics)
-        if rules.weights and reference is not None and scores is not reference:
-            score = scores.metrics["score"]
-            gain = score.value - reference.metrics["score"].value
-            values[f"score - {REFERENCE}"] = Masked(value=gain, valid=score.valid)
-        rows += _method_rows(config, rules, method, values, scenarios)
-    return rows
-
-
-def _method_rows(
-    config: Drive,
-    rules: Rules,
-    method: Method,
-    values: Mapping[str, Masked],
-    scenarios: ScenarioSet,
-) -> list[Row]:
-    metadata = method.predictor.metadata if method.predictor_name else {}
-    subsets = {"all": np.ones(len(scenarios), dtype=bool)}
-    subsets |= {tag: scenarios.has(tag) for tag in TAGS}
-    rows = []
-    for (subset, member), (metric, masked) in product(subsets.items(), values.items()):
-        counted = masked.valid & member
-        if not counted.any():
-            continue
-        estimate = statistics.mean(masked.value[counted], scenarios.recording[counted])
-        rows.append(
-            Row(
-                data=config.data,
-                predictor=method.predictor_name,
-                trained_on=metadata.get("trained_on", ""),
-                view=metadata.get("view", ""),
-                recipe=metadata.get("preset", ""),
-                planner=method.planner.name,
-                traffic=config.traffic or "",
-                latency_ticks=0,
-                horizon_s=config.horizon,
-                rules=rules.label,
-                subset=subset,
-                metric=metric,
-                value=estimate.value,
-                low=estimate.low,
-                high=estimate.high,
-                n=estimate.n,
-            )
-        )
-    return rows
 
 
 def save_rollouts(folder: Path, result: ClosedLoopResult) -> None:

@@ -51,7 +51,7 @@ class EpisodeSettings:
     horizon: int
     """Number of ticks of every forecast and plan."""
     history: int
-    """Number of ticks of history."""
+    """Number of ticks of history; a predictor that needs more is shown more."""
     dt_s: float
 
 
@@ -102,7 +102,7 @@ def drive_episodes(
         make_traffic(settings.traffic, dt_s=settings.dt_s, default=settings.world.traffic),
         num_episodes=len(scenarios),
         dt_s=settings.dt_s,
-        history=settings.history,
+        history=max(settings.history, predictor.history),
         world_class=settings.world,
     )
     world = simulation.world

@@ -36,7 +36,9 @@ from asp_env.evaluation.report import ForecastExamples, check_report_possible, w
 from asp_env.evaluation.results import Row, write_manifest, write_metrics
 from asp_env.evaluation.selection import (
     PartChoice,
+    expand_runs,
     load_predictors,
+    shared_metadata,
     snippets_within,
     ticks_to_evaluate,
 )
@@ -72,7 +74,8 @@ class Evaluate:
         "constant-velocity",
         "constant-turn-rate",
     )
-    """Predictors by name; trained ones with their run folder."""
+    """Predictors by name; trained ones with their run folder.
+    A pattern in quotes, such as 'ffw-asp:runs/*', is one method of several runs."""
     horizon: float = 3.0
     """Forecast horizon in seconds."""
     dt: float = DEFAULT_DT_S
@@ -125,9 +128,9 @@ class OpenLoopResult:
     """Lines of `metrics.csv`."""
     manifest: dict[str, Any]
     scores: ForecastScores
-    """Metrics of every snippet, for paired comparisons."""
+    """Metrics of every snippet by the name of the run, for paired comparisons."""
     examples: ForecastExamples
-    """Forecasts that the report shows."""
+    """Forecasts that the report shows; of a method of several runs those of the first run."""
 
 
 def evaluate(config: Evaluate) -> OpenLoopResult:
@@ -139,11 +142,18 @@ def evaluate(config: Evaluate) -> OpenLoopResult:
     recordings = open_data(config.data)
     horizon = ticks(config.horizon, config.dt)
     planner = None if config.planner in NO_PLANNER else load_candidate_planner(config.planner)
-    loaded = load_predictors(config.predictors, horizon=horizon, dt_s=config.dt)
+    runs = expand_runs(config.predictors)
+    names = [run for members in runs.values() for run in members]
+    loaded = load_predictors(names, horizon=horizon, dt_s=config.dt)
     allowed, part = ticks_to_evaluate(recordings, loaded, config.part, dt_s=config.dt)
-    index = index_snippets(recordings, dt_s=config.dt, horizon_s=config.horizon)
+    index = index_snippets(
+        recordings,
+        dt_s=config.dt,
+        horizon_s=config.horizon,
+        history_s=max(HISTORY_S, *(predictor.history * config.dt for predictor in loaded)),
+    )
     index = snippets_within(index, allowed)
-    predictors = dict(zip(config.predictors, loaded, strict=True))
+    predictors = dict(zip(names, loaded, strict=True))
     scenes: Sequence[Any] = recordings
     if config.history == "causal":
         scenes = causal_histories(recordings)
@@ -158,13 +168,19 @@ def evaluate(config: Evaluate) -> OpenLoopResult:
     )
     return OpenLoopResult(
         rows=make_rows(
-            scores, predictors, data=config.data, horizon_s=config.horizon, regrets=regrets
+            scores,
+            predictors,
+            runs,
+            data=config.data,
+            horizon_s=config.horizon,
+            regrets=regrets,
         ),
         manifest={
             "data": config.data,
             "data_hash": recordings.data_hash(),
             "predictors": {name: dict(p.metadata) for name, p in predictors.items()},
-            "privileged": [name for name, p in predictors.items() if p.privileged],
+            "runs": {name: list(members) for name, members in runs.items() if members != (name,)},
+            "privileged": [name for name, (run, *_) in runs.items() if predictors[run].privileged],
             "horizon_s": config.horizon,
             "dt_s": config.dt,
             "part": part,
@@ -176,10 +192,16 @@ def evaluate(config: Evaluate) -> OpenLoopResult:
             "states": 0 if regrets is None else len(regrets.recording),
             "best_by": config.best_by,
             "best-of-3": f"of the three most probable modes, {MODE_RULES[config.best_by]}",
-            "intervals": "95 %, bootstrap over recordings",
+            "intervals": "95 %, bootstrap over recordings and, with several, over training runs",
         },
         scores=scores,
-        examples=_examples(scenes, recordings, index, moving, predictors),
+        examples=_examples(
+            scenes,
+            recordings,
+            index,
+            moving,
+            {name: predictors[run] for name, (run, *_) in runs.items()},
+        ),
     )
 
 
@@ -215,6 +237,7 @@ def _regrets(
 def make_rows(
     scores: ForecastScores,
     predictors: Mapping[str, Predictor],
+    runs: Mapping[str, Sequence[str]],
     *,
     data: str,
     horizon_s: float,
@@ -223,8 +246,9 @@ def make_rows(
     """Means with intervals: a row for each predictor, selection, subset and metric that occurs.
 
     Args:
-        scores: metrics of all snippets.
-        predictors: the predictors by name.
+        scores: metrics of all snippets, by the name of the run.
+        predictors: the predictors by the name of their run.
+        runs: names of the runs that are averaged, by the name of the row.
         data: DATA as given.
         horizon_s: forecast horizon in seconds.
         regrets: planning regret of the predictors, if it was measured.
@@ -235,25 +259,28 @@ def make_rows(
         if each.name == REFERENCE and each.metric == "FDE"
     }
     rows: list[Row] = []
-    for name, predictor in predictors.items():
+    for stream, (name, members) in enumerate(runs.items()):
         estimates: list[tuple[str, str, str, Estimate]] = []
+        columns: dict[tuple[str, str], list[MetricValues]] = {}
         for each in scores.metrics:
-            if each.name == name:
-                estimates += _estimates(each, scores, reference.get(each.selection))
-        for modes in scores.modes:
-            if modes.name == name:
-                estimates += _calibration(modes, scores)
+            if each.name in members:
+                columns.setdefault((each.selection, each.metric), []).append(each)
+        for group in columns.values():
+            estimates += _estimates(group, scores, reference.get(group[0].selection), stream)
+        modes = [each for each in scores.modes if each.name in members]
+        if modes:
+            estimates += _calibration(modes, scores, stream)
         if regrets is not None:
-            estimates += [(ALL_MODES, *each) for each in regrets.estimates(name)]
-        metadata = predictor.metadata
+            estimates += [(ALL_MODES, *each) for each in regrets.estimates(*members, stream=stream)]
+        loaded = [predictors[run] for run in members]
         rows += [
             Row(
                 data=data,
                 predictor=name,
-                trained_on=metadata.get("trained_on", ""),
-                view=metadata.get("view", ""),
-                recipe=metadata.get("preset", ""),
-                chaining=metadata.get("chaining", ""),
+                trained_on=shared_metadata(loaded, "trained_on"),
+                view=shared_metadata(loaded, "view"),
+                recipe=shared_metadata(loaded, "preset"),
+                chaining=shared_metadata(loaded, "chaining"),
                 horizon_s=horizon_s,
                 selection=selection,
                 subset=subset,
@@ -262,6 +289,7 @@ def make_rows(
                 low=estimate.low,
                 high=estimate.high,
                 n=estimate.n,
+                runs=len(members),
             )
             for selection, subset, metric, estimate in estimates
         ]
@@ -269,25 +297,40 @@ def make_rows(
 
 
 def _estimates(
-    column: MetricValues, scores: ForecastScores, reference: MetricValues | None
+    runs: Sequence[MetricValues],
+    scores: ForecastScores,
+    reference: MetricValues | None,
+    stream: int,
 ) -> Iterator[tuple[str, str, str, Estimate]]:
     """(selection, subset, metric, estimate) of one metric and of its ratio to the reference."""
-    groups, values, selection = scores.recording, column.values, column.selection
-    compared = column.metric == "FDE" and column.name != REFERENCE
-    for subset, rows in _subset_rows(scores, column.valid):
-        yield selection, subset, column.metric, statistics.mean(values[rows], groups[rows])
+    selection, metric = runs[0].selection, runs[0].metric
+    values = np.stack([each.values for each in runs])
+    valid = np.stack([each.valid for each in runs])
+    compared = metric == "FDE" and runs[0].name != REFERENCE
+    for subset, rows in _subset_rows(scores, valid.any(axis=0)):
+        groups, known = scores.recording[rows], valid[:, rows]
+        sums = np.where(known, values[:, rows], 0)
+        mean = statistics.ratio_over_runs(sums, known, groups, stream=stream)
+        yield selection, subset, metric, mean
         if compared and reference is not None and reference.values[rows].any():
-            ratio = statistics.ratio(values[rows], reference.values[rows], groups[rows])
+            ratio = statistics.ratio_over_runs(
+                values[:, rows], reference.values[rows], groups, stream=stream
+            )
             yield selection, subset, RATIO, ratio
 
 
 def _calibration(
-    modes: ModeProbabilities, scores: ForecastScores
+    runs: Sequence[ModeProbabilities], scores: ForecastScores, stream: int
 ) -> Iterator[tuple[str, str, str, Estimate]]:
-    sums = calibration_sums(modes.probabilities, modes.nearest)
-    for subset, rows in _subset_rows(scores, modes.valid):
-        estimate = statistics.from_sums(sums[rows], scores.recording[rows], calibration_error)
-        yield ALL_MODES, subset, ECE, estimate
+    """The calibration error, which is computed for every run and then averaged."""
+    sums = np.stack([calibration_sums(each.probabilities, each.nearest) for each in runs])
+    valid = np.all([each.valid for each in runs], axis=0)
+    for subset, rows in _subset_rows(scores, valid):
+        by_run = statistics.run_sums(sums[:, rows], scores.recording[rows])
+        with np.errstate(invalid="ignore", divide="ignore"):
+            errors = calibration_error(by_run)
+        draws = statistics.average_runs(errors, stream=stream)
+        yield ALL_MODES, subset, ECE, statistics.interval(draws, n=len(rows))
 
 
 def _subset_rows(

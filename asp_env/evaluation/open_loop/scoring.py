@@ -16,7 +16,13 @@ from asp_env.data.classes import AgentClass
 from asp_env.data.predictor import Forecast, Predictor
 from asp_env.data.recording import ticks
 from asp_env.data.scene import Scene
-from asp_env.data.snippets import SNIPPET_INTERVAL_S, Future, SnippetIndex, gather_scene
+from asp_env.data.snippets import (
+    HISTORY_S,
+    SNIPPET_INTERVAL_S,
+    Future,
+    SnippetIndex,
+    gather_scene,
+)
 from asp_env.errors import AspEnvError
 from asp_env.evaluation.open_loop.ground_truth import GroundTruth, gather_ground_truth
 from asp_env.metrics.forecast.calibration import brier, mixture_nll, nearest_modes
@@ -119,7 +125,7 @@ def score_forecasts(
     table = _MetricTable(count)
     modes: dict[str, ModeProbabilities] = {}
     history = ForecastHistory(index)
-    subsets = _Subsets(count)
+    subsets = _Subsets(count, index.dt_s)
     for rows, scene, truth in batches(scenes, recorded, index, "evaluating"):
         subsets.put(rows, truth)
         on_road = stays_on_road(truth)
@@ -376,12 +382,16 @@ class _MetricTable:
 class _Subsets:
     """Manoeuvre and class of each snippet's target, filled batch by batch."""
 
-    def __init__(self, count: int) -> None:
+    def __init__(self, count: int, dt_s: float) -> None:
+        self._past_ticks = round(HISTORY_S / dt_s)
         self._manoeuvre = np.zeros(count, dtype=np.int8)
         self._class = np.zeros(count, dtype=np.int8)
 
     def put(self, rows: slice, truth: GroundTruth) -> None:
-        self._manoeuvre[rows] = manoeuvres(truth.states, truth.valid, now=truth.now)
+        first = max(0, truth.now - self._past_ticks)  # snippets may have a longer history
+        self._manoeuvre[rows] = manoeuvres(
+            truth.states[:, first:], truth.valid[:, first:], now=truth.now - first
+        )
         self._class[rows] = truth.classes
 
     def masks(self) -> dict[str, Bool[np.ndarray, " n"]]:

@@ -26,7 +26,12 @@ from asp_env.evaluation.report.results import (
     metric_note,
     read_results,
 )
-from asp_env.evaluation.report.tables import breakdown_figures, result_figures
+from asp_env.evaluation.report.tables import (
+    breakdown_figures,
+    comparison_figures,
+    result_figures,
+)
+from asp_env.evaluation.selection import split_name
 from asp_env.files import atomic_file
 
 BASELINE = "constant-velocity"
@@ -104,6 +109,7 @@ def write_report(
         "cards": [*_forecast_cards(results.open_loop), *_driving_cards(results.driving)],
         "forecast_figures": result_figures(results.open_loop),
         "breakdown_figures": breakdown_figures(results.open_loop),
+        "comparison_figures": comparison_figures(results.driving),
         "driving_figures": result_figures(results.driving),
         "notes": _notes(results),
         "run": run,
@@ -144,7 +150,7 @@ def _plots(results: Results) -> dict[str, Any]:
     }
     return {
         "figures": {name: json.loads(text) for name, text in figures.items() if text},
-        "colours": colours | {name.partition(":")[0]: value for name, value in colours.items()},
+        "colours": colours | {split_name(name)[0]: value for name, value in colours.items()},
     }
 
 

@@ -15,6 +15,7 @@ from asp_env.evaluation.report.results import (
     methods_of,
     metric_note,
 )
+from asp_env.evaluation.results import ORACLE_SHARE, SCORE, difference_of
 
 COLOURS = ("#e8590c", "#7048e8", "#0ca678", "#1c7ed6", "#d6336c", "#c99700", "#5c7cfa", "#74b816")
 PRIVILEGED_COLOUR = "#8a94a6"
@@ -103,6 +104,7 @@ def driving_metrics(results: Sequence[Result], colour: dict[str, str]) -> str | 
     """
     subset = next(iter(distinct((r.subset for r in results), first=SUBSETS)), None)
     results = [r for r in results if r.subset == subset and r.value is not None and r.at_s is None]
+    results = [r for r in results if not r.is_comparison or r.metric in _compared(results)]
     metrics = distinct(r.metric for r in results)
     if not metrics:
         return None
@@ -135,13 +137,22 @@ def driving_metrics(results: Sequence[Result], colour: dict[str, str]) -> str | 
                 showlegend=False,
             )
             figure.add_trace(point, row=row, col=column)
-        if percent and note.better == "higher":
+        if percent and note.better == "higher" and difference_of(metric) is None:
             figure.update_xaxes(range=[-4, 104], tickvals=[0, 50, 100], row=row, col=column)
         else:
             figure.update_xaxes(rangemode="tozero", nticks=5, row=row, col=column)
     figure.update_yaxes(autorange="reversed", ticks="")
     figure.update_layout(height=height)
     return _finish(figure, top_px=40)
+
+
+def _compared(results: Sequence[Result]) -> set[str]:
+    """The comparisons that have a panel: differences of the score, and oracle shares."""
+    pairs = {r.metric: difference_of(r.metric) for r in results}
+    return {
+        ORACLE_SHARE,
+        *(metric for metric, pair in pairs.items() if pair and pair[0] == SCORE),
+    }
 
 
 def _panel_title(metric: str) -> str:

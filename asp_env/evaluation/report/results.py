@@ -8,13 +8,16 @@ from pathlib import Path, PurePath
 from typing import Literal
 
 from asp_env.errors import DataError
-from asp_env.evaluation.results import Row
+from asp_env.evaluation.results import HEADROOM, ORACLE_SHARE, Row, difference_of
+from asp_env.evaluation.selection import split_name
 
 SELECTIONS = ("most-probable", "best-of-3", "")
 """Selections of modes in the order of the tables; metrics of all modes together have none."""
 SUBSETS = ("all", "moving")
 """The subsets of targets or episodes that come first."""
 COLUMNS = tuple(field.name for field in fields(Row))
+ADDED_COLUMNS = ("runs", "mde", "p_holm")
+"""Columns that older run folders lack."""
 RENAMED_COLUMNS = {"preset": "recipe"}
 """Columns of older run folders and their present names."""
 DETAILS = ("trained_on", "view", "recipe", "chaining", "traffic", "latency_ticks")
@@ -61,7 +64,7 @@ class MethodResult:
     @property
     def name(self) -> str:
         """The planner, the predictor without its folder, or both."""
-        parts = [self.planner, self.predictor.partition(":")[0]]
+        parts = [self.planner, split_name(self.predictor)[0]]
         return " + ".join(part for part in parts if part)
 
     @property
@@ -88,6 +91,15 @@ class Result:
     low: float | None
     high: float | None
     n: float | None
+    mde: float | None = None
+    """Minimal detectable effect of a difference."""
+    p_holm: float | None = None
+    """Adjusted p value of a difference."""
+
+    @property
+    def is_comparison(self) -> bool:
+        """Whether it compares the method with others: a difference, oracle share or headroom."""
+        return self.metric in (ORACLE_SHARE, HEADROOM) or difference_of(self.metric) is not None
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -124,8 +136,9 @@ def read_results(path: Path, *, privileged: Collection[str] = ()) -> Results:
     except (OSError, ValueError, csv.Error) as error:
         raise DataError(f"{path}: not a table of metrics ({error})") from error
     missing = [name for name in COLUMNS if name not in columns]
-    if missing:
+    if set(missing) - set(ADDED_COLUMNS):
         raise DataError(f"{path}: no column {missing[0]!r}, expected {', '.join(COLUMNS)}")
+    rows = [dict.fromkeys(missing, "") | row for row in rows]
     return Results(
         open_loop=_results(path, [row for row in rows if not row["planner"]], privileged),
         driving=_results(path, [row for row in rows if row["planner"]], privileged),
@@ -167,14 +180,16 @@ def _result(
     fixed: tuple[str, ...],
     privileged: Collection[str],
 ) -> Result:
-    folder = PurePath(row["predictor"].partition(":")[2])
+    folder = PurePath(split_name(row["predictor"])[1])
     details = ["/".join(folder.parts[-2:])] if folder.name else []
     details += [_detail(name, row[name]) for name in varying if row[name]]
+    if row["runs"] not in ("", "1"):
+        details.append(f"mean of {row['runs']} runs")
     metric = re.fullmatch(r"(.+)@([0-9.]+) ?s", row["metric"])
     try:
         numbers = {
             name: float(row[name]) if row[name] not in ("", "nan") else None
-            for name in ("value", "low", "high", "n")
+            for name in ("value", "low", "high", "n", "mde", "p_holm")
         }
         at_s = float(metric[2]) if metric else None
     except ValueError as error:
@@ -205,7 +220,19 @@ def _detail(column: str, value: str) -> str:
 
 def metric_note(metric: str) -> MetricNote:
     """The note of a metric; an unknown metric is named as in the file and is not ranked."""
-    return METRIC_NOTES.get(metric) or _note(metric, "", "neither", "")
+    known = METRIC_NOTES.get(metric)
+    if known is not None:
+        return known
+    difference = difference_of(metric)
+    if difference is None:
+        return _note(metric, "", "neither", "")
+    base, reference = metric_note(difference[0]), difference[1]
+    return _note(
+        f"{base.label} - {reference}",
+        base.unit,
+        base.better,
+        f"{base.label} less that of the same planner with {reference}, paired by scenario.",
+    )
 
 
 def _note(label: str, unit: str, better: Better, text: str) -> MetricNote:
@@ -323,6 +350,19 @@ METRIC_NOTES = {
         "%",
         "higher",
         "Score minus that of the same planner with constant velocity; paired interval.",
+    ),
+    ORACLE_SHARE: _note(
+        "Oracle share",
+        "%",
+        "higher",
+        "Share of the recorded future, mixed into constant velocity, with which the planner has "
+        "the same score: 0 % is constant velocity or worse, 100 % the oracle or better.",
+    ),
+    HEADROOM: _note(
+        "Headroom",
+        "%",
+        "higher",
+        "Gain of the score over constant velocity as a share of the oracle's gain.",
     ),
     "no at-fault collision": _note(
         "No at-fault",

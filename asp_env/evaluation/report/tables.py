@@ -1,18 +1,30 @@
 """The contents of the page's tables: one figure per data set and horizon, a tab per subset."""
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from types import MappingProxyType
 
+from asp_env.evaluation.ladder import is_under_test
 from asp_env.evaluation.report.results import (
     SELECTIONS,
     SUBSETS,
     MethodResult,
+    MetricNote,
     Result,
     best_result,
     distinct,
     methods_of,
     metric_note,
 )
+from asp_env.evaluation.results import HEADROOM, ORACLE_SHARE, SCORE, difference_name, difference_of
+from asp_env.evaluation.verdicts import NOT_RESOLVED, RESOLVED, headline, verdict_text
+
+COMPARISON = (ORACLE_SHARE, HEADROOM)
+"""Metrics beside the difference of the score."""
+COMPARED_SUBSETS = ("all", "interactive")
+"""The subsets of scenarios that come first in comparisons."""
+SHARE_NOTES = {HEADROOM: NOT_RESOLVED}
+"""Text of a missing value: the oracle's gain is not resolved."""
 
 BREAKDOWN_METRIC = "FDE"
 """The metric shown by kind of target, that is for subsets such as `manoeuvre:left`."""
@@ -28,6 +40,8 @@ class Cell:
     interval: tuple[str, str] | None
     count: str | None
     """Number of values averaged."""
+    note: str | None = None
+    """Text below the value."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -49,6 +63,32 @@ class Column:
     """Shown when the mouse hovers over the heading."""
 
 
+DIFFERENCE_COLUMNS = (
+    Column(
+        label="Difference",
+        detail="% ↑",
+        title="Mean difference of the score in the same scenarios, with its 95 % interval.",
+    ),
+    Column(
+        label="MDE",
+        detail="%",
+        title="Minimal detectable effect: the smallest difference that these scenarios resolve "
+        "with 80 % power at the 5 % level, 2.8 standard errors.",
+    ),
+    Column(
+        label="p",
+        detail="Holm",
+        title="Two-sided p value of the difference, adjusted by Holm's method over the methods.",
+    ),
+    Column(
+        label="Verdict",
+        detail="",
+        title="Resolved if the interval excludes 0 and the difference is at least the MDE; else "
+        "the number of scenarios that would resolve a difference of this size.",
+    ),
+)
+
+
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Table:
     """A row for each method, a column for each metric or kind of target."""
@@ -64,6 +104,8 @@ class Tab:
 
     label: str
     tables: tuple[Table, ...]
+    sentences: tuple[str, ...] = ()
+    """What the tables show, in words."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -76,10 +118,10 @@ class Figure:
 
 
 def result_figures(results: Sequence[Result]) -> list[Figure]:
-    """Metrics by method, without metrics over time and without kinds of targets."""
+    """Metrics by method, without comparisons, metrics over time and kinds of targets."""
     groups: dict[tuple[str, str], list[Result]] = {}
     for result in results:
-        if result.at_s is None and ":" not in result.subset:
+        if result.at_s is None and ":" not in result.subset and not result.is_comparison:
             groups.setdefault((result.data, result.horizon_s), []).append(result)
     figures = []
     for group in groups.values():
@@ -93,6 +135,123 @@ def result_figures(results: Sequence[Result]) -> list[Figure]:
         ]
         figures.append(_figure(group[0], (), tabs))
     return figures
+
+
+def comparison_figures(results: Sequence[Result]) -> list[Figure]:
+    """Differences to the reference with verdicts, oracle shares and headroom, a tab per subset."""
+    groups: dict[tuple[str, str, str], list[Result]] = {}
+    for result in results:
+        difference = difference_of(result.metric)
+        if difference is not None and difference[0] == SCORE:
+            groups.setdefault((result.data, result.horizon_s, difference[1]), []).append(result)
+    figures = []
+    for (data, horizon_s, reference), group in groups.items():
+        same = [r for r in results if (r.data, r.horizon_s) == (data, horizon_s)]
+        subsets = distinct((result.subset for result in group), first=COMPARED_SUBSETS)
+        tabs = [
+            _comparison_tab(subset, reference, [r for r in same if r.subset == subset])
+            for subset in subsets
+        ]
+        figures.append(_figure(group[0], (f"less {reference}",), tabs))
+    return figures
+
+
+def _comparison_tab(subset: str, reference: str, results: Sequence[Result]) -> Tab:
+    """The differences of a subset: a table of the score, one of the other metrics, sentences."""
+    of = {(result.method, result.metric): result for result in results}
+    score = difference_name(SCORE, reference)
+    methods = methods_of(result for result in results if result.metric == score)
+    columns = [column for column in COMPARISON if _occurs(column, results)]
+    rows = tuple(
+        MethodRow(
+            method=method,
+            cells=(
+                *_difference_cells(of[method, score]),
+                *(_cell(of.get((method, metric)), None, SHARE_NOTES) for metric in columns),
+            ),
+        )
+        for method in methods
+    )
+    headings = [*DIFFERENCE_COLUMNS, *(_heading(metric_note(metric)) for metric in columns)]
+    sentences = [
+        headline(
+            method.label,
+            reference,
+            _gain(of[method, score]),
+            of[method, score],
+            of.get((method, ORACLE_SHARE)),
+        )
+        for method in methods
+        if is_under_test(method.predictor, privileged=method.privileged)
+    ]
+    table = Table(heading=f"score less {reference}", columns=tuple(headings), rows=rows)
+    others = _other_differences(reference, methods, results)
+    return Tab(label=subset, tables=(table, *others), sentences=tuple(sentences))
+
+
+def _occurs(metric: str, results: Sequence[Result]) -> bool:
+    return any(result.metric == metric for result in results)
+
+
+def _heading(note: MetricNote) -> Column:
+    return Column(label=note.label, detail=note.unit_and_arrow, title=note.text)
+
+
+def _difference_cells(result: Result) -> tuple[Cell | None, ...]:
+    """The cells below `DIFFERENCE_COLUMNS`."""
+    note = metric_note(result.metric)
+    verdict, _, reason = verdict_text(result).partition(" (")
+    return (
+        _cell(result, None),
+        None if result.mde is None else _text(note.format(result.mde)),
+        None if result.p_holm is None else _text(_p_text(result.p_holm)),
+        Cell(
+            value=verdict,
+            best=verdict == RESOLVED,
+            interval=None,
+            count=None,
+            note=reason.removesuffix(")") or None,
+        ),
+    )
+
+
+def _p_text(p: float) -> str:
+    return "< 0.001" if p < 0.001 else f"{p:.3f}"
+
+
+def _text(value: str) -> Cell:
+    return Cell(value=value, best=False, interval=None, count=None)
+
+
+def _gain(result: Result) -> str:
+    """A difference with its sign, unit and interval, such as `+2.6 % [0.2, 5.1]`."""
+    note = metric_note(result.metric)
+    sign = "+" if (result.value or 0.0) >= 0 else ""
+    text = f"{sign}{note.format(result.value or 0.0)} {note.unit}"
+    if result.low is None or result.high is None:
+        return text
+    return f"{text} [{note.format(result.low)}, {note.format(result.high)}]"
+
+
+def _other_differences(
+    reference: str, methods: Sequence[MethodResult], results: Sequence[Result]
+) -> Iterator[Table]:
+    """A table of the differences of all metrics except the score, if there are any."""
+    columns: dict[str, dict[MethodResult, Result]] = {}
+    for result in results:
+        difference = difference_of(result.metric)
+        if difference is not None and difference[0] != SCORE and difference[1] == reference:
+            columns.setdefault(difference[0], {})[result.method] = result
+    if columns:
+        rows = tuple(
+            MethodRow(
+                method=method,
+                cells=tuple(_cell(column.get(method), None) for column in columns.values()),
+            )
+            for method in methods
+        )
+        headings = tuple(_heading(metric_note(metric)) for metric in columns)
+        yield Table(heading=f"less {reference}", columns=headings, rows=rows)
 
 
 def breakdown_figures(results: Sequence[Result]) -> list[Figure]:
@@ -180,9 +339,14 @@ def _best_text(column: Sequence[Result]) -> str | None:
     return note.format(winner.value)
 
 
-def _cell(result: Result | None, best: str | None) -> Cell | None:
-    if result is None or result.value is None:
+def _cell(
+    result: Result | None, best: str | None, missing: Mapping[str, str] = MappingProxyType({})
+) -> Cell | None:
+    """A value as it is printed; where it is missing, the text that `missing` has for its metric."""
+    if result is None:
         return None
+    if result.value is None:
+        return _text(missing[result.metric]) if result.metric in missing else None
     note = metric_note(result.metric)
     text = note.format(result.value)
     interval = None

@@ -106,6 +106,20 @@ def test_every_method_drives_the_same_scenarios(crossings):
     assert (row.traffic, row.latency_ticks, row.horizon_s) == ("log", 0, 3.0)
 
 
+def test_a_delayed_predictor_drives_the_same_scenarios(crossings):
+    """It needs 17 ticks of history, scenarios have 15; results of the others do not change."""
+    names = ("constant-velocity", "delayed:14:constant-turn-rate")
+    config = Drive(data=str(crossings), out=NOWHERE, predictors=names, max_scenarios=4)
+    alone = drive(dataclasses.replace(config, predictors=names[:1]))
+    result = drive(config)
+    assert result.manifest["scenarios"] == alone.manifest["scenarios"]
+    assert _values(result, "expert") == _values(alone, "expert")
+    score = _values(result, "sampling", names[0])["score"]
+    assert score == _values(alone, "sampling", names[0])["score"]
+    assert _values(result, "sampling", names[1])["score"] != score
+    assert list(result.rollouts)[2] == "sampling + delayed 14 constant-turn-rate"
+
+
 def test_a_planner_without_forecasts_drives_once(crossings):
     """`idm` drives once, without a predictor's name; `expert` does not drive a second time."""
     for planner, methods in (("idm", ["expert", "idm"]), ("expert", ["expert"])):
@@ -117,6 +131,46 @@ def test_a_planner_without_forecasts_drives_once(crossings):
             max_scenarios=2,
         )
         assert list(drive(config).rollouts) == methods
+
+
+def test_controls_are_added_to_a_comparison(crossings, monkeypatch):
+    """Those that are not named yet, after the named ones; with them, methods have oracle shares."""
+
+    def load(name: str, *, horizon: int, dt_s: float):
+        kind = Oracle if name == "oracle" or name.startswith("blend") else ConstantVelocity
+        return kind(horizon=horizon, dt_s=dt_s)
+
+    monkeypatch.setattr("asp_env.evaluation.selection.load_predictor", load)
+    config = Drive(
+        data=str(crossings),
+        out=NOWHERE,
+        predictors=("constant-turn-rate", "oracle"),
+        max_scenarios=4,
+        controls=True,
+    )
+    result = drive(config)
+    assert [method.predictor for method in result.methods] == [
+        "", "constant-turn-rate", "oracle",
+        "blind", "constant-velocity", "blend:0.25", "blend:0.5", "blend:0.75",
+    ]  # fmt: skip
+    metrics = _values(result, "sampling", "constant-turn-rate")
+    assert metrics["score - constant-velocity"] == 0.0  # here both are constant velocity
+    assert 0.0 <= metrics["oracle share"] <= 1.0
+    other = drive(dataclasses.replace(config, traffic="idm"))  # does not follow the recording
+    assert "oracle share" not in _values(other, "sampling", "constant-turn-rate")
+
+
+def test_differences_refer_to_any_predictor(crossings):
+    """By default to constant velocity, if it takes part."""
+    config = Drive(
+        data=str(crossings), out=NOWHERE, predictors=("oracle", "constant-turn-rate"),
+        max_scenarios=3, reference="constant-turn-rate",
+    )  # fmt: skip
+    row = next(r for r in drive(config).rows if r.metric == "score - constant-turn-rate")
+    assert row.planner == "expert"
+    assert row.mde is not None
+    none = drive(dataclasses.replace(config, reference=None))
+    assert not any(" - " in row.metric for row in none.rows)
 
 
 @pytest.mark.parametrize("traffic", ["log", "idm"])
@@ -240,6 +294,7 @@ def test_a_run_writes_its_folder(crossings, tmp_path):
     out = tmp_path / "out"
     Drive(data=str(crossings), out=out, max_scenarios=2).run()
     names = {"scenarios.json", "metrics.csv", "manifest.json", "report.html", "rollouts"}
+    names.add("scenarios.csv")
     assert {path.name for path in out.iterdir()} == names
     methods = sorted(path.name for path in (out / "rollouts").iterdir())
     assert methods == ["expert", "sampling + constant-velocity"]
@@ -266,6 +321,8 @@ def test_a_run_writes_its_folder(crossings, tmp_path):
         ({"dt": 0.3}, "does not divide recordings of 25 Hz"),
         ({"jobs": 0}, "--jobs 0: expected at least 1 process"),
         ({"jobs": -2}, "--jobs -2: expected"),
+        ({"reference": "oracle"}, "--reference oracle: expected one of the predictors, constant"),
+        ({"predictors": ("mtp:none/*",)}, r"mtp:none/\*: no folder matches none/\*"),
     ],
     ids=lambda value: next(iter(value)) if isinstance(value, dict) else None,
 )

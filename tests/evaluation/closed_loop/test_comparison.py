@@ -44,11 +44,20 @@ def network(tmp_path_factory: pytest.TempPathFactory) -> str:
     return f"dkm:{save_random(tmp_path_factory.mktemp('runs') / 'dkm', 'dkm', 'vectors')}"
 
 
+@pytest.fixture(scope="module")
+def runs(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A folder with two training runs of a DKM with random weights."""
+    folder = tmp_path_factory.mktemp("seeds")
+    for seed in (0, 1):
+        save_random(folder / f"seed{seed}", "dkm", "vectors", seed=seed)
+    return folder
+
+
 def methods(*predictors: str, planner: str = "sampling", traffic: str = "log") -> Methods:
     return Methods(
         data="",
         planner=planner,
-        predictors=predictors,
+        predictors={name: (name,) for name in predictors},
         traffic=traffic,
         rules="pdms",
         horizon_s=3.0,
@@ -177,23 +186,56 @@ def test_networks_run_on_one_thread(
 
 
 def test_the_number_of_processes_changes_nothing(
-    crossings: Path, network: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    crossings: Path, network: str, runs: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Every file of a run is the same, with a network and with traffic that draws samples."""
+    """Every file of a run is the same, with two networks and with traffic that draws samples."""
     monkeypatch.setattr(comparison, "EPISODES_AT_ONCE", 2)
-    runs = {1: tmp_path / "one", 2: tmp_path / "two"}
-    for jobs, out in runs.items():
+    outs = {1: tmp_path / "one", 2: tmp_path / "two"}
+    for jobs, out in outs.items():
         Drive(
-            data=str(crossings), out=out, predictors=(network,), max_scenarios=4, jobs=jobs,
+            data=str(crossings), out=out, predictors=(f"dkm:{runs}/*",), max_scenarios=4, jobs=jobs,
             traffic=f"predictor:mode=sampled:{network}",
         ).run()  # fmt: skip
     one, two = (
         {str(path.relative_to(out)): path.read_bytes() for path in out.rglob("*") if path.is_file()}
-        for out in runs.values()
+        for out in outs.values()
     )
-    assert sum(name.endswith(".npz") for name in one) == 8
-    assert {"metrics.csv", "manifest.json", "scenarios.json", "report.html"} < set(one)
+    assert sum(name.endswith(".npz") for name in one) == 12
+    assert {"scenarios.csv", "metrics.csv", "manifest.json", "scenarios.json", "report.html"} < set(
+        one
+    )
     assert one == two
+
+
+def test_runs_of_a_predictor_are_one_method(crossings: Path, runs: Path) -> None:
+    """Each run drives all scenarios; the scores of the method are the means over the runs."""
+    pattern = f"dkm:{runs}/*"
+    config = Drive(
+        data=str(crossings), out=Path("unused"), predictors=(pattern, "constant-velocity"),
+        max_scenarios=4,
+    )  # fmt: skip
+    result = drive.drive(config)
+    names = [f"dkm:{runs}/seed{seed}" for seed in (0, 1)]
+    expert, method, reference = result.methods
+    assert (expert.planner, method.predictor) == ("expert", pattern)
+    assert list(method.runs) == names
+    assert list(reference.runs) == ["constant-velocity"]
+    assert list(result.rollouts) == [
+        "expert", "sampling + dkm seed0", "sampling + dkm seed1", "sampling + constant-velocity",
+    ]  # fmt: skip
+    assert result.manifest["runs"] == {pattern: names}
+    (score,) = [
+        row
+        for row in result.rows
+        if (row.predictor, row.metric, row.subset) == (pattern, "score", "all")
+    ]
+    alone = [
+        drive.drive(dataclasses.replace(config, predictors=(name,))).methods[1].metric("score")
+        for name in names
+    ]
+    assert np.array_equal(method.metric("score").value, np.concatenate([a.value for a in alone]))
+    assert score.value == pytest.approx(np.mean([a.value for a in alone]))
+    assert (score.n, score.runs) == (4, 2)
 
 
 def test_an_error_in_a_process_is_one_line(

@@ -71,6 +71,23 @@ def test_the_oracle_has_no_error(crossings):
         assert rows["constant-velocity", selection, "all", "FDE"].value > 0.1
 
 
+def test_delays_by_hand(tmp_path):
+    """At 0.5 m/s², 0.4 s late: ¼ · 3.4² m short at constant velocity, 2.89 m after 3 s.
+
+    With `delayed:14:constant-turn-rate`, which needs 17 ticks of history, all predictors are
+    compared on the targets that have them: at ticks 18, 21, …, 45, one fewer than without.
+    """
+    recording = (car(-90, 5, (20.0, 0.5, 0.0)),)
+    write_crossing(tmp_path, drives=(recording, recording), seconds=12.0)
+    late = ("delayed:2:constant-velocity", "delayed:14:constant-turn-rate")
+    for predictors, count in ((late[:1], 11), (late, 10)):
+        rows = _evaluate(tmp_path, *predictors)
+        for name, error_m in zip(predictors, (2.89, 0.25 * 5.8**2), strict=False):
+            row = rows[name, "most-probable", "all", "FDE"]
+            assert row.value == pytest.approx(error_m, abs=5e-3)
+            assert row.n == 2 * count
+
+
 def test_standing_targets_are_not_in_the_moving_subset(tmp_path):
     """One car drives, the other one waits all the time."""
     waiting = car(30, 0, y_m=1.75, appears_s=0.2)

@@ -198,7 +198,7 @@ def test_metrics_of_several_modes_by_hand() -> None:
     expected = np.log(2 * np.pi) - np.log(density)
     assert scores.of("forks", "NLL", "").values == pytest.approx(expected, abs=1e-3)
     assert scores.of("forks", "Brier", "").values == pytest.approx(0.4**2 + 0.25**2 + 0.15**2)
-    rows = make_rows(scores, {"forks": Forks()}, data="d", horizon_s=3.0)
+    rows = make_rows(scores, {"forks": Forks()}, {"forks": ["forks"]}, data="d", horizon_s=3.0)
     (ece,) = [row for row in rows if (row.metric, row.subset) == ("ECE", "moving")]
     # Three bins of a third of all modes each: |0.6 - 1|, |0.25 - 0| and |0.15 - 0|.
     assert ece.value == pytest.approx((0.4 + 0.25 + 0.15) / 3, abs=1e-6)
