@@ -12,6 +12,7 @@ import tyro
 
 from asp_env.errors import AspEnvError, MissingExtraError
 from scenarios.sumo.dataset import synthesize
+from scenarios.sumo.demand import Traffic
 
 SEEDS = {"intersection": 14, "roundabout": 0}
 """Chosen by viewing: all classes and all turns occur, and traffic does not jam."""
@@ -60,6 +61,10 @@ class Synthesize:
             written to `truth/`.
         locations: Number of locations; by default one for every three recordings. A site of
             highway-env has a single location.
+        traffic: `normal`, or `dense`: vehicles follow each other after 3 to 6 s on the main road,
+            more of them turn left across oncoming traffic, drivers differ in whether they yield,
+            and vehicles leave two-lane roundabouts from both lanes. Sites of SUMO only.
+        jobs: Number of processes; the bytes do not depend on it.
     """
 
     out: Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="OUT")]
@@ -69,6 +74,8 @@ class Synthesize:
     seed: int = 0
     noise: bool = False
     locations: int | None = None
+    traffic: Traffic = "normal"
+    jobs: int = 1
 
     def run(self) -> None:
         """Writes the folder.
@@ -88,6 +95,8 @@ class Synthesize:
             seed=self.seed,
             noise=self.noise,
             locations=self.locations,
+            traffic=self.traffic,
+            jobs=self.jobs,
             progress=True,
         )
 
@@ -95,6 +104,10 @@ class Synthesize:
         if self.locations not in (None, 1):
             raise AspEnvError(
                 f"--locations {self.locations}: {self.site} has a single location; leave it out"
+            )
+        if self.traffic != "normal":
+            raise AspEnvError(
+                f"--traffic {self.traffic}: {self.site} has traffic of its own; leave it out"
             )
         try:
             from scenarios.highway import dataset
@@ -107,6 +120,7 @@ class Synthesize:
             minutes=self.minutes,
             seed=self.seed,
             noise=self.noise,
+            jobs=self.jobs,
             progress=True,
         )
 

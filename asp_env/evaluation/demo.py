@@ -19,11 +19,11 @@ from asp_env.evaluation.closed_loop.scenario_table import write_scenario_table
 from asp_env.evaluation.open_loop.evaluate import Evaluate, OpenLoopResult, evaluate
 from asp_env.evaluation.report import check_report_possible, write_report
 from asp_env.evaluation.results import write_manifest, write_metrics
-from asp_env.evaluation.tables import driving_tables, open_loop_tables
+from asp_env.evaluation.tables import driving_tables, headlines, open_loop_tables, regret_tables
 from asp_env.files import atomic_folder
 from asp_env.metrics.driving.rules import DEFAULT_RULES, RULES
 
-TRAFFIC = {"site": "intersection"}
+TRAFFIC = {"site": "intersection", "traffic": "dense"}
 """Options of `asp-env synthesize` for all traffic of the demo."""
 HELD_OUT = {"recordings": 20, "locations": 20, "minutes": 1.5, "seed": 48_271}
 """Recordings to evaluate on. Every one has a location of its own, because scenarios of one
@@ -38,11 +38,11 @@ into blocks of time, so that all locations are trained on."""
 PRETRAINED = f"{PREDICTOR}:pretrained"
 
 PHYSICAL = ("constant-velocity", "constant-turn-rate")
-CONTROLS = ("oracle", "constant-velocity")
-"""Predictors that are compared with the trained ones in open loop and in closed loop."""
+"""Predictors that are compared with the trained ones in open loop. In closed loop these are the
+controls of `asp-env drive --controls`."""
 
 PLANNER = "sampling"
-SCENARIOS = ""
+SCENARIOS = "interactive"
 """Filter of the scenarios that every method drives."""
 MAX_SCENARIOS = 160
 
@@ -93,7 +93,8 @@ class Demo:
         _simulate(console, held_out, HELD_OUT)
         if not (run / "config.json").exists():
             console.rule(f"Evaluating the forecasts of {PRETRAINED}")
-            _show(console, self.out, self._forecast(held_out, PRETRAINED), lead=FIRST_LEAD)
+            first = self._forecast(held_out, PRETRAINED, planner="none")
+            _show(console, self.out, first, lead=FIRST_LEAD)
             training = self.out / "traffic"
             _simulate(console, training, TRAINING)
             console.rule(f"Training the predictor {PREDICTOR}")
@@ -105,24 +106,31 @@ class Demo:
                 data=str(held_out),
                 out=self.out,
                 planner=PLANNER,
-                predictors=(*CONTROLS, *learned),
+                predictors=learned,
+                controls=True,
                 scenarios=SCENARIOS,
                 max_scenarios=MAX_SCENARIOS,
                 jobs=os.cpu_count() or 1,
             )
         )
-        _show(console, self.out, self._forecast(held_out, *learned), closed_loop, lead=LEAD)
+        open_loop = self._forecast(held_out, *learned, planner=PLANNER)
+        _show(console, self.out, open_loop, closed_loop, lead=LEAD)
 
-    def _forecast(self, data: Path, *learned: str) -> OpenLoopResult:
-        """Evaluates trained predictors beside physical ones."""
-        return evaluate(Evaluate(data=str(data), out=self.out, predictors=(*PHYSICAL, *learned)))
+    def _forecast(self, data: Path, *learned: str, planner: str) -> OpenLoopResult:
+        """Evaluates trained predictors beside physical ones, and the regret of a planner."""
+        return evaluate(
+            Evaluate(
+                data=str(data), out=self.out, predictors=(*PHYSICAL, *learned), planner=planner
+            )
+        )
 
 
 def _simulate(console: Console, folder: Path, options: dict[str, Any]) -> None:
     """Generates traffic, unless the folder exists."""
     if not folder.exists():
         console.rule(f"Simulating traffic: {folder}")
-        _run_command("synthesize", out=folder, **TRAFFIC, **options)
+        jobs = os.cpu_count() or 1
+        _run_command("synthesize", out=folder, jobs=jobs, **TRAFFIC, **options)
 
 
 def _show(
@@ -158,10 +166,13 @@ def _show(
     for table in open_loop_tables(open_loop.rows, open_loop.manifest["privileged"]):
         console.print(table)
     if closed_loop is not None:
-        shown = RULES[DEFAULT_RULES].shown
-        privileged = closed_loop.manifest["privileged"]
-        for table in driving_tables(closed_loop.rows, privileged, shown):
+        for table in regret_tables(open_loop.rows, planner=PLANNER):
             console.print(table)
+        rows, privileged = closed_loop.rows, closed_loop.manifest["privileged"]
+        for table in driving_tables(rows, privileged, RULES[DEFAULT_RULES].shown):
+            console.print(table)
+        for sentence in headlines(rows, privileged):
+            console.print(sentence)
     console.print(f"wrote {out / 'report.html'}")
 
 

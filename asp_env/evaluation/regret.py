@@ -86,29 +86,31 @@ class RegretScores:
     recording: Int[np.ndarray, " n"]
     """Index of each state's recording, over which intervals are resampled."""
 
-    def estimates(
-        self, runs: Sequence[str], *, stream: int = 0
-    ) -> Iterator[tuple[str, str, Estimate]]:
-        """Subset, metric and estimate of a predictor's metrics.
+    def estimates(self, *runs: str, stream: int = 0) -> Iterator[tuple[str, str, Estimate]]:
+        """Subset, metric and estimate of the metrics of a method.
 
         Args:
-            runs: names of its training runs; one name for a predictor without several runs.
-            stream: as for `statistics.resampled_sums`.
+            *runs: names of the method's training runs, or the name of one predictor.
+            stream: number of the sequence of random numbers that resamples runs.
         """
         for subset, member in self.subsets.items():
-            regret = np.stack([self.regrets[run][member] for run in runs])
-            reference = np.broadcast_to(self.regrets[REFERENCE][member], regret.shape)
-            per_state = {REGRET: (regret, np.ones(regret.shape))}
-            per_state[LOG_REGRET] = (np.log1p(regret), np.ones(regret.shape))
-            if [*runs] != [REFERENCE] and reference.any():
-                per_state[REMOVED] = (reference - regret, reference)
-            for metric, parts in per_state.items():
-                sums = statistics.resampled_sums(
-                    np.stack(parts, axis=-1), self.recording[member], stream=stream
+            regret, groups = (
+                np.stack([self.regrets[run] for run in runs])[:, member],
+                self.recording[member],
+            )
+            ones = np.ones(len(groups))
+            for metric, values in ((REGRET, regret), (LOG_REGRET, np.log1p(regret))):
+                yield (
+                    subset,
+                    metric,
+                    statistics.ratio_over_runs(values, ones, groups, stream=stream),
                 )
-                with np.errstate(invalid="ignore", divide="ignore"):
-                    ratios = sums[..., 0] / sums[..., 1]
-                yield subset, metric, statistics.interval(ratios, n=int(member.sum()))
+            reference = self.regrets[REFERENCE][member]
+            if runs != (REFERENCE,) and reference.any():
+                removed = statistics.ratio_over_runs(
+                    reference - regret, reference, groups, stream=stream
+                )
+                yield subset, REMOVED, removed
 
 
 def score_regrets(

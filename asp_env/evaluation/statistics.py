@@ -96,6 +96,28 @@ def ratio(
     return from_sums(parts, groups, lambda sums: sums[..., 0] / sums[..., 1])
 
 
+def ratio_over_runs(
+    numerators: Shaped[np.ndarray, "runs n"],
+    denominators: Shaped[np.ndarray, "*runs n"],
+    groups: Shaped[np.ndarray, " n"],
+    *,
+    stream: int = 0,
+) -> Estimate:
+    """Ratio of two sums over the samples of all training runs.
+
+    Args:
+        numerators: one value for each run and each of n > 0 samples.
+        denominators: one value for each sample, of every run or shared by all runs; with the mask
+            of the samples that have a value, the ratio is the mean.
+        groups: recording that each sample is from, as numbers or names.
+        stream: number of the sequence of random numbers, as for `resampled_sums`.
+    """
+    parts = np.stack(np.broadcast_arrays(numerators, denominators), axis=-1)
+    sums = resampled_sums(parts, groups, stream=stream)
+    with np.errstate(invalid="ignore", divide="ignore"):
+        return interval(sums[:, 0] / sums[:, 1], n=len(groups))
+
+
 def from_sums(
     parts: Shaped[np.ndarray, "n ..."],
     groups: Shaped[np.ndarray, " n"],

@@ -30,9 +30,6 @@ FORECAST_MORE = {
 
 REGRET_INTERVALS: Headings = {"regret": "regret", "regret removed": "removed"}
 REGRET_VALUES: Headings = {"log1p regret": "log1p"}
-REGRET_SUBSETS = ("all", "interactive")
-"""The subsets of scenarios for which planning regret is printed."""
-
 DRIVING_INTERVALS: Headings = {SCORE: "score"}
 DRIVING_VALUES: Headings = {
     "no collision": "no coll.",
@@ -57,6 +54,9 @@ DRIVING_VALUES: Headings = {
     "time lost": "lost s",
     "driving cost": "cost s",
 }
+
+SUBSETS = ("all", "interactive")
+"""Subsets of scenarios that are printed, as far as they occur."""
 
 MAX_PADDED_COLUMNS = 5
 """With more metrics than this, columns have no padding, so that a table fits 80 columns."""
@@ -103,7 +103,7 @@ def open_loop_tables(rows: Sequence[Row], privileged: Collection[str] = ()) -> l
 def regret_tables(
     rows: Sequence[Row], privileged: Collection[str] = (), *, planner: str
 ) -> list[Table]:
-    """Planning regret by predictor, a table for each of `REGRET_SUBSETS` that occurs.
+    """Planning regret by predictor, a table for each of `SUBSETS` that occurs.
 
     Args:
         rows: open-loop rows of `metrics.csv`.
@@ -113,21 +113,21 @@ def regret_tables(
     shown = {*REGRET_INTERVALS, *REGRET_VALUES}
     short = short_names([row.predictor for row in rows])
     tables = []
-    for subset in REGRET_SUBSETS:
+    for subset in SUBSETS:
         lines: dict[str, dict[str, Row]] = {}
         for row in rows:
             if row.subset == subset and row.metric in shown:
-                name = short[row.predictor] + (MARK if row.predictor in privileged else "")
+                name = (
+                    short[row.predictor]
+                    + _runs(row)
+                    + (MARK if row.predictor in privileged else "")
+                )
                 lines.setdefault(name, {})[row.metric] = row
         if lines:
             title = f"planning regret, {planner}, {subset} scenarios"
             tables.append(_table(title))
             _fill(tables[-1], "predictor", lines, REGRET_INTERVALS, REGRET_VALUES)
     return tables
-
-
-SUBSETS = ("all", "interactive")
-"""Subsets of scenarios that are printed, as far as they occur."""
 
 
 def driving_tables(

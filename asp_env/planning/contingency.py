@@ -83,9 +83,9 @@ class ContingencyWeights:
     """A contact while the ego stands in the way of an agent that is not behind it."""
     critical: float = 60.0
     """A time to collision within the bound."""
-    closeness: float = 10.0
+    closeness: float = 15.0
     """A contact with margins."""
-    later: float = 0.5
+    later: float = 0.9
     """Share by which these cost less at the end of the horizon than now."""
     progress: float = 1.0
     """Per metre gained along the route; subtracted."""

@@ -23,8 +23,8 @@ Different from the paper:
   speed no harder than `TARGET_BRAKING_MPS2`.
 - The driving direction is not scored; a proposal pays for its offset from the route instead.
 - The comfort of a proposal includes the ego's past second.
-- The ego brakes at any speed, not only below 5 m/s, unless a collision within 2 s would become more
-  probable.
+- The ego brakes at any speed, not only up to 5 m/s as in the authors' code, tuplan_garage, unless a
+  collision within 2 s would become more probable.
 """
 
 import itertools
@@ -58,6 +58,10 @@ SPEED_SHARES = (1.0, 0.8, 0.6, 0.4, 0.2)
 
 OFFSETS_M = (0.0, -1.0, 1.0)
 """Offsets of the proposals to the left of the route (Dauner et al.)."""
+
+ACCELERATION_MPS2 = 2.0
+"""Maximum acceleration of the intelligent driver model of the proposals. Balances progress against
+nuPlan's comfort bound of 2.4 m/s²; `IDM` has 1.5 m/s². Chosen by hand."""
 
 EMERGENCY_S = 2.0
 """The ego brakes if the best proposal collides within this time (Dauner et al.)."""
@@ -151,10 +155,10 @@ class PDMPlanner:
 
         Args:
             weights: of the score, by default `PDMWeights()`.
-            idm: parameters of the proposals, by default `IDM()`.
+            idm: parameters of the proposals, by default with `ACCELERATION_MPS2`.
         """
         self.weights = weights or PDMWeights()
-        self._idm = idm or IDM()
+        self._idm = idm or IDM(max_acceleration_mps2=ACCELERATION_MPS2)
         self._cache = RouteCache(self._idm, map_limits=True)
         pairs = [*itertools.product(SPEED_SHARES, OFFSETS_M), (0.0, 0.0)]
         self._profiles = np.array(pairs)

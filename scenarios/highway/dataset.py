@@ -4,8 +4,6 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-from rich.console import Console
-from rich.progress import track as with_progress
 
 from asp_env.data.cache import get_or_create
 from asp_env.errors import AspEnvError, unknown_name
@@ -22,6 +20,7 @@ from scenarios.highway.rounds import (
 )
 from scenarios.highway.sites import SITES, STEP_S, STEPS_PER_S, Site, network
 from scenarios.noise import measure
+from scenarios.processes import run_with_progress
 from scenarios.tables import Meta, Track, write_recording_meta, write_tracks, write_tracks_meta
 
 MOST_MINUTES = 60.0
@@ -45,14 +44,39 @@ class _Recorded:
     hidden: HiddenHistory
 
 
+@dataclass(frozen=True, slots=True, kw_only=True)
+class _Content:
+    """What `synthesize` writes. It writes one recording at a time, in any process and order."""
+
+    folder: Path
+    sites: tuple[str, ...]
+    rounds: int
+    seed: int
+    noise: bool
+
+    def write_map(self, location: int) -> None:
+        site = self.sites[location]
+        maps = self.folder / "maps" / "lanelets" / f"{location:02d}_{site}"
+        maps.mkdir(parents=True)
+        write_road_map(maps / f"location{location}.osm", network(site), origin_utm_m=ORIGIN_UTM_M)
+
+    def write_recording(self, number: int) -> None:
+        location = number % len(self.sites)
+        site = self.sites[location]
+        rng = np.random.default_rng([self.seed, [*SITES].index(site), number])
+        recorded = _record(SITES[site], rng, self.rounds)
+        _write(self, SITES[site], recorded, rng, number=number, location=location)
+
+
 def synthesize(
     out: Path,
     *,
-    site: str,
+    site: str | tuple[str, ...],
     recordings: int,
     minutes: float,
     seed: int,
     noise: bool = False,
+    jobs: int = 1,
     progress: bool = False,
 ) -> None:
     """Generates highway-env's traffic in the inD layout, 15 frames per second.
@@ -62,41 +86,46 @@ def synthesize(
 
     Args:
         out: folder to create; may exist if it is empty.
-        site: `intersection` or `roundabout`.
+        site: `intersection` or `roundabout`; or several sites, which the recordings have in turn.
         recordings: number of recordings.
         minutes: length of each recording, rounded up to whole rounds.
         seed: the same seed gives the same bytes on the same machine.
         noise: whether to write measured instead of true tracks; the true tracks go to
             `truth/XX_trueTracks.csv`, which readers ignore.
+        jobs: number of processes; the bytes do not depend on it.
         progress: whether to show a progress bar.
 
     Raises:
         AspEnvError: the site is unknown, a number is out of range, or the folder cannot be written.
     """
-    if site not in SITES:
-        raise unknown_name("site", f"highway:{site}", [f"highway:{name}" for name in SITES])
+    sites = (site,) if isinstance(site, str) else site
+    for each in sites:
+        if each not in SITES:
+            raise unknown_name("site", f"highway:{each}", [f"highway:{name}" for name in SITES])
     if recordings < 1 or not 0.0 < minutes <= MOST_MINUTES or seed < 0:
         raise AspEnvError(
             f"{recordings} recordings of {minutes} minutes with seed {seed} cannot be made: at "
             f"least one recording, at most {MOST_MINUTES:g} minutes, and a seed of 0 or above"
         )
-    place = SITES[site]
-    rounds = int(np.ceil(minutes * 60.0 / ROUND_S - 1e-9))
     with atomic_folder(out) as folder:
-        maps = folder / "maps" / "lanelets" / f"00_{site}"
-        maps.mkdir(parents=True)
-        write_road_map(maps / "location0.osm", network(site), origin_utm_m=ORIGIN_UTM_M)
+        content = _Content(
+            folder=folder.absolute(),
+            sites=sites,
+            rounds=int(np.ceil(minutes * 60.0 / ROUND_S - 1e-9)),
+            seed=seed,
+            noise=noise,
+        )
+        for location in range(len(sites)):
+            content.write_map(location)
         for name in ("data", FOLDER):
             (folder / name).mkdir()
-        for number in with_progress(
-            range(recordings),
-            f"highway-env {site} traffic",
-            console=Console(stderr=True),
-            disable=not progress,
-        ):
-            rng = np.random.default_rng([seed, [*SITES].index(site), number])
-            recorded = _record(place, rng, rounds)
-            _write(folder, place, recorded, rng, number=number, rounds=rounds, noise=noise)
+        run_with_progress(
+            content.write_recording,
+            recordings,
+            f"highway-env {' and '.join(sites)} traffic",
+            jobs=jobs,
+            progress=progress,
+        )
 
 
 def _record(site: Site, rng: np.random.Generator, rounds: int) -> _Recorded:
@@ -126,27 +155,27 @@ def _record(site: Site, rng: np.random.Generator, rounds: int) -> _Recorded:
 
 
 def _write(
-    folder: Path,
+    content: _Content,
     site: Site,
     recorded: _Recorded,
     rng: np.random.Generator,
     *,
     number: int,
-    rounds: int,
-    noise: bool,
+    location: int,
 ) -> None:
+    folder, noise = content.folder, content.noise
     stem = f"{number:02d}"
     true = [_track(site, seen) for seen in recorded.vehicles]
     shown = [_measured(rng, track) for track in true] if noise else true
     lat, lon = ORIGIN_LAT_LON_DEG
     meta = Meta(
         recording=number,
-        location=0,
+        location=location,
         frame_rate_hz=float(STEPS_PER_S),
         speed_limit_mps=site.speed_limit_mps,
         weekday="monday",
         start_hour=8,
-        num_frames=rounds * ROUND_S * STEPS_PER_S,
+        num_frames=content.rounds * ROUND_S * STEPS_PER_S,
         lat_deg=lat,
         lon_deg=lon,
         utm_origin_m=ORIGIN_UTM_M,

@@ -2,22 +2,22 @@
 
 import shutil
 import tempfile
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 from jaxtyping import Float
-from rich.console import Console
-from rich.progress import track as with_progress
 
 from asp_env.data.cache import get_or_create
 from asp_env.errors import AspEnvError, unknown_name
 from asp_env.files import atomic_folder
 from asp_env.geometry import boxes_overlap
 from scenarios.noise import measure
-from scenarios.sumo.demand import RoadUser, demand
+from scenarios.processes import run_with_progress
+from scenarios.sumo.demand import RoadUser, Traffic, demand
 from scenarios.sumo.motion import FRAME_RATE_HZ, Motion, reconstruct
 from scenarios.sumo.network import Movements, simulate
-from scenarios.sumo.place import METRES_PER_ORTHO_PIXEL, SITES, Place, make_place
+from scenarios.sumo.place import DENSE_SITES, METRES_PER_ORTHO_PIXEL, SITES, Place, make_place
 from scenarios.tables import Meta, Track, write_recording_meta, write_tracks, write_tracks_meta
 
 EVERY_FRAMES = 5
@@ -94,7 +94,7 @@ def overlapping(motions: dict[str, Motion], users: dict[str, RoadUser]) -> set[t
 
 
 def record(
-    rng: np.random.Generator, place: Place, *, num_frames: int
+    rng: np.random.Generator, place: Place, *, num_frames: int, traffic: Traffic = "normal"
 ) -> tuple[dict[str, Motion], dict[str, RoadUser]]:
     """Simulates traffic at a location without overlapping agents.
 
@@ -106,17 +106,24 @@ def record(
         rng: draws the demand and SUMO's seed.
         place: the location.
         num_frames: length of the recording.
+        traffic: `normal` or `dense`.
 
     Returns:
         All motions in the recording's frame and all agents, both by name.
     """
     seconds = WARM_UP_S + num_frames / FRAME_RATE_HZ + _AFTER_S
-    wanted = demand(rng, place.site, seconds)
+    wanted = demand(rng, place.site, seconds, traffic)
     seed = int(rng.integers(1, 2**31 - 1))
     motions: dict[str, Motion] = {}
     late: set[str] = set()
     for _ in range(_MOST_ATTEMPTS):
-        moved = simulate(place.folder, wanted.routes, seconds=seconds, seed=seed)
+        moved = simulate(
+            place.folder,
+            wanted.routes,
+            seconds=seconds,
+            seed=seed,
+            impatient=traffic == "dense",
+        )
         motions = _motions(moved, place, wanted.users)
         departs = {name: depart for depart, name, _ in wanted.entries}
         late = {
@@ -244,6 +251,47 @@ def parked_cars(rng: np.random.Generator, place: Place, num_frames: int) -> list
     return tracks
 
 
+@dataclass(frozen=True, slots=True, kw_only=True)
+class _Content:
+    """What `synthesize` writes. It writes one location at a time, in any process and order."""
+
+    folder: Path
+    site: str
+    recordings: int
+    locations: int
+    minutes: float
+    seed: int
+    noise: bool
+    traffic: Traffic
+    compress: bool
+
+    def write_location(self, location: int) -> None:
+        """Writes the map of a location and its recordings."""
+        with tempfile.TemporaryDirectory() as scratch:
+            place = self._place(location, Path(scratch))
+            mine = [
+                recording
+                for recording in range(self.recordings)
+                if recording * self.locations // self.recordings == location
+            ]
+            for recording in mine:
+                rng = self._rng(1, recording)
+                _write_recording(self, place, rng, recording=recording, location=location)
+
+    def _place(self, location: int, scratch: Path) -> Place:
+        rng = self._rng(0, location)
+        kinds = SITES[self.site] if self.traffic == "normal" else DENSE_SITES[self.site]
+        place = make_place(rng, kinds[location % len(kinds)](rng), scratch / str(location))
+        maps = self.folder / "maps" / "lanelets" / f"{location:02d}_{place.site.kind}"
+        maps.mkdir(parents=True)
+        place.write_map(maps / f"location{location}.osm")
+        place.write_picture(place.folder / "background.png")
+        return place
+
+    def _rng(self, purpose: int, number: int) -> np.random.Generator:
+        return np.random.default_rng([self.seed, list(SITES).index(self.site), purpose, number])
+
+
 def synthesize(
     out: Path,
     *,
@@ -253,7 +301,9 @@ def synthesize(
     seed: int,
     noise: bool = False,
     locations: int | None = None,
+    traffic: Traffic = "normal",
     compress: bool = False,
+    jobs: int = 1,
     progress: bool = False,
 ) -> None:
     """Generates traffic in the inD layout.
@@ -268,7 +318,9 @@ def synthesize(
         noise: whether to write measured instead of true tracks; the true tracks go to
             `truth/XX_trueTracks.csv`, which readers ignore.
         locations: number of locations; by default one for three recordings.
+        traffic: `normal` or `dense`.
         compress: whether to write tracks as `.csv.gz`.
+        jobs: number of processes; the bytes do not depend on it.
         progress: whether to show a progress bar.
 
     Raises:
@@ -284,60 +336,34 @@ def synthesize(
             "cannot be made: expected at least one recording of a second or more, at least one "
             "location and no more locations than recordings, and a seed of 0 or more"
         )
-    with atomic_folder(out) as folder, tempfile.TemporaryDirectory() as scratch:
-        made: dict[int, Place] = {}
-        for recording in with_progress(
-            range(recordings),
-            f"{site} traffic",
-            console=Console(stderr=True),
-            disable=not progress,
-        ):
-            location = recording * places // recordings
-            if location not in made:
-                made[location] = _make_location(folder, Path(scratch), site, seed, location)
-            _write_recording(
-                folder,
-                made[location],
-                _rng(seed, site, 1, recording),
-                recording=recording,
-                location=location,
-                num_frames=round(minutes * 60.0 * FRAME_RATE_HZ),
-                noise=noise,
-                suffix=".csv.gz" if compress else ".csv",
-            )
-
-
-def _rng(seed: int, site: str, purpose: int, number: int) -> np.random.Generator:
-    return np.random.default_rng([seed, list(SITES).index(site), purpose, number])
-
-
-def _make_location(folder: Path, scratch: Path, site: str, seed: int, location: int) -> Place:
-    rng = _rng(seed, site, 0, location)
-    kinds = SITES[site]
-    place = make_place(rng, kinds[location % len(kinds)](rng), scratch / str(location))
-    maps = folder / "maps" / "lanelets" / f"{location:02d}_{place.site.kind}"
-    maps.mkdir(parents=True)
-    place.write_map(maps / f"location{location}.osm")
-    place.write_picture(place.folder / "background.png")
-    return place
+    with atomic_folder(out) as folder:
+        content = _Content(
+            folder=folder.absolute(),
+            site=site,
+            recordings=recordings,
+            locations=places,
+            minutes=minutes,
+            seed=seed,
+            noise=noise,
+            traffic=traffic,
+            compress=compress,
+        )
+        run_with_progress(
+            content.write_location, places, f"{site} traffic", jobs=jobs, progress=progress
+        )
 
 
 def _write_recording(
-    folder: Path,
-    place: Place,
-    rng: np.random.Generator,
-    *,
-    recording: int,
-    location: int,
-    num_frames: int,
-    noise: bool,
-    suffix: str,
+    content: _Content, place: Place, rng: np.random.Generator, *, recording: int, location: int
 ) -> None:
-    motions, users = record(rng, place, num_frames=num_frames)
+    folder = content.folder
+    suffix = ".csv.gz" if content.compress else ".csv"
+    num_frames = round(content.minutes * 60.0 * FRAME_RATE_HZ)
+    motions, users = record(rng, place, num_frames=num_frames, traffic=content.traffic)
     parked = parked_cars(rng, place, num_frames)
     true = parked + tracks_in_view(place, motions, users, num_frames=num_frames)
     seen = true
-    if noise:
+    if content.noise:
         moving = tracks_in_view(place, motions, users, num_frames=num_frames, noise=rng)
         seen = parked + moving
         (folder / "truth").mkdir(exist_ok=True)

@@ -1,11 +1,15 @@
 """Demand: which agents appear, when, on which route, and with which driver parameters."""
 
 from dataclasses import dataclass
+from typing import Literal
 
 import numpy as np
 
-from asp_env.geometry import wrap_scalar
-from scenarios.sumo.sites import Arm, Site
+from scenarios.sumo.drivers import dense_driver
+from scenarios.sumo.sites import LEFT_TURN_RAD, Arm, Site, right_turn_rad
+
+Traffic = Literal["normal", "dense"]
+"""`dense` has more vehicles, more left turns and drivers of four temperaments."""
 
 VEHICLES_PER_HOUR = {
     "crossroads": (850.0, 1150.0),
@@ -13,6 +17,22 @@ VEHICLES_PER_HOUR = {
     "roundabout": (1000.0, 1350.0),
     "two-lane-roundabout": (1050.0, 1400.0),
 }
+DENSE_VEHICLES_PER_HOUR = {
+    "crossroads": (1400.0, 1900.0),
+    "t-junction": (1400.0, 1900.0),
+    "roundabout": (1400.0, 1900.0),
+    "two-lane-roundabout": (2000.0, 2600.0),
+}
+"""On the main road of an intersection, vehicles follow each other after 3 to 6 s. Balances how many
+vehicles meet against jams. Chosen by hand."""
+
+DENSE_FAR_ROUND_LEFT = 0.6
+"""Share of the vehicles that pass more than half of a ring and enter it on the left lane, in dense
+traffic; the others pass it on the outer lane. Chosen by hand."""
+
+DENSE_LEFT_TURNS = 1.8
+"""Odds of a left turn in dense traffic, relative to those in normal traffic. Chosen by hand."""
+
 PEDESTRIANS_PER_HOUR = (130.0, 260.0)
 SHARES = {
     "car": 0.74,
@@ -73,21 +93,25 @@ class RoadUser:
     width_m: float
 
 
-def demand(rng: np.random.Generator, site: Site, seconds: float) -> Demand:
+def demand(
+    rng: np.random.Generator, site: Site, seconds: float, traffic: Traffic = "normal"
+) -> Demand:
     """Draws the agents that depart within `seconds` at a site."""
+    per_hour = VEHICLES_PER_HOUR if traffic == "normal" else DENSE_VEHICLES_PER_HOUR
     users: dict[str, RoadUser] = {}
     entries: list[tuple[float, str, str]] = []
     hours = seconds / 3600.0
     kinds, shares = list(SHARES), np.array(list(SHARES.values()))
     weights = np.array([arm.weight for arm in site.arms])
-    count = rng.poisson(hours * rng.uniform(*VEHICLES_PER_HOUR[site.kind]))
+    count = rng.poisson(hours * rng.uniform(*per_hour[site.kind]))
     for number in range(count):
         name = f"v{number}"
         depart = float(rng.uniform(0.0, seconds))
         kind = str(rng.choice(kinds, p=shares / shares.sum()))
-        begin, end = _route(rng, site.arms, weights, kind)
+        begin, end = _route(rng, site.arms, weights, kind, traffic)
         users[name] = _user(rng, kind)
-        entries.append((depart, name, _vehicle_xml(rng, name, users[name], depart, begin, end)))
+        vehicle = _vehicle_xml(rng, name, users[name], depart, begin, end, traffic)
+        entries.append((depart, name, vehicle))
     for number in range(rng.poisson(hours * rng.uniform(*PEDESTRIANS_PER_HOUR))):
         name = f"p{number}"
         depart = float(rng.uniform(0.0, seconds))
@@ -105,24 +129,36 @@ def _user(rng: np.random.Generator, kind: str) -> RoadUser:
     )
 
 
-def right_turn_rad(begin: Arm, end: Arm) -> float:
-    """Angle of the turn from one arm to another, right positive, rad."""
-    return float(wrap_scalar(begin.angle_rad + np.pi - end.angle_rad))
-
-
 def _route(
-    rng: np.random.Generator, arms: tuple[Arm, ...], weights: np.ndarray, kind: str
+    rng: np.random.Generator,
+    arms: tuple[Arm, ...],
+    weights: np.ndarray,
+    kind: str,
+    traffic: Traffic,
 ) -> tuple[Arm, Arm]:
     sharpest = SHARPEST_TURN_RAD.get(kind, np.pi)
     pairs = [(a, b) for a in range(len(arms)) for b in range(len(arms)) if a != b]
-    allowed = [(a, b) for a, b in pairs if right_turn_rad(arms[a], arms[b]) <= sharpest]
+    allowed = [
+        (a, b) for a, b in pairs if right_turn_rad(arms[a].angle_rad, arms[b].angle_rad) <= sharpest
+    ]
     chances = np.array([weights[a] * weights[b] for a, b in allowed])
+    if traffic == "dense":
+        angles = np.array(
+            [right_turn_rad(arms[a].angle_rad, arms[b].angle_rad) for a, b in allowed]
+        )
+        chances = np.where(angles < -LEFT_TURN_RAD, DENSE_LEFT_TURNS, 1.0) * chances
     begin, end = allowed[int(rng.choice(len(allowed), p=chances / chances.sum()))]
     return arms[begin], arms[end]
 
 
 def _vehicle_xml(
-    rng: np.random.Generator, name: str, user: RoadUser, depart: float, begin: Arm, end: Arm
+    rng: np.random.Generator,
+    name: str,
+    user: RoadUser,
+    depart: float,
+    begin: Arm,
+    end: Arm,
+    traffic: Traffic,
 ) -> str:
     heavy = user.kind in ("truck", "bus")
     top_mps = rng.uniform(4.0, 6.5) if user.kind == "bicycle" else 40.0
@@ -149,9 +185,9 @@ def _vehicle_xml(
         "jmCrossingGap": rng.uniform(2.0, 6.0),
         "impatience": rng.uniform(0.4, 0.8),
     }
-    # Lane 0 is the sidewalk. Vehicles that pass more than half of the ring start on the left.
-    far_round = right_turn_rad(begin, end) < -0.3 and not heavy
-    lane = begin.lanes if far_round and rng.random() < 0.9 else 1
+    if traffic == "dense":
+        parameters |= dense_driver(rng)
+    lane = _depart_lane(rng, user, begin, end, traffic)
     attributes = " ".join(
         f'{key}="{value}"' if isinstance(value, str) else f'{key}="{value:.4f}"'
         for key, value in parameters.items()
@@ -161,6 +197,22 @@ def _vehicle_xml(
         f'<trip id="{name}" type="t{name}" depart="{depart:.3f}" from="{begin.enter}" '
         f'to="{end.leave}" departSpeed="desired" departPos="base" departLane="{lane}"/>'
     )
+
+
+def _depart_lane(
+    rng: np.random.Generator, user: RoadUser, begin: Arm, end: Arm, traffic: Traffic
+) -> int:
+    """The lane on which a vehicle enters; lane 0 is the sidewalk.
+
+    In a ring, vehicles that pass more than half of it mostly start on the left. At a junction the
+    left lane is for left turns.
+    """
+    angle = right_turn_rad(begin.angle_rad, end.angle_rad)
+    if begin.left_turns_only:
+        return begin.lanes if angle < -LEFT_TURN_RAD else 1
+    left_share = 0.9 if traffic == "normal" else DENSE_FAR_ROUND_LEFT
+    far_round = angle < -0.3 and user.kind not in ("truck", "bus")
+    return begin.lanes if far_round and rng.random() < left_share else 1
 
 
 def _person_xml(

@@ -2,6 +2,7 @@
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 
 import cv2
@@ -11,7 +12,13 @@ from jaxtyping import Float, UInt8
 from scenarios.lanelet2 import Area, Border, Lanelet, to_degrees, write_map
 from scenarios.polylines import Polyline, dense
 from scenarios.sumo.network import build_network, lanelets
-from scenarios.sumo.sites import Site, crossroads, roundabout, t_junction, two_lane_roundabout
+from scenarios.sumo.sites import (
+    Site,
+    crossroads,
+    roundabout,
+    t_junction,
+    two_lane_roundabout,
+)
 
 METRES_PER_ORTHO_PIXEL = 0.01
 DOWNSCALE = 12
@@ -28,6 +35,12 @@ SITES: dict[str, tuple[Callable[[np.random.Generator], Site], ...]] = {
     "roundabout": (roundabout, two_lane_roundabout),
 }
 """Kinds of junction of a site; locations use them in turn."""
+
+DENSE_SITES = {
+    "intersection": (partial(crossroads, left_lanes=True), partial(t_junction, left_lanes=True)),
+    "roundabout": (roundabout, partial(two_lane_roundabout, leave_inside=True)),
+}
+"""The same for dense traffic."""
 
 JOIN_M = 0.06
 """Ends of netconvert's lines that are nearer than this belong together."""

@@ -9,6 +9,7 @@ from dataclasses import dataclass, field
 import numpy as np
 from jaxtyping import Float
 
+from asp_env.geometry import wrap_scalar
 from scenarios.polylines import Polyline, bezier, clothoid_like, polar
 
 SIDEWALK_M = 2.0
@@ -26,6 +27,9 @@ SWING_M = 0.8
 
 LIMITS_MPS = (11.11, 13.89)
 
+LEFT_TURN_RAD = np.radians(45.0)
+"""Routes that bend to the left by more than this are left turns."""
+
 CLOSE_MPS = 9.5
 """Speed limit between the crossing and the ring."""
 
@@ -42,6 +46,8 @@ class Arm:
     """Edge on which vehicles leave."""
     lanes: int
     """Number of lanes that enter."""
+    left_turns_only: bool = False
+    """Whether the leftmost of several lanes is for left turns only."""
     weight: float
     """Share of the traffic, relative to the other arms."""
 
@@ -106,13 +112,13 @@ def node_xml(name: str, point: np.ndarray, **attributes: str | float) -> str:
     return f'<node id="{name}" x="{point[0]:.3f}" y="{point[1]:.3f}"{more}/>'
 
 
-def connection_xml(begin: str, end: str, lane: int = 1) -> str:
-    """A connection from a lane of one edge to the same lane of the next.
+def connection_xml(begin: str, end: str, lane: int = 1, to_lane: int | None = None) -> str:
+    """A connection from a lane of one edge to a lane of the next, by default the same.
 
     Without a visibility distance SUMO's vehicles nearly stop before they check for others.
     """
     return (
-        f'<connection from="{begin}" to="{end}" fromLane="{lane}" toLane="{lane}" '
+        f'<connection from="{begin}" to="{end}" fromLane="{lane}" toLane="{to_lane or lane}" '
         f'visibility="{SIGHT_M}"/>'
     )
 
@@ -144,25 +150,46 @@ def parking_lot(
     )
 
 
-def crossroads(rng: np.random.Generator) -> Site:
-    """Four arms; the first and third are the main road."""
+def right_turn_rad(begin_rad: float, end_rad: float) -> float:
+    """Angle of the turn from one arm to another, given their directions, right positive, rad."""
+    return float(wrap_scalar(begin_rad + np.pi - end_rad))
+
+
+def crossroads(rng: np.random.Generator, *, left_lanes: bool = False) -> Site:
+    """Four arms; the first and third are the main road.
+
+    Args:
+        rng: draws the site.
+        left_lanes: whether vehicles that turn left from the main road have a lane of their own.
+    """
     turn = rng.uniform(0.0, 0.5 * np.pi)
     angles = turn + 0.5 * np.pi * np.arange(4) + np.radians(rng.uniform(-14.0, 14.0, 4))
-    return _junction(rng, "crossroads", angles, main=(0, 2))
+    return _junction(rng, "crossroads", angles, main=(0, 2), left_lanes=left_lanes)
 
 
-def t_junction(rng: np.random.Generator) -> Site:
-    """Three arms; the first two are the main road, the third ends at it."""
+def t_junction(rng: np.random.Generator, *, left_lanes: bool = False) -> Site:
+    """Three arms; the first two are the main road, the third ends at it.
+
+    Args:
+        rng: draws the site.
+        left_lanes: whether vehicles that turn left from the main road have a lane of their own.
+    """
     turn = rng.uniform(0.0, 2.0 * np.pi)
     angles = turn + np.radians(
         np.array([0.0, 180.0 + rng.uniform(-14.0, 14.0), 270.0 + rng.uniform(-20.0, 20.0)])
     )
-    return _junction(rng, "t-junction", angles, main=(0, 1))
+    return _junction(rng, "t-junction", angles, main=(0, 1), left_lanes=left_lanes)
 
 
 def _junction(
-    rng: np.random.Generator, kind: str, angles_rad: np.ndarray, *, main: tuple[int, int]
+    rng: np.random.Generator,
+    kind: str,
+    angles_rad: np.ndarray,
+    *,
+    main: tuple[int, int],
+    left_lanes: bool,
 ) -> Site:
+    main_weight = 2.2 if left_lanes else 1.5
     width_m = rng.uniform(3.4, 3.9)
     main_mps, side_mps = rng.choice([(13.89, 13.89), (13.89, 8.33), (11.11, 8.33)])
     with_crossing = rng.random(len(angles_rad)) < 0.6
@@ -183,24 +210,29 @@ def _junction(
         split = int(rng.integers(12, 15))
         near, far = line[: split + 1], line[split:]
         nodes += [node_xml(f"e{i}", line[-1]), node_xml(f"k{i}", line[split], type="priority")]
-        road = {"priority": 4 if is_main else 1, "lanes": 1, "width_m": width_m, "speed_mps": speed}
-        edges.append(edge_xml(f"in{i}", f"e{i}", f"k{i}", far[::-1], **road))
-        edges.append(edge_xml(f"app{i}", f"k{i}", "c", near[::-1], **road))
-        edges.append(edge_xml(f"exit{i}", "c", f"k{i}", near, **road))
-        edges.append(edge_xml(f"out{i}", f"k{i}", f"e{i}", far, **road))
         others = [j for j in range(len(angles_rad)) if j != i]
-        connections += [connection_xml(f"app{i}", f"exit{j}") for j in others]
-        connections.append(connection_xml(f"in{i}", f"app{i}"))
+        left = {j for j in others if right_turn_rad(angle, angles_rad[j]) < -LEFT_TURN_RAD}
+        enter = 2 if left_lanes and is_main and left else 1
+        road = {"priority": 4 if is_main else 1, "width_m": width_m, "speed_mps": speed}
+        edges.append(edge_xml(f"in{i}", f"e{i}", f"k{i}", far[::-1], lanes=enter, **road))
+        edges.append(edge_xml(f"app{i}", f"k{i}", "c", near[::-1], lanes=enter, **road))
+        edges.append(edge_xml(f"exit{i}", "c", f"k{i}", near, lanes=1, **road))
+        edges.append(edge_xml(f"out{i}", f"k{i}", f"e{i}", far, lanes=1, **road))
+        connections += [
+            connection_xml(f"app{i}", f"exit{j}", enter if j in left else 1, 1) for j in others
+        ]
+        connections += [connection_xml(f"in{i}", f"app{i}", 1 + lane) for lane in range(enter)]
         connections.append(connection_xml(f"exit{i}", f"out{i}"))
         if with_crossing[i]:
             connections.append(crossing_xml(f"k{i}", (f"in{i}", f"out{i}")))
-        weight = rng.uniform(0.8, 1.2) * (1.5 if is_main else 1.0)
+        weight = rng.uniform(0.8, 1.2) * (main_weight if is_main else 1.0)
         arms.append(
             Arm(
                 angle_rad=float(angle),
                 enter=f"in{i}",
                 leave=f"out{i}",
-                lanes=1,
+                lanes=enter,
+                left_turns_only=enter > 1,
                 weight=float(weight),
             )
         )
@@ -230,6 +262,16 @@ class _Ring:
     arm_lane_m: float
     speed_limit_mps: float
     angles_rad: np.ndarray
+    leave_inside: bool = False
+    """Whether wide arms have two lanes that leave the ring."""
+
+    def wide(self, arm: int) -> bool:
+        """Whether an arm enters the ring with two lanes."""
+        return self.lanes == 2 and arm % 2 == 0
+
+    def exits(self, arm: int) -> int:
+        """Number of lanes that leave the ring at an arm."""
+        return 2 if self.leave_inside and self.wide(arm) else 1
 
     @property
     def outer_m(self) -> float:
@@ -267,8 +309,14 @@ def roundabout(rng: np.random.Generator) -> Site:
     return _site(rng, "roundabout", ring)
 
 
-def two_lane_roundabout(rng: np.random.Generator) -> Site:
-    """Two lanes in the ring; two opposite arms of the four enter with two lanes."""
+def two_lane_roundabout(rng: np.random.Generator, *, leave_inside: bool = False) -> Site:
+    """Two lanes in the ring; two opposite arms of the four enter with two lanes.
+
+    Args:
+        rng: draws the site.
+        leave_inside: whether these two arms are also left with two lanes. There a vehicle on the
+            inner lane may leave, and one on the outer lane may stay in the ring.
+    """
     ring = _Ring(
         inner_m=rng.uniform(17.0, 21.0),
         lanes=2,
@@ -276,6 +324,7 @@ def two_lane_roundabout(rng: np.random.Generator) -> Site:
         arm_lane_m=rng.uniform(3.5, 3.9),
         speed_limit_mps=float(rng.choice(LIMITS_MPS)),
         angles_rad=_angles(rng, 4, 8.0),
+        leave_inside=leave_inside,
     )
     return _site(rng, "two-lane-roundabout", ring)
 
@@ -326,7 +375,9 @@ def _add_ring_part(plan: _Plan, ring: _Ring, i: int, speed_mps: float) -> None:
     )
     before = f"ring{(i - 1) % arms}"
     plan.connections += [connection_xml(before, f"ring{i}", 1 + lane) for lane in range(ring.lanes)]
-    plan.connections.append(connection_xml(before, f"exit{i}"))
+    plan.connections += [
+        connection_xml(before, f"exit{i}", 1 + lane) for lane in range(ring.exits(i))
+    ]
 
 
 def _add_arm(rng: np.random.Generator, plan: _Plan, ring: _Ring, i: int) -> None:
@@ -345,8 +396,8 @@ def _add_arm(rng: np.random.Generator, plan: _Plan, ring: _Ring, i: int) -> None
     mouth = [polar(outer_m + 3.0, angle + side * 2.0 / outer_m) for side in (1.0, -1.0)]
     into = bezier(near, angle + np.pi, mouth[0], angle + np.pi - ENTRY_TILT_RAD)
     away = bezier(mouth[1], angle + ENTRY_TILT_RAD, near, angle)
-    double = ring.lanes == 2 and i % 2 == 0
-    enter = 2 if double else 1
+    double = ring.wide(i)
+    enter, leave = 2 if double else 1, ring.exits(i)
     road = {"priority": 3, "width_m": ring.arm_lane_m, "speed_mps": ring.speed_limit_mps}
     close = {
         "priority": 3,
@@ -356,18 +407,19 @@ def _add_arm(rng: np.random.Generator, plan: _Plan, ring: _Ring, i: int) -> None
     plan.edges += [
         edge_xml(f"in{i}", f"e{i}", f"k{i}", far[::-1], lanes=enter, **road),
         edge_xml(f"app{i}", f"k{i}", f"r{i}", into, lanes=enter, **close),
-        edge_xml(f"exit{i}", f"r{i}", f"k{i}", away, lanes=1, **close),
-        edge_xml(f"out{i}", f"k{i}", f"e{i}", far, lanes=1, **road),
+        edge_xml(f"exit{i}", f"r{i}", f"k{i}", away, lanes=leave, **close),
+        edge_xml(f"out{i}", f"k{i}", f"e{i}", far, lanes=leave, **road),
     ]
     for lane in range(1, 1 + enter):
         plan.connections.append(connection_xml(f"in{i}", f"app{i}", lane))
         plan.connections.append(connection_xml(f"app{i}", f"ring{i}", lane))
-    plan.connections.append(connection_xml(f"exit{i}", f"out{i}"))
+    for lane in range(1, 1 + leave):
+        plan.connections.append(connection_xml(f"exit{i}", f"out{i}", lane))
     if rng.random() < 0.75:
         plan.connections.append(crossing_xml(f"k{i}", (f"in{i}", f"out{i}")))
     weight = float(rng.uniform(0.8, 1.3) * (1.6 if double else 1.0))
     plan.arms.append(
         Arm(angle_rad=angle, enter=f"in{i}", leave=f"out{i}", lanes=enter, weight=weight)
     )
-    from_m, beside_m = outer_m + rng.uniform(22.0, 28.0), ring.arm_lane_m + SIDEWALK_M
+    from_m, beside_m = outer_m + rng.uniform(22.0, 28.0), leave * ring.arm_lane_m + SIDEWALK_M
     plan.parking.append(parking_lot(rng, line, from_m=from_m, beside_m=beside_m))

@@ -1,6 +1,7 @@
 """Laws of every registered predictor: its forecasts, and what it must learn and store."""
 
 import dataclasses
+import inspect
 from pathlib import Path
 
 import numpy as np
@@ -164,7 +165,7 @@ def test_metadata_is_complete_and_read_only(predictor: Predictor) -> None:
     assert set(predictor.metadata) - {"history"} == fields | chained
     assert all(predictor.metadata.values())
     with pytest.raises(AttributeError):
-        type(predictor).metadata.__set__(predictor, {})
+        inspect.getattr_static(predictor, "metadata").__set__(predictor, {})
 
 
 @every
@@ -179,7 +180,7 @@ def test_a_longer_history_changes_nothing(predictor: Predictor) -> None:
     ]
     found, expected = (each.states for each in forecasts)
     np.testing.assert_allclose(found, expected, atol=1e-5, rtol=1e-6)
-    np.testing.assert_allclose(*(each.log_probs for each in forecasts), atol=1e-5)
+    np.testing.assert_allclose(forecasts[0].log_probs, forecasts[1].log_probs, atol=1e-5)
 
 
 @every

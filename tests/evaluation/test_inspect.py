@@ -11,6 +11,7 @@ from asp_env.cli import main
 from asp_env.data.classes import AgentClass
 from asp_env.data.recording import Recording
 from asp_env.data.road_map import Ragged, RoadMap
+from asp_env.data.scenarios.tags import COLUMNS
 from asp_env.errors import DataError
 from asp_env.evaluation.inspect import Inspect, drift_m
 from tests.data.levelx_files import write_folder
@@ -128,7 +129,7 @@ def test_scenarios_by_tag(folder: Path, capsys: pytest.CaptureFixture[str]) -> N
     assert cells["all"][:2] == ["6", "6.7"]  # medians of 6.8 and 6.6 s
     assert cells["all"][5:8] == ["2.0", "2.0", "2.0"]  # density, agents, max_density
     assert cells["straight"] == cells["all"]
-    assert cells["standing-start"] == ["0", *"---------"]
+    assert cells["standing-start"] == ["0", *"-" * len(COLUMNS)]
 
 
 def test_repairs_are_listed(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:

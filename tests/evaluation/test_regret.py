@@ -108,13 +108,13 @@ def test_estimates_by_hand() -> None:
         subsets={"all": np.ones(2, dtype=bool), "left": np.array([False, True])},
         recording=np.array([0, 0]),
     )
-    found = {each[:2]: each[2] for each in scores.estimates(["x"])}
+    found = {each[:2]: each[2] for each in scores.estimates("x")}
     assert found["all", "regret"].value == 1.0
     assert found["all", "log1p regret"].value == pytest.approx(0.5 * np.log(3))
     assert found["all", "regret removed"].value == 0.5
     assert ("left", "regret removed") not in found  # constant velocity has none there
     assert found["left", "regret"].value == 2.0
-    reference = {each[:2]: each[2] for each in scores.estimates(["constant-velocity"])}
+    reference = {each[:2]: each[2] for each in scores.estimates("constant-velocity")}
     assert ("all", "regret removed") not in reference
 
 

@@ -13,10 +13,13 @@ from selenium.webdriver.common.by import By
 from selenium.webdriver.support.ui import WebDriverWait
 
 from asp_env.errors import AspEnvError, DataError, MissingExtraError
-from asp_env.evaluation.report import ForecastExamples, write_report
+from asp_env.evaluation.report import ForecastExamples, metric_note, write_report
 from asp_env.evaluation.report.payload import MapTable, examples_payload
+from asp_env.metrics.driving.rules import PDMS
+from asp_env.metrics.driving.scores import driving_metrics
 from tests.builders import make_recording
 from tests.evaluation.runs import make_examples, metric_rows, write_run, write_tables
+from tests.metrics.records import record
 
 METHODS = ["sampling + constant-velocity", "sampling + ffw-asp"]
 
@@ -34,6 +37,12 @@ def report(tmp_path_factory: pytest.TempPathFactory) -> Path:
         maps={recording.name: recording.road_map},
         examples=make_examples([recording], count=2),
     )
+
+
+def test_every_driving_metric_has_a_note() -> None:
+    """Columns and cards are labelled, have a unit and are explained."""
+    for name in driving_metrics(record(), PDMS):
+        assert metric_note(name).text, name
 
 
 def rows_of(page: str, heading: str) -> list[list[str]]:

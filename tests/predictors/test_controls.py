@@ -163,8 +163,8 @@ def test_noise_has_the_stated_size_at_the_horizon() -> None:
     last = error_m[:, -1]
     assert math.sqrt((last**2).sum(axis=1).mean()) == pytest.approx(2.0, rel=0.03)
     np.testing.assert_allclose(np.sqrt((last**2).mean(axis=0)), math.sqrt(2), rtol=0.04)
-    np.testing.assert_allclose(last.mean(axis=0), 0, atol=0.08)
-    assert abs(np.corrcoef(last.T)[0, 1]) < 0.05
+    np.testing.assert_allclose(last.mean(axis=0), np.zeros(2), atol=0.08)
+    np.testing.assert_allclose((last[:, 0] * last[:, 1]).mean(), 0, atol=0.1)
     share = np.arange(1, 16)[:, None] / 15
     np.testing.assert_allclose(error_m, last[:, None] * share, atol=1e-3)
 
@@ -255,11 +255,11 @@ def test_shuffled_forecasts_are_distributed_like_the_oracle() -> None:
     for found in (shuffled, oracle):
         np.testing.assert_array_equal(found.valid, True)
     now = scene.target_states[:, None, None, :2]
-    covered = [np.linalg.norm(each.states[..., :2] - now, axis=-1) for each in (shuffled, oracle)]
-    np.testing.assert_allclose(*(np.sort(each, axis=0) for each in covered), atol=1e-4)
-    np.testing.assert_array_equal(
-        *(np.sort(each.states[..., 3], axis=0) for each in (shuffled, oracle))
-    )
+    covered_m = [np.linalg.norm(each.states[..., :2] - now, axis=-1) for each in (shuffled, oracle)]
+    found, expected = (np.sort(each, axis=0) for each in covered_m)
+    np.testing.assert_allclose(found, expected, atol=1e-4)
+    found, expected = (np.sort(each.states[..., 3], axis=0) for each in (shuffled, oracle))
+    np.testing.assert_array_equal(found, expected)
 
 
 @pytest.mark.parametrize(

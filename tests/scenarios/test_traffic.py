@@ -7,8 +7,8 @@ import pandas as pd
 
 from asp_env.dynamics import inverse, rollout
 from asp_env.geometry import boxes_overlap
-from scenarios.sumo.demand import SHARES, demand, right_turn_rad
-from scenarios.sumo.sites import crossroads
+from scenarios.sumo.demand import SHARES, demand
+from scenarios.sumo.sites import crossroads, right_turn_rad
 
 STEP = 5
 """Frames in 0.2 s."""
@@ -104,7 +104,7 @@ def test_the_demand_has_all_classes() -> None:
     assert kinds.count("car") > len(kinds) / 2
     pairs = [(a, b) for a in place.arms for b in place.arms if a is not b]
     assert all(f'from="{a.enter}" to="{b.leave}"' in wanted.routes for a, b in pairs)
-    assert len({round(right_turn_rad(a, b), 6) for a, b in pairs}) == len(pairs)
+    assert len({round(right_turn_rad(a.angle_rad, b.angle_rad), 6) for a, b in pairs}) == len(pairs)
 
 
 def test_removing_an_agent_leaves_the_others_unchanged() -> None:

@@ -11,25 +11,27 @@ the ego's front is at the first tick, and either
 
 It ends when the agent leaves the path or turns within 20° of the route or against it. An agent that
 follows the ego or drives ahead of it in its lane, or comes towards it in another lane, is in no
-conflict. Conflicts whose place the ego does not reach within the scenario do not count.
+conflict. Conflicts begin within the scenario; the ego may reach their place later, but those whose
+place it never reaches do not count.
 
 `pet_s`, the post-encroachment time (Allen, Shin and Cooper, 1978), is the smallest time between the
 ego's box and the other's at the same place of the path, no matter which is first: over the ticks of
 a conflict, the time from then to the period in which the ego's box reaches over the part of the
-route that the other's box covers. It is 0 if they are there together.
+route that the other's box covers. It is 0 if they are there together. `pet_behind_s` is the same
+over the ticks before that period begins, so that the other agent is first, and 0 likewise.
 
 `dttcp_s` is the smallest |ΔTTCP|: the time to the conflict point at the present speed, the ego's
 less the other's. The conflict point is where the other's centre is nearest to the route during the
 conflict. Conflicts whose point the two pass at most 5 s apart count, and of those the ticks up to
 3 s before the first of the two passes; a value counts if it is not exceeded for 0.6 s. Below
-0.5 m/s the time is infinite. This follows the filter of pred2plan for interactive scenarios (arXiv
-2505.05638), which requires that another agent passes a point of the ego's path at most 5 s before
-the ego and that |ΔTTCP| is below 3 s at any of the six ticks of 0.1 s before. Here, either may be
-first, following in a lane is excluded, and an ego that stops is observed before it stands.
+0.5 m/s the time is infinite.
 
-Only the ticks of the scenario count; routes, and the agents that count, are those of
-`asp_env.data.scenarios.tags`. Times of the ego are interpolated between ticks, those of the other
-agents are not.
+Related is pred2plan's filter for interactive scenarios (arXiv 2505.05638): another agent passes a
+point of the ego's path at most 5 s before the ego, and |ΔTTCP| is below 3 s at any of the six ticks
+of 0.1 s before. There, leaders in the ego's lane pass such points, too.
+
+Routes, and the agents that count, are those of `asp_env.data.scenarios.tags`. Times of the ego are
+interpolated between ticks, those of the other agents are not.
 """
 
 import math
@@ -64,23 +66,24 @@ _ROUNDING = 1e-6
 @njit(cache=True)
 @no_type_check
 def measure_conflicts(tracks, drives, stride, dt_s, out):
-    """Writes the smallest post-encroachment time and |ΔTTCP| of scenarios of one recording.
+    """Writes the smallest post-encroachment times and |ΔTTCP| of scenarios of one recording.
 
     Args:
         tracks: the track table, see `tags._Tracks`.
         drives: the scenarios, see `tags._Drives`.
         stride: frames per tick.
         dt_s: seconds per tick.
-        out: (n, 2) both times, s; on input infinite, which remains without a conflict.
+        out: (n, 3) `pet_s`, `pet_behind_s` and `dttcp_s`; on input infinite, which remains
+            without a conflict.
     """
     for i in range(len(drives.tracks)):
         e, count, frame = drives.tracks[i], drives.lengths[i] + 1, drives.ticks[i] * stride
         row = tracks.starts[e] + frame - tracks.first[e]
-        ego = tracks.states[row : row + (count - 1) * stride + 1 : stride]
+        ego = tracks.states[row : tracks.starts[e + 1] : stride]  # also after the scenario
         route = drives.routes[drives.route_starts[i] : drives.route_starts[i + 1]]
-        arcs = np.empty(count)
+        arcs = np.empty(len(ego))
         near = 0.0
-        for t in range(count):
+        for t in range(len(ego)):
             if t > 0:
                 near += math.hypot(ego[t, 0] - ego[t - 1, 0], ego[t, 1] - ego[t - 1, 1])
             arcs[t], _, _ = project(route, len(route), ego[t, 0], ego[t, 1], near, _SEARCH_M)
@@ -90,11 +93,10 @@ def measure_conflicts(tracks, drives, stride, dt_s, out):
             if o == e or tracks.roles[o] == 0 or tracks.first[o] > last or tracks.last[o] < frame:
                 continue
             rows = tracks.states[tracks.starts[o] : tracks.starts[o + 1]]
-            pet, dttcp = _with_agent(
-                rows, frame - tracks.first[o], stride, ego, arcs, route,
-                tracks.sizes[e], tracks.sizes[o], dt_s,
+            _with_agent(
+                rows, frame - tracks.first[o], stride, count, ego, arcs, route,
+                tracks.sizes[e], tracks.sizes[o], dt_s, out[i],
             )  # fmt: skip
-            out[i, 0], out[i, 1] = min(out[i, 0], pet), min(out[i, 1], dttcp)
 
 
 @njit(cache=True)
@@ -113,8 +115,8 @@ def _meet(rows, first_row, stride, ego, arcs, route, size, size_o, met):
         rows: (frames, 4) states of the other agent.
         first_row: row of the first tick of the scenario, which may be negative.
         stride: frames per tick.
-        ego: (ticks, 4) states of the ego.
-        arcs: (ticks,) arc length of the ego, m.
+        ego: (all ticks, 4) states of the ego, also after the scenario.
+        arcs: (all ticks,) arc length of the ego, m.
         route: (points, 2) of the ego, 1 m apart.
         size: (2,) length and width of the ego, m.
         size_o: (2,) of the other agent.
@@ -130,7 +132,7 @@ def _meet(rows, first_row, stride, ego, arcs, route, size, size_o, met):
     low_x, high_x = ego[:, 0].min() - _NEAR_M, ego[:, 0].max() + _NEAR_M
     low_y, high_y = ego[:, 1].min() - _NEAR_M, ego[:, 1].max() + _NEAR_M
     end = min(len(route), int(arcs.max()) + _BEYOND_M)
-    for t in range(len(ego)):
+    for t in range(len(met)):
         row = first_row + t * stride
         if row < 0 or row >= len(rows):
             continue
@@ -158,27 +160,25 @@ def _meet(rows, first_row, stride, ego, arcs, route, size, size_o, met):
 
 @njit(cache=True)
 @no_type_check
-def _with_agent(rows, first_row, stride, ego, arcs, route, size, size_o, dt_s):
-    """Smallest post-encroachment time and |ΔTTCP| of the ego and another agent.
+def _with_agent(rows, first_row, stride, count, ego, arcs, route, size, size_o, dt_s, out):
+    """Reduces times of a scenario to the smallest ones of the ego and another agent.
 
     Args:
-        rows: (frames, 4) states of the other agent; this and the others see `_meet`.
+        rows: (frames, 4) states of the other agent.
         first_row: row of the first tick of the scenario, which may be negative.
         stride: frames per tick.
-        ego: (ticks, 4) states of the ego.
-        arcs: (ticks,) arc length of the ego, m.
+        count: number of ticks of the scenario.
+        ego: (all ticks, 4) states of the ego, also after the scenario.
+        arcs: (all ticks,) arc length of the ego, m.
         route: (points, 2) of the ego, 1 m apart.
         size: (2,) length and width of the ego, m.
         size_o: (2,) of the other agent.
         dt_s: seconds per tick.
-
-    Returns:
-        Both times, s; infinite without a conflict.
+        out: (3,) `pet_s`, `pet_behind_s` and `dttcp_s`, updated.
     """
-    count, smallest_pet, smallest_dttcp = len(ego), np.inf, np.inf
     met = np.full((count, 6), np.nan)
     if not _meet(rows, first_row, stride, ego, arcs, route, size, size_o, met):
-        return smallest_pet, smallest_dttcp
+        return
     was_beside = False
     for t in range(1, count):
         before, now = met[t - 1, 4], met[t, 4]
@@ -195,12 +195,18 @@ def _with_agent(rows, first_row, stride, ego, arcs, route, size, size_o, dt_s):
             last += 1
         nearest = t
         for k in range(t, last + 1):
-            smallest_pet = min(smallest_pet, _time_apart(arcs, size[0], met[k], k) * dt_s)
+            reach = met[k, 5] + 0.5 * size[0]
+            arrives = _passing_tick(arcs, met[k, 0] - reach)
+            if arrives == np.inf:
+                continue
+            leaves = _passing_tick(arcs, met[k, 0] + reach)
+            out[0] = min(out[0], max(arrives - k, k - leaves, 0.0) * dt_s)
+            if k <= leaves:
+                out[1] = min(out[1], max(arrives - k, 0.0) * dt_s)
             if abs(met[k, 1]) < abs(met[nearest, 1]):
                 nearest = k
         dttcp = _smallest_dttcp(rows, first_row, stride, ego, arcs, met, nearest, dt_s)
-        smallest_dttcp = min(smallest_dttcp, dttcp)
-    return smallest_pet, smallest_dttcp
+        out[2] = min(out[2], dttcp)
 
 
 @njit(cache=True)
@@ -209,7 +215,7 @@ def _passing_tick(arcs, arc):
     """When the ego reaches an arc length: a tick with its fraction, infinite if it does not.
 
     Args:
-        arcs: (ticks,) arc length of the ego, m.
+        arcs: (all ticks,) arc length of the ego, m.
         arc: arc length to reach, m.
     """
     for t in range(len(arcs)):
@@ -222,22 +228,6 @@ def _passing_tick(arcs, arc):
 
 @njit(cache=True)
 @no_type_check
-def _time_apart(arcs, length, met, tick):
-    """Ticks between another agent's presence in the path and the ego's at the same place.
-
-    Args:
-        arcs: (ticks,) arc length of the ego, m.
-        length: of the ego, m.
-        met: (6,) one tick of the output of `_meet`.
-        tick: that tick.
-    """
-    reach = met[5] + 0.5 * length
-    arrives, leaves = _passing_tick(arcs, met[0] - reach), _passing_tick(arcs, met[0] + reach)
-    return max(arrives - tick, tick - leaves, 0.0)
-
-
-@njit(cache=True)
-@no_type_check
 def _smallest_dttcp(rows, first_row, stride, ego, arcs, met, tick, dt_s):
     """Smallest |ΔTTCP| before the ego and another agent pass a conflict point.
 
@@ -245,8 +235,8 @@ def _smallest_dttcp(rows, first_row, stride, ego, arcs, met, tick, dt_s):
         rows: (frames, 4) states of the other agent.
         first_row: row of the first tick of the scenario, which may be negative.
         stride: frames per tick.
-        ego: (ticks, 4) states of the ego.
-        arcs: (ticks,) arc length of the ego, m.
+        ego: (all ticks, 4) states of the ego, also after the scenario.
+        arcs: (all ticks,) arc length of the ego, m.
         met: (ticks, 6) output of `_meet`.
         tick: at which the other agent passes the conflict point.
         dt_s: seconds per tick.

@@ -29,7 +29,8 @@ in either direction.
 `roundabout`: the ego drives at least 10 m along a roundabout of the map, within 2 m of the centre
     line of one of its lanes and heading within 45° of it.
 `roundabout-entry`, `roundabout-exit`: a `roundabout` that the ego enters; that it leaves.
-`interactive`: `pet_s` is below 3 s, or `dttcp_s` is (`asp_env.data.scenarios.conflicts`). It
+`interactive`: `pet_behind_s` is at most 5 s (`asp_env.data.scenarios.conflicts`): another agent
+    crosses the ego's path or merges with it, and the ego is at that place up to 5 s later. It
     depends on the recording alone, so that it favours no predictor or planner.
 
 Recordings have no traffic signals, so waiting at a signal while others cross is `yielding`, too.
@@ -75,6 +76,7 @@ COLUMNS = {
     "max_density": "largest number of other agents within 30 m of the ego at any tick",
     "pet_s": "post-encroachment time: smallest time between the ego and another agent at the "
     "crossing or merging of their paths; infinite without one",
+    "pet_behind_s": "the same of agents that are first; infinite without one",
     "dttcp_s": "smallest difference of the times to the conflict point at present speeds; infinite "
     "without a conflict",
 }
@@ -108,7 +110,7 @@ CROSSING_AHEAD_M = 30.0
 ROUNDABOUT_M = 10.0
 ROUNDABOUT_HALF_WIDTH_M = 2.0
 DENSITY_RADIUS_M = 30.0
-INTERACTIVE_S = 3.0
+INTERACTIVE_S = 5.0
 MAX_RADIUS_M = 100.0
 MAX_RADIUS_RATIO = 3.0
 TANGENTIAL_SHARE = 0.9
@@ -136,8 +138,9 @@ _ROUNDING = 1e-6
     _CROSSING_VRU, _ROUNDABOUT, _ENTRY, _EXIT, _INTERACTIVE,
 ) = range(13)  # fmt: skip
 (
-    _LENGTH, _DISTANCE, _MAX_SPEED, _TURN, _DENSITY, _AGENTS, _MAX_DENSITY, _PET, _DTTCP,
-) = range(9)  # fmt: skip
+    _LENGTH, _DISTANCE, _MAX_SPEED, _TURN, _DENSITY, _AGENTS, _MAX_DENSITY, _PET, _PET_BEHIND,
+    _DTTCP,
+) = range(10)  # fmt: skip
 
 
 def describe(
@@ -185,10 +188,10 @@ def describe(
     dt_s = stride / recording.frame_rate_hz
     ring = roundabout_points(recording.road_map)
     _describe_all(table, drives, stride, dt_s, ring, tags, values)
-    conflicts = np.full((len(tracks), 2), np.inf)
+    conflicts = np.full((len(tracks), 3), np.inf)
     measure_conflicts(table, drives, stride, dt_s, conflicts)
-    values[:, _PET], values[:, _DTTCP] = conflicts.T
-    tags[:, _INTERACTIVE] = conflicts.min(axis=1) < INTERACTIVE_S
+    values[:, [_PET, _PET_BEHIND, _DTTCP]] = conflicts
+    tags[:, _INTERACTIVE] = values[:, _PET_BEHIND] <= INTERACTIVE_S
     return tags, values
 
 

@@ -16,7 +16,7 @@ from asp_env.data.recording import DEFAULT_DT_S
 from asp_env.data.road_map import RoadMap
 from asp_env.data.rollout import Rollout
 from asp_env.data.scenarios.scenario import ScenarioSet
-from asp_env.data.scenarios.selection import choose_scenarios, save_scenarios
+from asp_env.data.scenarios.selection import save_scenarios
 from asp_env.data.source import Recordings, open_data
 from asp_env.errors import AspEnvError
 from asp_env.evaluation.closed_loop.comparison import (
@@ -29,6 +29,7 @@ from asp_env.evaluation.closed_loop.comparison import (
 )
 from asp_env.evaluation.closed_loop.scenario_table import write_scenario_table
 from asp_env.evaluation.closed_loop.summary import Comparison, MethodScores, comparison_rows
+from asp_env.evaluation.hard import HARD_NOTE, is_hard, select_scenarios
 from asp_env.evaluation.ladder import BASELINE, missing_controls
 from asp_env.evaluation.report import check_report_possible, write_report
 from asp_env.evaluation.results import SCORE, Row, write_manifest, write_metrics
@@ -55,7 +56,7 @@ class Drive:
     """Folder in the inD/rounD or INTERACTION layout, or sample:…, synthetic:… or highway:…."""
     out: Path
     """Folder to write; it must not exist, or be empty."""
-    planner: str = "sampling"
+    planner: str = "contingency"
     """Planner that drives the ego."""
     predictors: Annotated[tuple[str, ...], tyro.conf.arg(metavar="NAME[:RUN] …")] = (
         "constant-velocity",
@@ -74,7 +75,8 @@ class Drive:
     The default is log for recordings and own for highway:…."""
     scenarios: Annotated[str, tyro.conf.arg(metavar="FILTER|FILE")] = ""
     """Tags and comparisons, such as 'left,!stopping,length>=8',
-    or the scenarios.json of another run. The default is all."""
+    or the scenarios.json of another run. The default is all;
+    hard are interactive ones in which constant velocity fails."""
     max_scenarios: int | None = None
     """Largest number of scenarios; they are chosen at even spacing."""
     horizon: float = 3.0
@@ -96,6 +98,9 @@ class Drive:
             AspEnvError: an option or the data are bad, or a package is missing.
         """
         check_report_possible()
+        note = HARD_NOTE if is_hard(self.scenarios) else ""
+        if note:
+            Console().print(note)
         with atomic_folder(self.out) as folder:
             result = drive(self)
             write_metrics(folder, result.rows)
@@ -103,7 +108,8 @@ class Drive:
             save_scenarios(folder / "scenarios.json", result.scenarios, result.recordings)
             write_scenario_table(folder, result.scenarios, result.methods)
             save_rollouts(folder, result)
-            write_report(folder, title=f"Driving on {Path(self.data).name}", maps=result.maps)
+            title = f"Driving on {Path(self.data).name}"
+            write_report(folder, title=title, lead=note, maps=result.maps)
         console = Console()
         shown = RULES[self.rules].shown
         for table in driving_tables(result.rows, result.manifest["privileged"], shown):
@@ -182,6 +188,7 @@ def drive(config: Drive) -> ClosedLoopResult:
             "horizon_s": config.horizon,
             "dt_s": config.dt,
             "part": part,
+            **({"note": HARD_NOTE} if is_hard(config.scenarios) else {}),
             "asked for": {"scenarios": config.scenarios, "max_scenarios": config.max_scenarios},
             "scenarios": {scenario.name: {"seed": scenario.seed} for scenario in chosen},
             "endings": {
@@ -270,7 +277,7 @@ def _choose_scenarios(
     allowed, part = ticks_to_evaluate(
         recordings, [*methods.predictors.values()], config.part, dt_s=config.dt
     )
-    chosen = choose_scenarios(
+    chosen = select_scenarios(
         recordings,
         config.scenarios,
         dt_s=config.dt,

@@ -248,7 +248,9 @@ def _measure(
         "num_ticks": active.sum(axis=1),
         "dt_s": world.dt_s,
     }
-    margins = shared | {"wide_sector": lane_is_ambiguous | (off_road_m > OFF_ROAD_M)}
+    margins: dict[str, Any] = shared | {
+        "wide_sector": lane_is_ambiguous | (off_road_m > OFF_ROAD_M)
+    }
     return EpisodeRecord(
         states=states[:, :, EGO],
         log_states=episodes.log_states[:, ticks, EGO],

@@ -147,10 +147,9 @@ def _mean(
     if not rows.any():
         return None
     valid = masked.valid[:, rows]
-    parts = np.stack([np.where(valid, masked.value[:, rows], 0.0), valid], axis=-1)
-    sums = statistics.resampled_sums(parts, recording[rows], stream=method.stream)
-    with np.errstate(invalid="ignore"):
-        return statistics.interval(sums[:, 0] / sums[:, 1], n=int(rows.sum()))
+    return statistics.ratio_over_runs(
+        np.where(valid, masked.value[:, rows], 0.0), valid, recording[rows], stream=method.stream
+    )
 
 
 def _means(

@@ -7,7 +7,7 @@ from typing import Annotated, Any, Literal
 
 import numpy as np
 import tyro
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Bool, Int
 from rich.console import Console
 
 from asp_env.data.causal import causal_histories
@@ -168,7 +168,12 @@ def evaluate(config: Evaluate) -> OpenLoopResult:
     )
     return OpenLoopResult(
         rows=make_rows(
-            scores, predictors, runs, data=config.data, horizon_s=config.horizon, regrets=regrets
+            scores,
+            predictors,
+            runs,
+            data=config.data,
+            horizon_s=config.horizon,
+            regrets=regrets,
         ),
         manifest={
             "data": config.data,
@@ -266,7 +271,7 @@ def make_rows(
         if modes:
             estimates += _calibration(modes, scores, stream)
         if regrets is not None:
-            estimates += [(ALL_MODES, *each) for each in regrets.estimates(members, stream=stream)]
+            estimates += [(ALL_MODES, *each) for each in regrets.estimates(*members, stream=stream)]
         loaded = [predictors[run] for run in members]
         rows += [
             Row(
@@ -304,20 +309,14 @@ def _estimates(
     compared = metric == "FDE" and runs[0].name != REFERENCE
     for subset, rows in _subset_rows(scores, valid.any(axis=0)):
         groups, known = scores.recording[rows], valid[:, rows]
-        parts = np.stack([np.where(known, values[:, rows], 0), known], axis=-1)
-        yield selection, subset, metric, _ratio(parts, groups, stream)
+        sums = np.where(known, values[:, rows], 0)
+        mean = statistics.ratio_over_runs(sums, known, groups, stream=stream)
+        yield selection, subset, metric, mean
         if compared and reference is not None and reference.values[rows].any():
-            base = np.broadcast_to(reference.values[rows], known.shape)
-            parts = np.stack([values[:, rows], base], axis=-1)
-            yield selection, subset, RATIO, _ratio(parts, groups, stream)
-
-
-def _ratio(
-    parts: Float[np.ndarray, "runs n 2"], groups: Int[np.ndarray, " n"], stream: int
-) -> Estimate:
-    sums = statistics.resampled_sums(parts, groups, stream=stream)
-    with np.errstate(invalid="ignore", divide="ignore"):
-        return statistics.interval(sums[:, 0] / sums[:, 1], n=len(groups))
+            ratio = statistics.ratio_over_runs(
+                values[:, rows], reference.values[rows], groups, stream=stream
+            )
+            yield selection, subset, RATIO, ratio
 
 
 def _calibration(

@@ -223,7 +223,7 @@ def _continuous(
         time_lost_s=lost_s,
         ttc_s=record.conflict_s,
         uncomfortable=uncomfortable.value > 0,
-        fault=at_fault(record, NUPLAN).any(axis=1) | off_road.any(axis=1),
+        fault=np.asarray((at_fault(record, NUPLAN) | off_road).any(axis=1)),
         active=active,
         dt_s=record.dt_s,
         weights=DrivingCostWeights(),

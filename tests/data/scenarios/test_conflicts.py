@@ -1,7 +1,7 @@
 """Post-encroachment time and ΔTTCP of constructed crossings, worked out by hand.
 
 The ego drives along +x at 5 m/s and is 4.5 m by 1.8 m, as every other car. Its scenario lasts from
-3 s, when it is at x = 15 m, to 18 s, at x = 90 m.
+3 s, when it is at x = 15 m, to 18 s, at x = 90 m; its track ends at 20 s, at x = 100 m.
 """
 
 import math
@@ -43,13 +43,19 @@ def test_crossing_at_a_right_angle(at_s: float, pet_s: float, dttcp_s: float) ->
 
 
 @pytest.mark.parametrize(
-    ("x", "pet_s"), [(93.1, 17.99 - 15.2), (93.3, math.inf), (17.9, 0.0), (17.0, math.inf)]
+    ("x", "pet_s"), [(103.1, 19.99 - 15.2), (103.3, math.inf), (17.9, 0.0), (17.0, math.inf)]
 )
-def test_the_ego_reaches_the_place_within_the_scenario(x: float, pet_s: float) -> None:
-    """Its front is at x = 17.25 m at 3 s and at 92.25 m at 18 s; boxes are 0.9 m beside x."""
+def test_the_ego_reaches_the_place(x: float, pet_s: float) -> None:
+    """Its front is at x = 17.25 m at 3 s and at 102.25 m at 20 s; boxes are 0.9 m beside x."""
     at_s = 15.0 if x > 50 else 4.2
     found = conflict(EGO, through(x, 0, at_s, UP, 9))[0]
     assert found == pytest.approx(pet_s, abs=0.02)
+
+
+@pytest.mark.parametrize(("at_s", "expected"), [(17.8, True), (18.4, False)])
+def test_conflicts_begin_within_the_scenario(at_s: float, expected: bool) -> None:
+    """The other's box is in the path from 17.6 s on or from 18.2 s on."""
+    assert math.isfinite(conflict(EGO, through(95, 0, at_s, UP, 9))[0]) == expected
 
 
 @pytest.mark.parametrize(
@@ -109,17 +115,24 @@ def test_noisy_speeds_at_single_ticks_do_not_count() -> None:
     assert conflict(brakes, through(50, 0, 6.8, UP, 9))[1] >= steady
 
 
-@pytest.mark.parametrize(("at_s", "expected"), [(6.6, True), (5.8, False)])
-def test_interactive(at_s: float, expected: bool) -> None:
-    """PET 9.37 - 6.8 = 2.57 s or 3.37 s; |ΔTTCP| is 3.4 s or more."""
+@pytest.mark.parametrize(
+    ("at_s", "behind_s", "expected"),
+    [(4.4, 9.37 - 4.6, True), (4.0, 9.37 - 4.2, False), (9.8, 0.0, True), (11.0, math.inf, False)],
+)
+def test_interactive(at_s: float, behind_s: float, expected: bool) -> None:
+    """The ego follows within 5 s; an agent that is there 0.17 s after the ego does not count."""
     found = first(EGO, through(50, 0, at_s, UP, 9))
+    assert found.column("pet_behind_s")[0] == pytest.approx(behind_s, abs=1e-3)
     assert found.has("interactive").tolist() == [expected]
-    assert ScenarioFilter.parse("pet<3").matches(found).tolist() == [expected]
+    assert ScenarioFilter.parse("pet_behind<=5").matches(found).tolist() == [expected]
 
 
-def test_pedestrians_count_and_scenarios_without_conflict_match_no_upper_bound() -> None:
+def test_pedestrians_count() -> None:
     walks = through(50, 0, 8.6, UP, 1.4, AgentClass.PEDESTRIAN)
     assert first(EGO, walks).has("interactive").all()
+
+
+def test_scenarios_without_conflict_match_no_upper_bound() -> None:
     alone = first(EGO)
     assert not ScenarioFilter.parse("pet<1000|dttcp<1000").matches(alone).any()
 

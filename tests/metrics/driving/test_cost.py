@@ -1,6 +1,7 @@
 """Time lost, driving cost and the continuous measures of whole episodes, worked out by hand."""
 
 import math
+from typing import Any
 
 import hypothesis.strategies as st
 import numpy as np
@@ -131,7 +132,7 @@ def test_a_perfect_episode_costs_nothing() -> None:
 
 def test_measures_over_the_ticks_of_an_episode() -> None:
     """One of eight ticks; values after the end are ignored."""
-    changes = {
+    changes: dict[str, Any] = {
         "near_miss": at_tick(3, 1).astype(bool),
         "conflict_s": at_tick(3, 1.2, 3.0),
         "required_mps2": at_tick(3, 4.5),
@@ -152,7 +153,7 @@ def test_measures_over_the_ticks_of_an_episode() -> None:
 @pytest.mark.parametrize(
     "fault", [{"contacts": contact(TICKS - 1, Contact.FRONT)}, {"off_road_m": at_tick(3, 1.0)}]
 )
-def test_a_fault_costs_30_s(fault: dict[str, np.ndarray]) -> None:
+def test_a_fault_costs_30_s(fault: dict[str, Any]) -> None:
     at_log = [np.linspace(33, 40, TICKS)]
     assert values(record(**fault, log_route_m=at_log), PDMS)["driving cost"] == 30
 

@@ -1,6 +1,7 @@
 """Near misses, conflicts and required decelerations, derived by hand and by law."""
 
 import math
+from random import Random
 
 import hypothesis.strategies as st
 import numpy as np
@@ -201,7 +202,7 @@ def test_another_agent_never_makes_it_safer(others: list[State], wide: bool) -> 
 
 
 @given(others=traffic, order=st.randoms(use_true_random=False))
-def test_the_order_of_agents_changes_nothing(others: list[State], order: object) -> None:
+def test_the_order_of_agents_changes_nothing(others: list[State], order: Random) -> None:
     shuffled = list(others)
     order.shuffle(shuffled)
     for first, second in zip(measures(scene(*others)), measures(scene(*shuffled)), strict=True):

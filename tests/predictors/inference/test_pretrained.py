@@ -75,6 +75,7 @@ def test_errors_are_below_those_of_constant_velocity(name: str, site: str, tmp_p
             data=f"sample:{site}",
             out=tmp_path,
             predictors=("constant-velocity", f"{name}:{PRETRAINED}"),
+            planner="none",
         )
     )
     ratios = {

@@ -1,0 +1,35 @@
+"""Traffic is written in several processes, with a progress bar."""
+
+from collections.abc import Callable
+from contextlib import nullcontext
+
+from rich.console import Console
+from rich.progress import track
+
+from asp_env.errors import AspEnvError
+from asp_env.workers import WorkerPool
+
+
+def run_with_progress(
+    work: Callable[[int], None], count: int, title: str, *, jobs: int, progress: bool
+) -> None:
+    """Calls a function with the numbers from 0 to `count - 1`, each in any of several processes.
+
+    Args:
+        work: the function; processes need that it can be pickled.
+        count: number of calls.
+        title: text beside the progress bar, which is on stderr.
+        jobs: number of processes; with 1, this process does all.
+        progress: whether to show the progress bar.
+
+    Raises:
+        AspEnvError: `jobs` is below 1, a process has ended, or as the function raises it.
+    """
+    if jobs < 1:
+        raise AspEnvError(f"--jobs {jobs}: expected at least 1 process")
+    processes = min(jobs, count)
+    with WorkerPool(work, processes) if processes > 1 else nullcontext() as pool:
+        done = pool.map(range(count)) if pool is not None else map(work, range(count))
+        shown = track(done, title, total=count, console=Console(stderr=True), disable=not progress)
+        for _ in shown:
+            pass
