@@ -2,8 +2,9 @@
 
 A score says little without a scale. `blind` is its lower end, `constant-velocity` and `oracle` are
 two of its marks, `blend:SHARE` are the marks between them, and `noisy-oracle:METRES` and
-`shuffled-oracle` lie below the oracle by a known defect. All forecast agents of any class. Those
-that are made from the recorded future are privileged.
+`shuffled-oracle` lie below the oracle by a known defect. `interactive-oracle` takes the place of
+`oracle` where traffic reacts to the ego. All forecast agents of any class. Those that are made from
+the recorded future, or a simulated one, are privileged.
 """
 
 import math
@@ -267,6 +268,44 @@ class ShuffledOracle(_RecordedFuture):
         states = np.where(alone, constant_velocity(scene, steps=self.horizon), states)
         states = np.where(oracle.valid[:, None, None], states, 0)
         return with_inferred_actions(scene, _wrapped(states), oracle.valid)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class InteractiveOracle(_RecordedFuture):
+    """The future that the simulation has if the ego carries out its last plan.
+
+    The last plan is shifted by one tick, and its last action is repeated; before the first plan,
+    the ego continues at constant speed. Where traffic reacts, this is a perfect forecast for that
+    plan, while `oracle` returns a recorded run that does not happen. It is a forecast for no other
+    plan: the reactions to the candidates that the planner compares are not known.
+
+    Where traffic does not react, and at logged states, it equals `oracle`.
+    """
+
+    name: str = "interactive-oracle"
+    needs_simulation: bool = True
+
+    @classmethod
+    def from_name(cls, argument: str, *, horizon: int, dt_s: float) -> "InteractiveOracle":
+        """Makes the predictor for any horizon (ticks) and time step.
+
+        Raises:
+            AspEnvError: The argument is not empty.
+        """
+        refuse_argument("interactive-oracle", argument)
+        return cls(horizon=horizon, dt_s=dt_s)
+
+    def predict(self, scene: Scene, future: Future | None = None) -> Forecast:
+        """Returns the future of the targets, like `oracle`, in one mode.
+
+        Args:
+            scene: the scene.
+            future: the simulated future; at logged states, the recorded one.
+
+        Raises:
+            AspEnvError: The scene has another time step, or the future is missing or too short.
+        """
+        return self._oracle(scene, future)
 
 
 def persistent_noise(

@@ -7,7 +7,13 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Float
 
-from asp_env.data.predictor import Forecast, Predictor, load_predictor, make_forecast
+from asp_env.data.predictor import (
+    Forecast,
+    Predictor,
+    load_predictor,
+    make_forecast,
+    needs_simulation,
+)
 from asp_env.data.scene import Scene
 from asp_env.data.snippets import Future
 from asp_env.data.split import TrainedOn
@@ -45,6 +51,11 @@ class Delayed:
     def privileged(self) -> bool:
         """Whether the other predictor is."""
         return self.inner.privileged
+
+    @property
+    def needs_simulation(self) -> bool:
+        """Whether the other predictor does."""
+        return needs_simulation(self.inner)
 
     @property
     def history(self) -> int:

@@ -7,7 +7,7 @@ and the controls need no torch.
 from functools import cache
 from typing import TYPE_CHECKING, Any
 
-from predictors.controls import Blend, Blind, NoisyOracle, ShuffledOracle
+from predictors.controls import Blend, Blind, InteractiveOracle, NoisyOracle, ShuffledOracle
 from predictors.delayed import Delayed
 from predictors.physical import ConstantTurnRate, ConstantVelocity, Oracle
 
@@ -29,6 +29,7 @@ __all__ = [
     "ConstantTurnRate",
     "ConstantVelocity",
     "Delayed",
+    "InteractiveOracle",
     "NoisyOracle",
     "Oracle",
     "ShuffledOracle",

@@ -4,6 +4,7 @@ from asp_env.data.causal import causal_histories
 from asp_env.data.classes import AgentClass
 from asp_env.data.predictor import (
     Forecast,
+    InteractivePredictor,
     Predictor,
     PredictorPlug,
     fill_missing,
@@ -28,6 +29,7 @@ __all__ = [
     "AgentClass",
     "Forecast",
     "Future",
+    "InteractivePredictor",
     "Predictor",
     "PredictorPlug",
     "Recording",

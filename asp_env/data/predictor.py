@@ -101,6 +101,27 @@ class Predictor(Protocol):
 
 
 @runtime_checkable
+class InteractivePredictor(Predictor, Protocol):
+    """A privileged predictor that is given a simulated future where there is a simulation.
+
+    `asp-env drive` gives it the future that the simulation has if the ego carries out its last plan
+    (`asp_env.sim.simulated_future`). At logged states the ego carries out the log, so that this
+    future is the recorded one. It cannot be used where the plan of the ego is not known, as in
+    environments and drivers.
+    """
+
+    @property
+    def needs_simulation(self) -> bool:
+        """Whether the future is to be simulated; if not, it is the recorded one."""
+        ...
+
+
+def needs_simulation(predictor: Predictor) -> bool:
+    """Whether a predictor is to be given a simulated future."""
+    return isinstance(predictor, InteractivePredictor) and predictor.needs_simulation
+
+
+@runtime_checkable
 class PredictorPlug(Protocol):
     """The object that an entry point of the group `asp_env.predictors` names."""
 

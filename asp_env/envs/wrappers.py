@@ -11,7 +11,7 @@ from gymnasium.vector import VectorEnv, VectorObservationWrapper
 from gymnasium.vector.utils import batch_space
 from jaxtyping import Int
 
-from asp_env.data.predictor import Predictor, fill_missing, load_predictor
+from asp_env.data.predictor import Predictor, fill_missing, load_predictor, needs_simulation
 from asp_env.data.recording import ticks
 from asp_env.data.scene import EGO, Scene
 from asp_env.data.snippets import Future
@@ -289,6 +289,11 @@ def nearest_agents(
 
 
 def _check_predictor(predictor: Predictor, horizon: int, dt_s: float, privileged: bool) -> None:
+    if needs_simulation(predictor):
+        raise AspEnvError(
+            f"predictor {predictor.name} simulates the ego's plan, which an environment does not "
+            "know: use oracle, or asp-env drive"
+        )
     if predictor.privileged and not privileged:
         raise AspEnvError(
             f"predictor {predictor.name} uses the recorded future, which is not known while "

@@ -11,6 +11,7 @@ from asp_env.sim.observation import (
     ego_context,
 )
 from asp_env.sim.reward import RewardWeights, reward_terms, weighted_sum
+from asp_env.sim.simulated_future import simulated_future
 from asp_env.sim.simulation import Simulation, ending
 from asp_env.sim.traffic.assignment import make_traffic
 from asp_env.sim.world import (
@@ -42,6 +43,7 @@ __all__ = [
     "make_traffic",
     "recorded_future",
     "reward_terms",
+    "simulated_future",
     "weighted_sum",
     "world_class",
 ]

@@ -11,11 +11,11 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 
 from asp_env import registry
-from asp_env.data.recording import Recording
+from asp_env.data.recording import Recording, frames_per_tick
 from asp_env.data.road_map import RoadMap
 from asp_env.data.scenarios.scenario import Scenario
 from asp_env.data.scene import EGO, Scene, infer_actions
-from asp_env.data.snippets import Future, SnippetIndex, gather_ticks
+from asp_env.data.snippets import Future, SnippetIndex, gather_ticks, gather_window
 from asp_env.data.source import scheme_of
 from asp_env.dynamics import forward
 from asp_env.geometry import route_coordinates
@@ -297,6 +297,34 @@ class World(ABC):
         for index, road_map in enumerate(self._maps):
             drivable_field(road_map).corners_m(egos, sizes, self._map_index == index, off_road_m)
         return beyond_log_m(off_road_m, self.episodes.on_route, self.episodes.log_off_road_m)
+
+    def set_lengths(self, lengths: Int[np.ndarray, " b"]) -> None:
+        """Lets episodes end at other ticks than their scenarios do.
+
+        Beyond the end of a scenario, uncontrolled agents replay their tracks, as before it. Agents
+        that are recorded only after that end do not appear.
+
+        Args:
+            lengths: number of ticks of each episode, counted from its start.
+        """
+        later = np.flatnonzero(lengths > self.episodes.length).tolist()
+        last = self.history + self.episodes.length
+        self.episodes = episodes = self.episodes.with_room(
+            ticks=self.history + 1 + int(lengths.max()), agents=0, points=0
+        )
+        for b in later:
+            recording, agents = self.recordings[int(episodes.recording[b])], episodes.ids[b] >= 0
+            added = slice(last[b] + 1, self.history + 1 + lengths[b])
+            states, valid = gather_window(
+                recording,
+                episodes.tracks[b, agents],
+                first_tick=int(episodes.start_tick[b] + episodes.length[b]) + 1,
+                num_ticks=int(lengths[b] - episodes.length[b]),
+                stride=frames_per_tick(recording.frame_rate_hz, self.dt_s),
+            )
+            episodes.log_states[b, added][:, agents] = states.swapaxes(0, 1)
+            episodes.log_valid[b, added][:, agents] = valid.T
+        episodes.length[:] = lengths
 
     def snapshot(self) -> Any:
         """A copy of the whole state, for `restore`."""

@@ -186,13 +186,16 @@ class HighwayWorld(World):
             run.frame += 1
             if run.frame % STEPS_PER_S == 0:
                 remove_exited(run.history.site, road, ego=int(self.episodes.tracks[b, EGO]))
-                away = [slot for slot in slots.values() if controlled[slot] or gone[slot]]
-                self._add_arrivals(run, {int(self.episodes.tracks[b, slot]) for slot in away})
+                free = [track for track, a in slots.items() if not (controlled[a] or gone[a])]
+                self._add_arrivals(run, free)
 
-    def _add_arrivals(self, run: _Run, away: set[int]) -> None:
-        """Adds the vehicles recorded to appear at this frame, unless their position is occupied."""
+    def _add_arrivals(self, run: _Run, tracks: list[int]) -> None:
+        """Adds those of some vehicles that are recorded to appear at this frame.
+
+        A vehicle whose position is occupied does not appear.
+        """
         arrivals = run.history.coming(run.frame)
-        for row in arrivals[~np.isin(arrivals["track"], [*away])]:
+        for row in arrivals[np.isin(arrivals["track"], tracks)]:
             place = np.array([row["x"], row["y"]])
             near = [np.linalg.norm(each.position - place) < APART_M for each in run.road.vehicles]
             if not any(near):

@@ -6,9 +6,9 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from jaxtyping import Bool, Int
+from jaxtyping import Bool, Float, Int
 
-from asp_env.data.predictor import Forecast, Predictor, fill_missing
+from asp_env.data.predictor import Forecast, Predictor, fill_missing, needs_simulation
 from asp_env.data.rollout import Rollout
 from asp_env.data.scenarios.scenario import Scenario
 from asp_env.data.scene import EGO, Scene
@@ -34,6 +34,7 @@ from asp_env.metrics.driving.scores import (
 from asp_env.metrics.driving.ttc import time_to_collision
 from asp_env.metrics.masked import Masked
 from asp_env.planning.planner import Plan, Planner
+from asp_env.sim.simulated_future import simulated_future
 from asp_env.sim.simulation import Simulation, ending
 from asp_env.sim.traffic.assignment import TrafficSpec, make_traffic
 from asp_env.sim.world import Ending, Events, ReplayWorld, World, recorded_future
@@ -123,7 +124,10 @@ def drive_episodes(
         running = endings == Ending.RUNNING
         actions = np.zeros((len(scenarios), 2), dtype=np.float32)
         if not planner.privileged:
-            decisions.append(_decide(world, running, planner, predictor, settings.horizon))
+            last_plan = decisions[-1].plan if decisions else None
+            decisions.append(
+                _decide(simulation, running, planner, predictor, settings.horizon, last_plan)
+            )
             actions = decisions[-1].plan.actions[:, 0].astype(np.float32)
         simulation.step(actions, running & (not planner.privileged))
         events.append(world.events())
@@ -143,17 +147,42 @@ def drive_episodes(
 
 
 def _decide(
-    world: World,
+    simulation: Simulation,
     running: Bool[np.ndarray, " b"],
     planner: Planner,
     predictor: Predictor,
     horizon: int,
+    last_plan: Plan | None,
 ) -> Decision:
-    scene = world.scene()
+    scene = simulation.world.scene()
     scene = scene.with_targets(targets_near_egos(scene, running))
-    future = recorded_future(world, scene, horizon) if predictor.privileged else None
+    future = None
+    if needs_simulation(predictor):
+        actions = continued_actions(last_plan, len(running), horizon)
+        future = simulated_future(simulation, scene, actions, running)
+    elif predictor.privileged:
+        future = recorded_future(simulation.world, scene, horizon)
     forecast = forecast_for_planner(predictor, scene, future, horizon)
     return Decision(running=running, forecast=forecast, plan=planner.plan(scene, forecast))
+
+
+def continued_actions(
+    last_plan: Plan | None, num_episodes: int, horizon: int
+) -> Float[np.ndarray, "b horizon 2"]:
+    """The actions that carry on with the plans of the last tick.
+
+    Args:
+        last_plan: the plans, whose first action has been executed; None before the first plans.
+        num_episodes: B.
+        horizon: number of actions. The last action of a plan is repeated.
+
+    Returns:
+        [acceleration m/s², steering rad]; zeros, which is constant speed, without plans.
+    """
+    if last_plan is None:
+        return np.zeros((num_episodes, horizon, 2), dtype=np.float32)
+    ticks = np.minimum(1 + np.arange(horizon), last_plan.actions.shape[1] - 1)
+    return last_plan.actions[:, ticks].astype(np.float32)
 
 
 def forecast_for_planner(

@@ -3,7 +3,13 @@
 import numpy as np
 from jaxtyping import Bool, Int
 
-from asp_env.data.predictor import Forecast, Predictor, fill_missing, load_predictor
+from asp_env.data.predictor import (
+    Forecast,
+    Predictor,
+    fill_missing,
+    load_predictor,
+    needs_simulation,
+)
 from asp_env.data.recording import ticks
 from asp_env.dynamics import clip_actions, inverse
 from asp_env.errors import AspEnvError
@@ -58,8 +64,14 @@ class PredictorDriver:
             sampled: whether to draw a mode instead of taking the most probable one.
 
         Raises:
-            AspEnvError: `every` is not between 1 and the predictor's horizon.
+            AspEnvError: `every` is not between 1 and the predictor's horizon, or the predictor
+                needs a simulated future.
         """
+        if needs_simulation(predictor):
+            raise AspEnvError(
+                f"driver predictor:{predictor.name}: simulates the ego's plan, which drivers do "
+                "not know: use predictor:oracle, or a predictor that needs no future"
+            )
         if not 1 <= every <= predictor.horizon:
             raise AspEnvError(
                 f"every={every}: expected 1 to {predictor.horizon} ticks, the horizon of "
