@@ -95,7 +95,8 @@ descending order |
 
         Args:
             env: an environment of this package, possibly in wrappers, with a Dict observation.
-            predictor: a predictor or its name, such as `constant-velocity` or `ssp-asp:RUN_DIR`.
+            predictor: a predictor or its name, such as `constant-velocity`, `ffw-asp:pretrained` or
+                `ssp-asp:RUN_DIR`.
             agents: number of nearest agents.
             modes: number of most probable modes.
             at_s: times ahead of the positions in seconds, whole ticks.

@@ -11,7 +11,6 @@ import shutil
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from types import MappingProxyType
 from typing import Annotated, Any
 
 import torch
@@ -45,8 +44,9 @@ VALIDATION = {
 """Options of `asp-env synthesize` for each site, by `--traffic`: many locations with one short
 recording each. Dense traffic has about twice as many snippets in a minute."""
 
-EPOCHS: Mapping[str, int] = MappingProxyType({"ffw-asp": 20, "ssp-asp": 40})
-"""Epochs by predictor: about as many snippets for both. Chosen on the validation data."""
+EPOCHS = 20
+"""Epochs of each predictor, instead of the recipe's eight. Chosen by hand: the errors on the
+validation data still fall, and a run takes a few minutes."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -55,7 +55,7 @@ class Pretrain:
 
     out: Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="OUT")]
     """Folder of traffic and runs; the result is in OUT/pretrained."""
-    predictors: tuple[str, ...] = tuple(EPOCHS)
+    predictors: tuple[str, ...] = ("ffw-asp", "ssp-asp")
     """Predictors to train."""
     held_out: Annotated[tuple[str, ...], tyro.conf.arg(metavar="DATA …")] = ()
     """Recordings whose errors the model card states. Nothing is chosen on them."""
@@ -78,7 +78,7 @@ class Pretrain:
                     out=run,
                     view="vectors",
                     recipe="ours",
-                    epochs=EPOCHS[name],
+                    epochs=EPOCHS,
                 ).run()
             shipped = self.out / PRETRAINED / name
             if not shipped.exists():

@@ -5,9 +5,12 @@ import subprocess
 import sys
 from pathlib import Path
 
+import gymnasium
 import numpy as np
 import pytest
+from safetensors.numpy import load_file
 
+import asp_env
 from asp_env.data.predictor import load_predictor
 from asp_env.data.source import open_data
 from asp_env.errors import AspEnvError, CheckpointError
@@ -138,10 +141,21 @@ print(json.dumps(predictor.predict(scene).states.shape))
     assert json.loads(done.stdout) == [4, 3, 15, 4]
 
 
+def test_forecasts_as_observation() -> None:
+    """A learned predictor's forecasts in an environment, without any training."""
+    env = asp_env.PredictionFeatures(
+        gymnasium.make("asp_env/Replay-v0", observations=("state",)), "ffw-asp:pretrained"
+    )
+    observation, _ = env.reset(seed=0)
+    assert observation["forecast_valid"].sum() > 0
+    probabilities = observation["forecast_probabilities"].reshape(8, 3)
+    present = observation["forecast_valid"] == 1
+    np.testing.assert_allclose(probabilities[present].sum(axis=1), 1, atol=1e-5)
+    assert (probabilities[present].max(axis=1) < 1).any()
+
+
 def test_weights_are_rounded_to_half_precision() -> None:
     """Every stored weight is float16; the network computes in float32."""
-    from safetensors.numpy import load_file
-
     for name in pretrained_names():
         stored = load_file(pretrained_folder(name) / "weights.safetensors")
         assert {tensor.dtype for tensor in stored.values()} == {np.dtype(np.float16)}
