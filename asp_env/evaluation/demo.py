@@ -25,15 +25,15 @@ from asp_env.metrics.driving.rules import DEFAULT_RULES, RULES
 
 TRAFFIC = {"site": "intersection", "traffic": "dense"}
 """Options of `asp-env synthesize` for all traffic of the demo."""
-HELD_OUT = {"recordings": 20, "locations": 20, "minutes": 1.5, "seed": 48_271}
+HELD_OUT = {"recordings": 24, "locations": 24, "minutes": 2.0, "seed": 48_271}
 """Recordings to evaluate on. Every one has a location of its own, because scenarios of one
 location resemble each other."""
 TRAINING = {"recordings": 12, "locations": 12, "minutes": 2.0, "seed": 0}
 """Recordings that the predictor is trained on; another seed gives other locations."""
 
 PREDICTOR = "ffw-asp"
-RECIPE = {"recipe": "ours", "view": "vectors", "split": "blocks", "epochs": 2}
-"""Options of `asp-env train`: two epochs instead of the recipe's eight. Every recording is split
+RECIPE = {"recipe": "ours", "view": "vectors", "split": "blocks", "epochs": 6}
+"""Options of `asp-env train`: six epochs instead of the recipe's eight. Every recording is split
 into blocks of time, so that all locations are trained on."""
 PRETRAINED = f"{PREDICTOR}:pretrained"
 
@@ -44,7 +44,7 @@ controls of `asp-env drive --controls`."""
 PLANNER = "sampling"
 SCENARIOS = "interactive"
 """Filter of the scenarios that every method drives."""
-MAX_SCENARIOS = 160
+MAX_SCENARIOS = 300
 
 PLAN = {
     "traffic": TRAFFIC,
@@ -89,7 +89,7 @@ class Demo:
         check_report_possible()
         console = Console()
         _claim(self.out)
-        held_out, run = self.out / "held-out", self.out / PREDICTOR
+        held_out, run = self.out / "held-out", self.out / "trained"
         _simulate(console, held_out, HELD_OUT)
         if not (run / "config.json").exists():
             console.rule(f"Evaluating the forecasts of {PRETRAINED}")

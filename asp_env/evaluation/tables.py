@@ -135,18 +135,26 @@ def driving_tables(
 ) -> list[Table]:
     """For each of `SUBSETS`, the differences to the reference and the driving metrics, by method.
 
+    If all scenarios are interactive, they are shown once.
+
     Args:
         rows: closed-loop rows of `metrics.csv`.
         privileged: names of the privileged planners and predictors, which are marked.
         shown: metrics to show after the score.
     """
     tables = []
-    for subset in SUBSETS:
+    for subset in _different_subsets(rows):
         chosen = [row for row in rows if row.subset == subset]
-        if chosen:
-            tables += _difference_tables(chosen, privileged)
-            tables.append(driving_table(chosen, privileged, shown, subset=subset))
+        tables += _difference_tables(chosen, privileged)
+        tables.append(driving_table(chosen, privileged, shown, subset=subset))
     return tables
+
+
+def _different_subsets(rows: Sequence[Row]) -> list[str]:
+    """Those of `SUBSETS` that occur; of subsets of all the same scenarios, the last."""
+    counts = {name: max((r.n for r in rows if r.subset == name), default=0) for name in SUBSETS}
+    last = {count: name for name, count in counts.items() if count > 0}
+    return [*last.values()]
 
 
 def headlines(rows: Sequence[Row], privileged: Collection[str]) -> list[str]:

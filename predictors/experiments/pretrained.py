@@ -7,7 +7,6 @@ finished is not made again.
 """
 
 import shlex
-import shutil
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -23,9 +22,11 @@ from predictors.inference.checkpoint import (
     CARD,
     CONFIG,
     WEIGHTS,
+    read_config,
     read_weights,
     save_weights,
     weights_hash,
+    write_json,
 )
 from predictors.inference.pretrained import PRETRAINED
 from predictors.training.command import Train
@@ -43,6 +44,9 @@ VALIDATION = {
 }
 """Options of `asp-env synthesize` for each site, by `--traffic`: many locations with one short
 recording each. Dense traffic has about twice as many snippets in a minute."""
+
+SOURCE = "synthetic traffic"
+"""Name of the training data in tables, instead of four folders."""
 
 EPOCHS = 20
 """Epochs of each predictor, instead of the recipe's eight. Chosen by hand: the errors on the
@@ -116,6 +120,8 @@ def _data(by_traffic: Mapping[str, Mapping[str, Any]]) -> list[dict[str, Any]]:
 def ship(run: Path, shipped: Path) -> None:
     """Copies a finished run with its weights in half precision, which halves their size.
 
+    The name of the training data becomes `SOURCE`.
+
     Args:
         run: The folder of the run.
         shipped: The folder to create.
@@ -124,7 +130,9 @@ def ship(run: Path, shipped: Path) -> None:
         CheckpointError: The run's weights are missing or damaged.
     """
     with atomic_folder(shipped) as folder:
-        shutil.copyfile(run / CONFIG, folder / CONFIG)
+        config = read_config(run)
+        config["provenance"]["trained_on"]["source"] = SOURCE
+        write_json(config, folder / CONFIG)
         weights = read_weights(run / WEIGHTS)
         save_weights({n: each.to(torch.float16) for n, each in weights.items()}, folder / WEIGHTS)
         card = (run / CARD).read_text()

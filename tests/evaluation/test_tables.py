@@ -1,6 +1,7 @@
 """Result tables for terminals, and the short names in them."""
 
 import io
+from dataclasses import replace
 
 import pytest
 from rich.console import Console
@@ -188,12 +189,20 @@ def test_differences_are_shown_with_their_verdicts():
 
 def test_interactive_scenarios_are_beside_all():
     """Two tables of each, wherever the tag occurs; other tags are in `metrics.csv` only."""
-    tables = driving_tables(_compared("all", "left", "interactive"), PRIVILEGED, SHOWN)
+    rows = _compared("all", "left", "interactive")
+    some = [replace(row, n=120) if row.subset == "interactive" else row for row in rows]
+    tables = driving_tables(some, PRIVILEGED, SHOWN)
     titles = [_printed(table)[0].strip() for table in tables]
     assert [title.partition(" scenarios")[0] for title in titles] == [
-        "all 480", "all 480", "480 interactive", "480 interactive",
+        "all 480", "all 480", "120 interactive", "120 interactive",
     ]  # fmt: skip
     assert all(max(len(line) for line in _printed(table)) <= 80 for table in tables)
+
+
+def test_scenarios_that_are_all_interactive_are_shown_once():
+    tables = driving_tables(_compared("all", "interactive"), PRIVILEGED, SHOWN)
+    titles = [_printed(table)[0].strip() for table in tables]
+    assert [title.partition(" scenarios")[0] for title in titles] == ["480 interactive"] * 2
 
 
 def test_without_differences_there_is_one_table():
