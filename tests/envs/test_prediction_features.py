@@ -222,6 +222,8 @@ def test_privileged_predictors_need_permission_and_rename_the_keys(crossing):
     """The oracle's forecasts are the positions that the agents then reach."""
     with pytest.raises(asp_env.AspEnvError, match=r"oracle uses the recorded future.*privileged=T"):
         PredictionFeatures(_env(crossing), "oracle")
+    with pytest.raises(asp_env.AspEnvError, match="interactive-oracle simulates the ego's plan"):
+        PredictionFeatures(_env(crossing), "interactive-oracle", privileged=True)
     env = PredictionFeatures(_env(crossing), "oracle", privileged=True, agents=2, at_s=(1.0,))
     assert {"oracle_forecast", "oracle_forecast_probabilities", "oracle_forecast_valid"} < set(
         env.observation_space.keys()  # pyright: ignore[reportAttributeAccessIssue]

@@ -8,7 +8,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from asp_env.data.classes import AgentClass
-from asp_env.data.predictor import Forecast, load_predictor
+from asp_env.data.predictor import Forecast, load_predictor, needs_simulation
 from asp_env.data.scene import Scene
 from asp_env.data.snippets import (
     Future,
@@ -20,6 +20,7 @@ from asp_env.data.snippets import (
 from asp_env.data.source import open_data
 from asp_env.errors import AspEnvError
 from asp_env.geometry import wrap_angle
+from asp_env.sim.traffic.assignment import make_traffic
 from predictors.controls import persistent_noise
 from tests.builders import Drive, make_recording
 from tests.real_data import real_data
@@ -262,6 +263,27 @@ def test_shuffled_forecasts_are_distributed_like_the_oracle() -> None:
     np.testing.assert_array_equal(found, expected)
 
 
+def test_the_interactive_oracle_equals_the_oracle_at_logged_states() -> None:
+    """There the ego carries out its log, so that the future is the recorded one."""
+    scene, future = scene_at_3_s(EAST, BRAKING, WALKER)
+    oracle, interactive = (
+        forecast_by(name, scene, future) for name in ("oracle", "interactive-oracle")
+    )
+    np.testing.assert_array_equal(interactive.states, oracle.states)
+    np.testing.assert_array_equal(interactive.valid, True)
+
+
+def test_only_the_interactive_oracle_needs_a_simulation() -> None:
+    """Also behind a delay; a driver of traffic does not know the ego's plan and refuses it."""
+    needing = ("interactive-oracle", "delayed:2:interactive-oracle")
+    for name in (*needing, "oracle", "blend:0.5", "constant-velocity", "delayed:2:oracle"):
+        predictor = load_predictor(name, horizon=15, dt_s=0.2)
+        assert needs_simulation(predictor) == (name in needing)
+        if name in needing:
+            with pytest.raises(AspEnvError, match="simulates the ego's plan, which drivers do not"):
+                make_traffic(f"predictor:{name}")
+
+
 @pytest.mark.parametrize(
     ("name", "message"),
     [
@@ -275,6 +297,7 @@ def test_shuffled_forecasts_are_distributed_like_the_oracle() -> None:
         ("noisy-oracle:inf", "predictor noisy-oracle:inf: expected"),
         ("blind:1", "predictor blind takes no argument, '1' was given: use blind"),
         ("shuffled-oracle:1", "predictor shuffled-oracle takes no argument"),
+        ("interactive-oracle:1", "predictor interactive-oracle takes no argument"),
     ],
 )
 def test_bad_arguments_are_refused(name: str, message: str) -> None:

@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from asp_env.data.predictor import Forecast
+from asp_env.data.predictor import Forecast, load_predictor
 from asp_env.data.rollout import Rollout
 from asp_env.data.scenarios.scenario import Scenario, find_scenarios
 from asp_env.data.scene import Scene
@@ -22,11 +22,12 @@ from asp_env.evaluation.closed_loop.episodes import (
     FORECAST_WITHIN_M,
     DrivenEpisodes,
     EpisodeSettings,
+    continued_actions,
     drive_episodes,
 )
 from asp_env.metrics.driving.rules import PDMS
 from asp_env.metrics.driving.scores import driving_metrics
-from asp_env.planning.planner import load_planner
+from asp_env.planning.planner import Plan, load_planner
 from asp_env.sim.world import Ending
 from predictors.physical import ConstantVelocity, Oracle
 from tests.crossing_files import ON_ROAD, write_crossing
@@ -41,6 +42,7 @@ class Spy:
 
     horizon: int = 15
     privileged: bool = False
+    needs_simulation: bool = False
     name: str = "spy"
     dt_s: float = DT_S
     history: int = 0
@@ -243,6 +245,39 @@ def test_only_privileged_predictors_receive_the_future(recordings):
         present = frames < len(recording.track(track))
         assert future.valid[row].tolist() == present.tolist()
         assert np.array_equal(future.states[row][present], recording.track(track)[frames[present]])
+
+
+def test_simulating_the_future_does_not_change_a_drive(recordings):
+    """The same states and plans as without, in traffic that reacts."""
+    scenarios = _scenarios(recordings)[:3]
+    alone = _drive(recordings, scenarios, Spy(), traffic="idm")
+    spy = Spy(privileged=True, needs_simulation=True)
+    simulated = _drive(recordings, scenarios, spy, traffic="idm")
+    for one, other in zip(alone.rollouts, simulated.rollouts, strict=True):
+        assert one.states.tobytes() == other.states.tobytes()
+        assert one.plans.tobytes() == other.plans.tobytes()
+    assert all(future is not None for _, future in spy.inputs)
+
+
+def test_the_last_plan_is_carried_on():
+    """Shifted by one tick, with the last action repeated; zeros before the first plan."""
+    actions = np.arange(6, dtype=np.float32).reshape(1, 3, 2)
+    plan = Plan(actions=actions, states=np.zeros((1, 3, 4), dtype=np.float32))
+    assert continued_actions(plan, 1, 4).tolist() == [[[2, 3], [4, 5], [4, 5], [4, 5]]]
+    assert continued_actions(None, 1, 2).tolist() == [[[0, 0], [0, 0]]]
+
+
+def test_the_interactive_oracle_drives_like_the_oracle_in_replayed_traffic(recordings):
+    """Equal bits there; with `idm`, which reacts, it forecasts something else."""
+    scenarios = _scenarios(recordings)[:3]
+    names = ("oracle", "interactive-oracle")
+    predictors = [load_predictor(name, horizon=15, dt_s=DT_S) for name in names]
+    for traffic in ("log", "idm"):
+        one, other = (
+            np.concatenate([each.forecast_states for each in driven.rollouts]).tobytes()
+            for driven in (_drive(recordings, scenarios, p, traffic=traffic) for p in predictors)
+        )
+        assert (one == other) == (traffic == "log")
 
 
 def test_forecasts_are_cut_to_the_horizon(recordings):
