@@ -2,6 +2,7 @@
 
 import io
 from dataclasses import replace
+from typing import Any
 
 import pytest
 from rich.console import Console
@@ -153,7 +154,12 @@ def _compared(*subsets: str) -> list[Row]:
     """The ladder, a resolved method, and one of three runs that is not resolved."""
     rows = []
     for subset in subsets:
-        common = {"planner": "sampling", "subset": subset, "rules": "pdms 1", "n": 480}
+        common: dict[str, Any] = {
+            "planner": "sampling",
+            "subset": subset,
+            "rules": "pdms 1",
+            "n": 480,
+        }
         rows.append(_row("score", 0.95, **(common | {"planner": "expert"})))
         for name in (*LADDER, "constant-turn-rate", "ffw-asp:runs/*"):
             several = name.startswith("ffw")
@@ -161,13 +167,13 @@ def _compared(*subsets: str) -> list[Row]:
             rows.append(_row("score", 0.9, **about))
             if name == "constant-velocity":
                 continue
-            gain = {"value": 0.011, "low": -0.002, "high": 0.021} if several else {
+            gain: dict[str, Any] = {"value": 0.011, "low": -0.002, "high": 0.021} if several else {
                 "value": 0.046, "low": 0.023, "high": 0.061}  # fmt: skip
             mde = 0.0247 if several else 0.028
             metric = "score - constant-velocity"
             rows.append(Row(data="d", metric=metric, mde=mde, p_holm=0.01, **about, **gain))
             if name not in LADDER:
-                share = {"value": 0.4, "low": 0.25, "high": 0.549}
+                share: dict[str, Any] = {"value": 0.4, "low": 0.25, "high": 0.549}
                 rows.append(Row(data="d", metric="oracle share", **about, **share))
     return rows
 

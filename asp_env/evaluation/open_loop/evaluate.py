@@ -307,7 +307,7 @@ def _estimates(
     values = np.stack([each.values for each in runs])
     valid = np.stack([each.valid for each in runs])
     compared = metric == "FDE" and runs[0].name != REFERENCE
-    for subset, rows in _subset_rows(scores, valid.any(axis=0)):
+    for subset, rows in _subset_rows(scores, np.asarray(valid.any(axis=0))):
         groups, known = scores.recording[rows], valid[:, rows]
         sums = np.where(known, values[:, rows], 0)
         mean = statistics.ratio_over_runs(sums, known, groups, stream=stream)

@@ -19,7 +19,7 @@ def both(
     """The configurations of a recipe and of its variant, as the command makes it."""
     horizon = VARIANTS[predictor][name].horizons_s[0]
     command = Train(
-        predictor=predictor, data="", out=Path(), recipe=recipe_name, view=view,
+        predictor=predictor, data=("",), out=Path(), recipe=recipe_name, view=view,
         horizon=horizon, variant=name,
     )  # fmt: skip
     return recipe(predictor, recipe_name, view=view, horizon_s=horizon), command.config_for(horizon)
@@ -86,7 +86,9 @@ def test_unknown_variants_list_the_known_ones() -> None:
 )
 def test_other_numbers_of_epochs_are_scaled(predictor: str, name: str, epochs: int) -> None:
     """Of 4 epochs for 6 s: half of them after 3 s (8 of 16), twice as many at once (16 for 8)."""
-    command = Train(predictor=predictor, data="", out=Path(), horizon=6.0, variant=name, epochs=4)
+    command = Train(
+        predictor=predictor, data=("",), out=Path(), horizon=6.0, variant=name, epochs=4
+    )
     assert command.config_for(6.0).epochs == epochs
 
 
