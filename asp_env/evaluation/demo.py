@@ -41,10 +41,10 @@ PHYSICAL = ("constant-velocity", "constant-turn-rate")
 """Predictors that are compared with the trained ones in open loop. In closed loop these are the
 controls of `asp-env drive --controls`."""
 
-PLANNER = "sampling"
+PLANNER = "contingency"
 SCENARIOS = "interactive"
 """Filter of the scenarios that every method drives."""
-MAX_SCENARIOS = 300
+MAX_SCENARIOS = 200
 
 PLAN = {
     "traffic": TRAFFIC,

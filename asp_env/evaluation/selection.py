@@ -125,9 +125,13 @@ def split_name(name: str) -> tuple[str, str]:
     """The label of a predictor and its run folder, which is empty for a predictor without one.
 
     Numbers in the name belong to the label: `noisy-oracle:2` is `noisy-oracle 2`, and
-    `delayed:2:mtp:runs/1` is `delayed 2 mtp` with the folder `runs/1`.
+    `delayed:2:mtp:runs/1` is `delayed 2 mtp` with the folder `runs/1`. So does the predictor in
+    `most-probable:mtp:runs/1`.
     """
     kind, _, argument = name.partition(":")
+    if kind == "most-probable" and argument:
+        label, run = split_name(argument)
+        return f"{kind} {label}", run
     number, _, inner = argument.partition(":")
     if not re.fullmatch(r"[0-9.]+", number):
         return kind, argument

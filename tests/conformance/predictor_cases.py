@@ -37,6 +37,7 @@ HISTORY = 15
 ARGUMENTS = {
     "blend": ("0.25",),
     "noisy-oracle": ("2",),
+    "most-probable": ("ffw-asp:pretrained", "oracle"),
     "delayed": ("2:constant-turn-rate", "3:oracle", "1:delayed:1:blend:0.5"),
 }
 """Arguments of the predictors that need one."""

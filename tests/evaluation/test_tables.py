@@ -267,6 +267,7 @@ def test_short_names_contain_numbers():
         "blend:1": "blend 1",
         "noisy-oracle:2": "noisy-oracle 2",
         "delayed:2:oracle": "delayed 2 oracle",
+        "most-probable:mtp:runs/1": "most-probable mtp",
         "delayed:2:blend:0.5": "delayed 2 blend 0.5",
         "delayed:1:delayed:2:mtp:runs/1": "delayed 1 delayed 2 mtp",
         "delayed:2:ffw-asp:runs/1": "delayed 2 ffw-asp 1",
