@@ -47,7 +47,7 @@ _FACTORS = (np.uint64(0xBF58476D1CE4E5B9), np.uint64(0x94D049BB133111EB))
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Blind:
-    """Forecasts every present agent as standing 1 km ahead, so that a planner sees a free road.
+    """Forecasts every present agent as standing 1 km ahead, so that the road is free for a planner.
 
     It has no actions.
     """

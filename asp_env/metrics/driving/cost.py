@@ -1,6 +1,6 @@
 """The driving cost: what a drive costs in seconds of delay, risk and discomfort.
 
-It rates driven episodes, not plans, and knows nothing of a planner's own cost.
+It rates driven episodes, not plans, and does not use a planner's own cost.
 """
 
 from dataclasses import dataclass
