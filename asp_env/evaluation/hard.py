@@ -1,8 +1,9 @@
 """The largest planning regret along the log of scenarios, and the `hard` ones among them.
 
 These are measures of scenarios that need a planner and predictors, so they are computed on demand
-and stored in the cache, by content of the recording. The regret of `blind`, which forecasts every agent far away, states whether any forecast matters in a scenario, and favours no predictor. The regret of
-constant velocity states where it fails: a selection by it favours all others against it.
+and stored in the cache, by content of the recording. The regret of `blind`, which forecasts every
+agent far away, states whether any forecast matters in a scenario, and favours no predictor. The
+regret of constant velocity states where it fails: a selection by it favours all others against it.
 """
 
 import hashlib
