@@ -59,7 +59,7 @@ def test_drives_are_logged_and_the_expert_comes_first(
     assert expert["log divergence"] == 0.0
     assert expert["progress"] == pytest.approx(1.0, abs=0.01)
     assert expert["no at-fault collision"] == 1.0
-    rollouts = [Rollout.load(path) for path in sorted(out.glob("rollouts/sampling*/*.npz"))]
+    rollouts = [Rollout.load(path) for path in sorted(out.glob("rollouts/contingency*/*.npz"))]
     assert len(rollouts) == 2
     assert all(len(rollout.plans) == len(rollout.states) - 1 for rollout in rollouts)
 

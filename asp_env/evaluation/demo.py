@@ -35,7 +35,7 @@ PREDICTOR = "ffw-asp"
 RECIPE = {"recipe": "ours", "view": "vectors", "split": "blocks", "epochs": 6}
 """Options of `asp-env train`: six epochs instead of the recipe's eight. Every recording is split
 into blocks of time, so that all locations are trained on."""
-PRETRAINED = f"{PREDICTOR}:pretrained"
+PRETRAINED = "ssp-asp:pretrained"
 
 PHYSICAL = ("constant-velocity", "constant-turn-rate")
 """Predictors that are compared with the trained ones in open loop. In closed loop these are the
@@ -44,7 +44,7 @@ controls of `asp-env drive --controls`."""
 PLANNER = "contingency"
 SCENARIOS = "interactive"
 """Filter of the scenarios that every method drives."""
-MAX_SCENARIOS = 200
+MAX_SCENARIOS = 120
 
 PLAN = {
     "traffic": TRAFFIC,

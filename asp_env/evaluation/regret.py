@@ -193,11 +193,12 @@ def regrets_at(
         recorded: the same recordings as the truth.
         horizon: number of ticks of forecasts and plans.
     """
+    history = max(scenarios.history, *(predictor.history for predictor in predictors.values()))
     oracle = load_predictor("oracle", horizon=horizon, dt_s=scenarios.dt_s)
     regrets = {name: np.zeros(len(states)) for name in predictors}
     for start in track(range(0, len(states), BATCH), description="planning", transient=True):
         rows = slice(start, min(start + BATCH, len(states)))
-        world = _world_at(states, rows, scenarios, scenes)
+        world = _world_at(states, rows, scenarios, scenes, history=history)
         scene = world.scene()
         scene = scene.with_targets(targets_near_egos(scene, np.ones(len(world), dtype=bool)))
         world.recordings = recorded
@@ -213,7 +214,12 @@ def regrets_at(
 
 
 def _world_at(
-    states: LoggedStates, rows: slice, scenarios: ScenarioSet, recordings: Sequence[Any]
+    states: LoggedStates,
+    rows: slice,
+    scenarios: ScenarioSet,
+    recordings: Sequence[Any],
+    *,
+    history: int,
 ) -> ReplayWorld:
     """A world in which an episode begins at each of the states, the logged ego at its place."""
     episodes = [
@@ -226,7 +232,7 @@ def _world_at(
         recordings,
         num_episodes=len(episodes),
         dt_s=scenarios.dt_s,
-        history=scenarios.history,
+        history=history,
     )
     world.reset(episodes, [np.random.default_rng(0)] * len(episodes))  # replay draws nothing
     return world

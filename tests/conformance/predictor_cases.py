@@ -114,7 +114,7 @@ def snippets_for(predictor: Predictor) -> SnippetIndex:
 
 def forecasts_all_classes(predictor: Predictor) -> bool:
     """Whether it also forecasts agents that trained predictors do not, such as pedestrians."""
-    kind = re.sub(r"delayed:\d+:", "", predictor.name).partition(":")[0]
+    kind = re.sub(r"(delayed:\d+|most-probable):", "", predictor.name).partition(":")[0]
     return kind in (
         "oracle",
         "blind",

@@ -39,7 +39,7 @@ def record(*, active: int = TICKS, dt_s: float = DT_S, **changes: object) -> Epi
         "log_route_m": np.linspace(43, 50, TICKS)[None],
         "scenario_ticks": np.array([TICKS - 1]),
         "near_miss": no,
-        "conflict_s": np.full((1, TICKS), 3.0),
+        "bounded_ttc_s": np.full((1, TICKS), 3.0),
         "required_mps2": zeros,
         "outside_m": zeros,
         "several_lanes": no,

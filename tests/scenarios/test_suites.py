@@ -90,7 +90,7 @@ def test_other_traffic_is_not_comparable(tiny: Suite, monkeypatch: pytest.Monkey
         text = str(caught[0].message)
         assert text.count("eclipse-sumo") == 2
         assert str(frozen_facts(tiny)["data_hash"])[:12] in text
-    assert not (folder / "scenarios.json").exists()
+        assert not (folder / "scenarios.json").exists()
 
 
 def test_an_unknown_suite_lists_those_known() -> None:

@@ -17,7 +17,7 @@ from asp_env.metrics.drivable import OFF_ROAD_M
 from asp_env.metrics.driving.cost import log_route_m
 from asp_env.metrics.driving.map_context import map_context
 from asp_env.metrics.driving.margins import (
-    conflict_time_s,
+    bounded_ttc_s,
     near_misses,
     required_deceleration,
 )
@@ -270,7 +270,7 @@ def _measure(
         ),
         scenario_ticks=episodes.length.copy(),
         near_miss=near_misses(*agents, ignored=episodes.own_trailer),
-        conflict_s=conflict_time_s(*agents, **margins),
+        bounded_ttc_s=bounded_ttc_s(*agents, **margins),
         required_mps2=required_deceleration(*agents, **margins),
         map_context=context,
         active=active,

@@ -15,8 +15,8 @@ from asp_env.metrics.driving.cost import (
 )
 from asp_env.metrics.driving.map_context import MapContext, map_context
 from asp_env.metrics.driving.margins import (
-    CONFLICT_TTC,
-    conflict_time_s,
+    BOUNDED_TTC,
+    bounded_ttc_s,
     near_misses,
     required_deceleration,
 )
@@ -49,7 +49,7 @@ from asp_env.metrics.driving.scores import (
 from asp_env.metrics.driving.ttc import TtcRule, time_to_collision
 
 __all__ = [
-    "CONFLICT_TTC",
+    "BOUNDED_TTC",
     "DEFAULT_RULES",
     "GRADED",
     "NUPLAN",
@@ -66,9 +66,9 @@ __all__ = [
     "TtcRule",
     "against_traffic_in_window_m",
     "at_fault",
+    "bounded_ttc_s",
     "comfort_signals",
     "comfortable",
-    "conflict_time_s",
     "driving_cost_s",
     "driving_metrics",
     "feature_likelihood",

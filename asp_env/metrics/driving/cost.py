@@ -9,7 +9,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 
 from asp_env.geometry import route_coordinates
-from asp_env.metrics.driving.margins import CONFLICT_TTC
+from asp_env.metrics.driving.margins import BOUNDED_TTC
 
 SAME_PLACE_M = 1.0
 """Two positions on the route within this arc length count as the same place. Otherwise an ego that
@@ -23,7 +23,7 @@ class DrivingCostWeights:
 
     risk: float = 5.0
     """Seconds of delay per second at full severity. In PDMS a time to collision below its bound
-    costs as much as a drive without progress, about 10 s; a conflict lasts about 2 s."""
+    costs as much as a drive without progress, about 10 s; a foreseeable overlap lasts about 2 s."""
     discomfort: float = 1.0
     """Seconds of delay per second beyond nuPlan's comfort bounds: harsh motion is worth avoiding if
     the ego arrives later by no more than the harsh motion would have lasted."""
@@ -35,14 +35,14 @@ class DrivingCostWeights:
 
 
 def severity(ttc_s: Float[np.ndarray, "*shape"]) -> Float[np.ndarray, "*shape"]:
-    """Severity of conflicts: (1 - TTC / 3 s)², 0 from 3 s on and 1 at 0 s.
+    """Severity of foreseeable overlaps: (1 - TTC / 3 s)², 0 from 3 s on and 1 at 0 s.
 
     It is quadratic, since times to collision of 2 to 3 s are ordinary: a severity of at most 1/9.
 
     Args:
         ttc_s: time to collision, seconds.
     """
-    return (1.0 - np.clip(ttc_s / CONFLICT_TTC.horizon_s, 0.0, 1.0)) ** 2
+    return (1.0 - np.clip(ttc_s / BOUNDED_TTC.horizon_s, 0.0, 1.0)) ** 2
 
 
 def log_route_m(

@@ -23,7 +23,7 @@ NEAR_AHEAD_M = 0.5
 `NEAR_AHEAD_S` at its speed."""
 
 NEAR_AHEAD_S = 0.2
-"""Time at the ego's speed by which a near miss extends its box ahead. It balances conflicts ahead
+"""Time at the ego's speed by which a near miss extends its box ahead. It balances foreseeable overlaps ahead
 against oncoming traffic in bends, which a longer extension would sweep. Chosen by hand."""
 
 NEAR_SIDE_M = 0.3
@@ -37,7 +37,7 @@ this, which is not so in parallel traffic, oncoming or not, nor in a queue. Chos
 CLOSING_S = 0.1
 """Time at constant velocity over which the decrease is measured. Chosen by hand."""
 
-CONFLICT_TTC = TtcRule(
+BOUNDED_TTC = TtcRule(
     futures="constant-velocity",
     step_s=0.1,
     horizon_s=3.0,
@@ -92,7 +92,7 @@ def near_misses(
     return out
 
 
-def conflict_time_s(
+def bounded_ttc_s(
     states: Float[np.ndarray, "b t a 4"],
     valid: Bool[np.ndarray, "b t a"],
     sizes: Float[np.ndarray, "b a 2"],
@@ -103,7 +103,7 @@ def conflict_time_s(
     num_ticks: Int[np.ndarray, " b"],
     dt_s: float,
 ) -> Float[np.ndarray, "b t"]:
-    """Time to collision by `CONFLICT_TTC`; 0 during contacts that may be the ego's fault.
+    """Time to collision by `BOUNDED_TTC`; 0 during contacts that may be the ego's fault.
 
     Args:
         states: [x m, y m, heading rad, speed m/s] of A agents in B episodes of up to T ticks.
@@ -116,7 +116,7 @@ def conflict_time_s(
         dt_s: seconds per tick.
 
     Returns:
-        (b, t) seconds, at most 3; 3 where there is no conflict and after the end of an episode.
+        (b, t) seconds, at most 3; 3 where there is no foreseeable overlap and after the end of an episode.
     """
     found = time_to_collision(
         states,
@@ -126,11 +126,11 @@ def conflict_time_s(
         ignored=ignored,
         wide_sector=wide_sector,
         num_ticks=num_ticks,
-        rule=CONFLICT_TTC,
+        rule=BOUNDED_TTC,
         dt_s=dt_s,
     )
     hit = _contact_at_fault(contacts, num_ticks)
-    return np.where(hit, 0.0, np.minimum(found, CONFLICT_TTC.horizon_s))
+    return np.where(hit, 0.0, np.minimum(found, BOUNDED_TTC.horizon_s))
 
 
 def required_deceleration(
@@ -144,12 +144,12 @@ def required_deceleration(
     num_ticks: Int[np.ndarray, " b"],
     dt_s: float,
 ) -> Float[np.ndarray, "b t"]:
-    """The smallest constant braking of the ego (slot 0) that avoids every conflict, m/s².
+    """The smallest constant braking of the ego (slot 0) that avoids every foreseeable overlap, m/s².
 
-    A conflict is an overlap within 3 s with an agent that counts for `CONFLICT_TTC`, if the ego
-    continues at its speed and curvature and the agent at constant velocity. Each conflict requires
+    A foreseeable overlap is an overlap within 3 s with an agent that counts for `BOUNDED_TTC`, if the ego
+    continues at its speed and curvature and the agent at constant velocity. Each foreseeable overlap requires
     the smallest braking under which the ego does not overlap the agent within 6 s, and the largest
-    of these is the result. The time is twice that of the conflict, since braking that just avoids a
+    of these is the result. The time is twice that of the foreseeable overlap, since braking that just avoids a
     vehicle ahead, v² / (2 gap) for a standing one, takes 2 gap / v to end. An overlap that begins
     after the ego has stopped is not the ego's fault and does not count.
 
@@ -178,9 +178,9 @@ def required_deceleration(
         _curvature(states[:, :, 0], dt_s),
         num_ticks,
         _Trial(
-            step_s=CONFLICT_TTC.step_s,
-            steps=round(CONFLICT_TTC.horizon_s / CONFLICT_TTC.step_s),
-            standing_mps=CONFLICT_TTC.standing_mps,
+            step_s=BOUNDED_TTC.step_s,
+            steps=round(BOUNDED_TTC.horizon_s / BOUNDED_TTC.step_s),
+            standing_mps=BOUNDED_TTC.standing_mps,
         ),
         out,
     )
@@ -192,9 +192,9 @@ class _Trial(NamedTuple):
 
     step_s: float
     steps: int
-    """Number of steps within which a conflict counts; braking is tested over twice as many."""
+    """Number of steps within which a foreseeable overlap counts; braking is tested over twice as many."""
     standing_mps: float
-    """An ego up to this speed has no conflict."""
+    """An ego up to this speed has no foreseeable overlap."""
 
 
 def _contact_at_fault(
@@ -305,7 +305,7 @@ def _write_required(states, valid, sizes, skipped, wide_sector, curvature, num_t
 @njit(cache=True)
 @no_type_check
 def _smallest_braking(ego, size, curvature, other, other_size, trial):
-    """The smallest braking m/s² that avoids one agent; 0 without a conflict.
+    """The smallest braking m/s² that avoids one agent; 0 without a foreseeable overlap.
 
     Args:
         ego: (4,) state.

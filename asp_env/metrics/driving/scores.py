@@ -19,7 +19,7 @@ from asp_env.metrics.driving.cost import (
     time_lost_s,
 )
 from asp_env.metrics.driving.map_context import MapContext
-from asp_env.metrics.driving.margins import CONFLICT_TTC
+from asp_env.metrics.driving.margins import BOUNDED_TTC
 from asp_env.metrics.driving.rules import NUPLAN, Rules
 from asp_env.metrics.forecast.feasibility import infeasible_ticks
 from asp_env.metrics.masked import Masked
@@ -69,8 +69,8 @@ class EpisodeRecord:
     """Number of steps that each scenario provides."""
     near_miss: Bool[np.ndarray, "b t"]
     """Values of `near_misses`."""
-    conflict_s: Float[np.ndarray, "b t"]
-    """Values of `conflict_time_s`, the same under all rules."""
+    bounded_ttc_s: Float[np.ndarray, "b t"]
+    """Values of `bounded_ttc_s`, the same under all rules."""
     required_mps2: Float[np.ndarray, "b t"]
     """Values of `required_deceleration`."""
     map_context: MapContext
@@ -101,7 +101,7 @@ def driving_metrics(record: EpisodeRecord, rules: Rules) -> dict[str, Masked]:
     - `log divergence`, `route deviation`: mean distance to the logged ego at the same ticks, and
       mean absolute offset from its route, m.
     - `no near miss`: 1 or 0; `near misses`: share of the ticks that are near misses.
-    - `min TTC`: the smallest time to collision at constant velocity (`CONFLICT_TTC`), s, at most 3.
+    - `min TTC`: the smallest time to collision at constant velocity (`BOUNDED_TTC`), s, at most 3.
     - `required deceleration`: the largest over ticks, m/s², at most 8.
     - `safety margin`: the threshold of `TTC`, 0.95 s, widened to a ramp: min TTC / 1.9 s, up to 1.
     - `uncomfortable ticks`: share of the ticks beyond a comfort bound.
@@ -221,7 +221,7 @@ def _continuous(
     off_road = (record.off_road_m > NUPLAN.off_road_m) & active
     cost_s = driving_cost_s(
         time_lost_s=lost_s,
-        ttc_s=record.conflict_s,
+        ttc_s=record.bounded_ttc_s,
         uncomfortable=uncomfortable.value > 0,
         fault=np.asarray((at_fault(record, NUPLAN) | off_road).any(axis=1)),
         active=active,
@@ -229,15 +229,15 @@ def _continuous(
         weights=DrivingCostWeights(),
     )
     near = record.near_miss & active
-    horizon_s = CONFLICT_TTC.horizon_s
-    min_ttc_s = np.where(active, record.conflict_s, horizon_s).min(axis=1, initial=horizon_s)
+    horizon_s = BOUNDED_TTC.horizon_s
+    min_ttc_s = np.where(active, record.bounded_ttc_s, horizon_s).min(axis=1, initial=horizon_s)
     braking = np.where(active, record.required_mps2, 0.0).max(axis=1, initial=0.0)
     values = {
         "no near miss": 1.0 - near.any(axis=1),
         "near misses": _mean_over_ticks(near, active),
         "min TTC": min_ttc_s,
         "required deceleration": braking,
-        "safety margin": np.minimum(0.5 * min_ttc_s / CONFLICT_TTC.min_ttc_s, 1.0),
+        "safety margin": np.minimum(0.5 * min_ttc_s / BOUNDED_TTC.min_ttc_s, 1.0),
         "time lost": lost_s,
         "driving cost": cost_s,
     }

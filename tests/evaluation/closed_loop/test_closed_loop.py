@@ -86,7 +86,7 @@ def test_the_expert_replays_its_log(tmp_path):
     assert expert["log divergence"] == 0.0
     assert expert["progress"] == pytest.approx(1.0, abs=1e-3)
     assert expert["on road"] == 1.0
-    assert list(result.manifest["endings"]) == ["expert", "sampling + oracle"]
+    assert list(result.manifest["endings"]) == ["expert", "contingency + oracle"]
     assert expert["no collision"] == 1.0
     assert result.manifest["endings"]["expert"] == {"GOAL": 2}
 
@@ -96,14 +96,14 @@ def test_every_method_drives_the_same_scenarios(crossings):
     names = ("oracle", "constant-velocity")
     result = drive(Drive(data=str(crossings), out=NOWHERE, predictors=names, max_scenarios=5))
     assert len(result.manifest["scenarios"]) == 5
-    methods = ["expert", "sampling + oracle", "sampling + constant-velocity"]
+    methods = ["expert", "contingency + oracle", "contingency + constant-velocity"]
     assert list(result.rollouts) == methods
     for method in methods:
         assert sum(result.manifest["endings"][method].values()) == 5
         driven = [rollout.scenario.name for rollout in result.rollouts[method]]
         assert driven == [rollout.scenario.name for rollout in result.rollouts["expert"]]
     for name in names:
-        assert _values(result, "sampling", name)["score"] > 0
+        assert _values(result, "contingency", name)["score"] > 0
     row = result.rows[-1]
     assert (row.traffic, row.latency_ticks, row.horizon_s) == ("log", 0, 3.0)
 
@@ -116,10 +116,10 @@ def test_a_delayed_predictor_drives_the_same_scenarios(crossings):
     result = drive(config)
     assert result.manifest["scenarios"] == alone.manifest["scenarios"]
     assert _values(result, "expert") == _values(alone, "expert")
-    score = _values(result, "sampling", names[0])["score"]
-    assert score == _values(alone, "sampling", names[0])["score"]
-    assert _values(result, "sampling", names[1])["score"] != score
-    assert list(result.rollouts)[2] == "sampling + delayed 14 constant-turn-rate"
+    score = _values(result, "contingency", names[0])["score"]
+    assert score == _values(alone, "contingency", names[0])["score"]
+    assert _values(result, "contingency", names[1])["score"] != score
+    assert list(result.rollouts)[2] == "contingency + delayed 14 constant-turn-rate"
 
 
 def test_a_planner_without_forecasts_drives_once(crossings):
@@ -155,11 +155,11 @@ def test_controls_are_added_to_a_comparison(crossings, monkeypatch):
         "", "constant-turn-rate", "oracle",
         "blind", "constant-velocity", "blend:0.25", "blend:0.5", "blend:0.75",
     ]  # fmt: skip
-    metrics = _values(result, "sampling", "constant-turn-rate")
+    metrics = _values(result, "contingency", "constant-turn-rate")
     assert metrics["score - constant-velocity"] == 0.0  # here both are constant velocity
     assert 0.0 <= metrics["oracle share"] <= 1.0
     other = drive(dataclasses.replace(config, traffic="idm"))  # does not follow the recording
-    assert "oracle share" not in _values(other, "sampling", "constant-turn-rate")
+    assert "oracle share" not in _values(other, "contingency", "constant-turn-rate")
 
 
 def test_differences_refer_to_any_predictor(crossings):
@@ -332,7 +332,7 @@ def test_a_run_writes_its_folder(crossings, tmp_path):
     names.add("scenarios.csv")
     assert {path.name for path in out.iterdir()} == names
     methods = sorted(path.name for path in (out / "rollouts").iterdir())
-    assert methods == ["expert", "sampling + constant-velocity"]
+    assert methods == ["contingency + constant-velocity", "expert"]
     manifest = json.loads((out / "manifest.json").read_text())
     for method in methods:
         for path in (out / "rollouts" / method).iterdir():

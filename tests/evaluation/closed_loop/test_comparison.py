@@ -220,9 +220,8 @@ def test_runs_of_a_predictor_are_one_method(crossings: Path, runs: Path) -> None
     assert (expert.planner, method.predictor) == ("expert", pattern)
     assert list(method.runs) == names
     assert list(reference.runs) == ["constant-velocity"]
-    assert list(result.rollouts) == [
-        "expert", "sampling + dkm seed0", "sampling + dkm seed1", "sampling + constant-velocity",
-    ]  # fmt: skip
+    labels = ("dkm seed0", "dkm seed1", "constant-velocity")
+    assert list(result.rollouts) == ["expert", *(f"contingency + {label}" for label in labels)]
     assert result.manifest["runs"] == {pattern: names}
     (score,) = [
         row

@@ -24,7 +24,7 @@ def test_drive(tmp_path):
     given = ["drive", data, "--out", str(out), "--max-scenarios", "2", "--scenarios", "length<=9"]
     assert main([*given, "--predictors", *PREDICTORS]) == 0
     endings = json.loads((out / "manifest.json").read_text())["endings"]
-    assert list(endings) == ["expert", *(f"sampling + {each}" for each in PREDICTORS)]
+    assert list(endings) == ["expert", *(f"contingency + {each}" for each in PREDICTORS)]
     assert endings["expert"] == {"GOAL": 2}
     rows = _rows(out)
     assert rows[0]["planner"] == "expert"

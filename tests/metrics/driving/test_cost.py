@@ -134,7 +134,7 @@ def test_measures_over_the_ticks_of_an_episode() -> None:
     """One of eight ticks; values after the end are ignored."""
     changes: dict[str, Any] = {
         "near_miss": at_tick(3, 1).astype(bool),
-        "conflict_s": at_tick(3, 1.2, 3.0),
+        "bounded_ttc_s": at_tick(3, 1.2, 3.0),
         "required_mps2": at_tick(3, 4.5),
     }
     found = values(record(**changes))
@@ -172,7 +172,7 @@ def test_smoothness(acceleration: float, smoothness: float) -> None:
 @pytest.mark.parametrize(("ttc_s", "margin"), [(3.0, 1), (1.9, 1), (0.95, 0.5), (0.1, 1 / 19)])
 def test_safety_margin(ttc_s: float, margin: float) -> None:
     """Half at the bound of TTC."""
-    assert values(record(conflict_s=at_tick(2, ttc_s, 3.0)))["safety margin"] == pytest.approx(
+    assert values(record(bounded_ttc_s=at_tick(2, ttc_s, 3.0)))["safety margin"] == pytest.approx(
         margin
     )
 
@@ -181,7 +181,7 @@ def test_graded_rules_weigh_continuous_measures() -> None:
     """(5 · 0.8 + 5 margin + 2 smoothness) / 12, 0 with a fault."""
     states = record().states.copy()
     states[0, :, 3] = 15 - np.arange(TICKS)  # brakes at 5 m/s²
-    braking = record(states=states, conflict_s=at_tick(3, 1.2, 3.0))
+    braking = record(states=states, bounded_ttc_s=at_tick(3, 1.2, 3.0))
     found = values(braking, GRADED)
     assert found["comfort"] == 0
     assert found["smoothness"] == pytest.approx(1.5 - 5 / 4.05)

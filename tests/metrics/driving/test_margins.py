@@ -1,4 +1,4 @@
-"""Near misses, conflicts and required decelerations, derived by hand and by law."""
+"""Near misses, foreseeable overlaps and required decelerations, derived by hand and by law."""
 
 import math
 from random import Random
@@ -12,7 +12,7 @@ from asp_env.geometry import from_frame
 from asp_env.metrics.boxes import Contact
 from asp_env.metrics.driving.margins import (
     MAX_BRAKING_MPS2,
-    conflict_time_s,
+    bounded_ttc_s,
     near_misses,
     required_deceleration,
 )
@@ -37,7 +37,7 @@ def measures(
     wide_sector: bool = False,
     num_ticks: int | None = None,
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """(t,) near misses, conflict times and required decelerations of one episode of cars."""
+    """(t,) near misses, bounded times to collision and required decelerations of one episode of cars."""
     _, ticks, agents, _ = states.shape
     present = np.ones((1, ticks, agents), dtype=bool) if valid is None else valid
     sizes = np.full((1, agents, 2), CAR)
@@ -52,7 +52,7 @@ def measures(
     }
     return (
         near_misses(states, present, sizes, ignored=skip)[0],
-        conflict_time_s(states, present, sizes, **options)[0],
+        bounded_ttc_s(states, present, sizes, **options)[0],
         required_deceleration(states, present, sizes, **options)[0],
     )
 
@@ -99,8 +99,8 @@ def test_agents_that_are_absent_or_ignored_are_no_near_miss() -> None:
     assert not measures(states, valid=np.array([[[True, False]]]))[0].any()
 
 
-def test_conflict_time_is_clipped_and_0_in_a_contact() -> None:
-    """9.95 m at 10 m/s are 1 s; without a conflict it is 3 s; in a contact at fault 0 s."""
+def test_bounded_ttc_is_clipped_and_0_in_a_contact() -> None:
+    """9.95 m at 10 m/s are 1 s; without a foreseeable overlap it is 3 s; in a contact at fault 0 s."""
     states = scene((13.95, 0.0, 0.0, 0.0), ticks=3)
     contacts = np.zeros((1, 3, 2), dtype=np.int8)
     contacts[0, 1, 1] = Contact.OTHER_STANDS
@@ -121,7 +121,7 @@ def test_conflict_time_is_clipped_and_0_in_a_contact() -> None:
         (10.0, 10.0, 0.0, 5.0),  # v² / (2 gap)
         (20.0, 10.0, 0.0, 2.5),
         (25.0, 10.0, 0.0, 2.0),
-        (30.1, 10.0, 0.0, 0.0),  # no conflict within 3 s
+        (30.1, 10.0, 0.0, 0.0),  # no foreseeable overlap within 3 s
         (10.0, 10.0, 5.0, 1.25),  # (v - w)² / (2 gap)
         (8.0, 14.0, 6.0, 4.0),
         (6.0, 10.0, 0.0, 8.0),  # 8.33 m/s², more than the largest
