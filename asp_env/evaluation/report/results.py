@@ -501,7 +501,7 @@ METRIC_NOTES = {
         "Driving cost",
         "s",
         "lower",
-        "Time lost, plus 5 s per second of foreseeable overlap of full severity, which is (1 - TTC / 3 s)², "
+        "Time lost, plus 5 s per second of overlap of full severity, which is (1 - TTC / 3 s)², "
         "plus the uncomfortable time, plus 30 s for an at-fault collision or for leaving the "
         "road.",
     ),

@@ -23,7 +23,7 @@ NEAR_AHEAD_M = 0.5
 `NEAR_AHEAD_S` at its speed."""
 
 NEAR_AHEAD_S = 0.2
-"""Time at the ego's speed by which a near miss extends its box ahead. It balances foreseeable overlaps ahead
+"""Time at the ego's speed by which a near miss extends its box ahead. It balances overlaps ahead
 against oncoming traffic in bends, which a longer extension would sweep. Chosen by hand."""
 
 NEAR_SIDE_M = 0.3
@@ -116,7 +116,7 @@ def bounded_ttc_s(
         dt_s: seconds per tick.
 
     Returns:
-        (b, t) seconds, at most 3; 3 where there is no foreseeable overlap and after the end of an episode.
+        (b, t) seconds, at most 3; 3 where there is no overlap and after the end of an episode.
     """
     found = time_to_collision(
         states,
@@ -144,12 +144,12 @@ def required_deceleration(
     num_ticks: Int[np.ndarray, " b"],
     dt_s: float,
 ) -> Float[np.ndarray, "b t"]:
-    """The smallest constant braking of the ego (slot 0) that avoids every foreseeable overlap, m/s².
+    """The smallest constant braking of the ego (slot 0) that avoids every overlap, m/s².
 
-    A foreseeable overlap is an overlap within 3 s with an agent that counts for `BOUNDED_TTC`, if the ego
-    continues at its speed and curvature and the agent at constant velocity. Each foreseeable overlap requires
+    It is due within 3 s, with an agent that counts for `BOUNDED_TTC`, if the ego
+    continues at its speed and curvature and the agent at constant velocity. Each overlap requires
     the smallest braking under which the ego does not overlap the agent within 6 s, and the largest
-    of these is the result. The time is twice that of the foreseeable overlap, since braking that just avoids a
+    of these is the result. The time is twice that of the overlap, since braking that just avoids a
     vehicle ahead, v² / (2 gap) for a standing one, takes 2 gap / v to end. An overlap that begins
     after the ego has stopped is not the ego's fault and does not count.
 
@@ -192,7 +192,7 @@ class _Trial(NamedTuple):
 
     step_s: float
     steps: int
-    """Number of steps within which a foreseeable overlap counts; braking is tested over twice as many."""
+    """Number of steps within which a overlap counts; braking is tested over twice as many."""
     standing_mps: float
     """An ego up to this speed has no foreseeable overlap."""
 

@@ -100,7 +100,7 @@ def test_agents_that_are_absent_or_ignored_are_no_near_miss() -> None:
 
 
 def test_bounded_ttc_is_clipped_and_0_in_a_contact() -> None:
-    """9.95 m at 10 m/s are 1 s; without a foreseeable overlap it is 3 s; in a contact at fault 0 s."""
+    """9.95 m at 10 m/s are 1 s; without a overlap it is 3 s; in a contact at fault 0 s."""
     states = scene((13.95, 0.0, 0.0, 0.0), ticks=3)
     contacts = np.zeros((1, 3, 2), dtype=np.int8)
     contacts[0, 1, 1] = Contact.OTHER_STANDS
