@@ -146,9 +146,9 @@ def required_deceleration(
 ) -> Float[np.ndarray, "b t"]:
     """The smallest constant braking of the ego (slot 0) that avoids every overlap, m/s².
 
-    It is due within 3 s, with an agent that counts for `BOUNDED_TTC`, if the ego
-    continues at its speed and curvature and the agent at constant velocity. Each overlap requires
-    the smallest braking under which the ego does not overlap the agent within 6 s, and the largest
+    An overlap counts if it is due within 3 s with an agent that counts for `BOUNDED_TTC`, if the
+    ego continues at its speed and curvature and the agent at constant velocity. Each requires the
+    smallest braking under which the ego does not overlap the agent within 6 s, and the largest
     of these is the result. The time is twice that of the overlap, since braking that just avoids a
     vehicle ahead, v² / (2 gap) for a standing one, takes 2 gap / v to end. An overlap that begins
     after the ego has stopped is not the ego's fault and does not count.

@@ -37,7 +37,7 @@ def measures(
     wide_sector: bool = False,
     num_ticks: int | None = None,
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """(t,) near misses, bounded times to collision and required decelerations of one episode of cars."""
+    """(t,) near misses, bounded times to collision and required decelerations of one episode."""
     _, ticks, agents, _ = states.shape
     present = np.ones((1, ticks, agents), dtype=bool) if valid is None else valid
     sizes = np.full((1, agents, 2), CAR)
