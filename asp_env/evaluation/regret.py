@@ -164,7 +164,7 @@ def load_candidate_planner(name: str) -> CandidatePlanner[Any]:
     if not isinstance(planner, CandidatePlanner):
         raise AspEnvError(
             f"planner {name!r}: does not choose from candidates, which planning regret needs; use "
-            "sampling"
+            "contingency or sampling"
         )
     return planner
 
