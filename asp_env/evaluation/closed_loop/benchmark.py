@@ -37,6 +37,7 @@ from asp_env.evaluation.results import (
     write_manifest,
     write_metrics,
 )
+from asp_env.evaluation.selection import short_names
 from asp_env.evaluation.statistics import is_resolved
 from asp_env.evaluation.verdicts import share_text
 from asp_env.files import atomic_file, atomic_folder
@@ -340,18 +341,23 @@ def benchmark_table(rows: Sequence[BenchmarkRow], privileged: Collection[str]) -
         rows: the rows.
         privileged: names of the planners and predictors that are given the recorded future.
     """
+    planners = {row.planner for row in rows}
+    one_planner = len(planners) == 1 and all(row.predictor for row in rows)
     table = Table(box=box.SIMPLE_HEAD, show_edge=False, padding=(0, 1, 0, 0))
-    table.add_column("method", overflow="fold")
+    table.title = f"planner {rows[0].planner}" if one_planner else None
+    table.add_column("predictor" if one_planner else "method", overflow="fold")
     for heading in ("score", f"less {BASELINE}", "oracle share"):
         table.add_column(heading, justify="right", no_wrap=True)
+    short = short_names([row.predictor for row in rows])
     notes = set[str]()
     for row in rows:
         star = row.planner in privileged or row.predictor in privileged
         notes |= {"* uses the recorded future"} if star else set()
         difference = _difference_text(row.difference)
         notes |= {"~ not resolved"} if difference.endswith("~") else set()
+        named = (row.planner, short[row.predictor])
         table.add_row(
-            " + ".join(part for part in (row.planner, row.predictor) if part) + " *" * star,
+            " + ".join(part for part in named[one_planner:] if part) + " *" * star,
             _interval_text(row.score),
             difference,
             share_text(row.oracle_share) if row.oracle_share else "",
