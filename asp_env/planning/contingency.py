@@ -64,6 +64,13 @@ these times, rounded to ticks: the bound of the driving rules is 0.95 s."""
 MARGIN_M = 0.25
 """Margin on every side of the ego's box when closeness is rated. Chosen by hand."""
 
+OFF_ROAD_ROUTE_M = 5.0
+"""Where the route itself is off the road, up to this far beyond what candidates reach, the ego may
+be off the road as far as the route is: as for the log in the driving rules."""
+
+ROUTE_TOLERANCE_M = 0.3
+"""It may be farther off than the route by this: the ego does not follow the route exactly."""
+
 MAX_JOINT_AGENTS = 3
 """Number of agents whose modes are combined to joint scenarios; the modes of all others are
 averaged. Chosen by hand: the cost grows with the power."""
@@ -207,11 +214,17 @@ class ContingencyPlanner:
         weights = self.weights
         gained, speed, acceleration, jerk, lateral, offset = np.moveaxis(motion, -1, 0)
         outside = np.zeros(states.shape[:-1])
+        allowed = np.zeros(len(states))
+        routes = self._cache.routes(scene)
         for b, index in enumerate(scene.map_index):
             size = np.broadcast_to(scene.sizes[b, EGO], (*states.shape[1:-1], 2))
             outside[b] = off_road_m(scene.maps[int(index)], states[b], size)
-        # an ego that is off the road already pays only for going farther
-        leaves_road = outside.max(axis=-1) > np.maximum(OFF_ROAD_M, outside[..., 0])
+            reach_m = np.abs(routes.points[b] - scene.states[b, EGO, -1, :2]).max(axis=1)
+            near = reach_m <= gained[b].max() + OFF_ROAD_ROUTE_M
+            allowed[b] = (routes.off_road_m[b] * near)[: routes.counts[b]].max()
+        # an ego that is off the road already, or whose route is, pays only for going farther
+        allowed = np.maximum(OFF_ROAD_M, allowed + ROUTE_TOLERANCE_M * (allowed > OFF_ROAD_M))
+        leaves_road = outside.max(axis=-1) > np.maximum(allowed[:, None, None], outside[..., 0])
         emergency = (self._first[:, 0] == FIRST_MPS2[0])[:, None]
         return (
             -weights.progress * gained

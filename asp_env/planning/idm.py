@@ -13,6 +13,7 @@ from asp_env.dynamics.car_following import IDM, follow_paths, speed_limits
 from asp_env.errors import AspEnvError
 from asp_env.geometry import route_coordinates
 from asp_env.metrics import lanes
+from asp_env.metrics.drivable import off_road_m
 from asp_env.planning.planner import Plan
 
 DESIRED_MPS = 50 / 3.6
@@ -28,6 +29,9 @@ class Routes(NamedTuple):
     """(B,) number of valid points."""
     speed_limits: np.ndarray
     """(B, P) desired speed at each point, m/s."""
+    off_road_m: np.ndarray
+    """(B, P) distance of the outermost corner of the ego at each point to the drivable area, m. It
+    is positive where the map has a gap, or is offset from the recording of the route."""
 
 
 class RouteCache:
@@ -46,6 +50,7 @@ class RouteCache:
             points=np.zeros((0, 0, 2), dtype=np.float32),
             counts=np.zeros(0, dtype=np.int64),
             speed_limits=np.zeros((0, 0), dtype=np.float32),
+            off_road_m=np.zeros((0, 0), dtype=np.float32),
         )
 
     def routes(self, scene: Scene) -> Routes:
@@ -60,13 +65,18 @@ class RouteCache:
         known = self._routes
         if not (np.array_equal(known.points, scene.route) and np.array_equal(known.counts, counts)):
             limits = np.zeros(scene.route.shape[:2], dtype=np.float32)
+            outside = np.zeros(scene.route.shape[:2], dtype=np.float32)
             for b, count in enumerate(counts):
                 route = scene.route[b, :count]
+                road_map = scene.maps[int(scene.map_index[b])]
+                size = np.broadcast_to(scene.sizes[b, EGO], (count, 2))
+                outside[b, :count] = off_road_m(road_map, _states_on(route), size)
                 limits[b, :count] = speed_limits(route, DESIRED_MPS, self._idm)
                 if self._map_limits:
-                    road_map = scene.maps[int(scene.map_index[b])]
                     limits[b, :count] = _with_map_limits(route, road_map, self._idm)
-            self._routes = Routes(points=scene.route, counts=counts, speed_limits=limits)
+            self._routes = Routes(
+                points=scene.route, counts=counts, speed_limits=limits, off_road_m=outside
+            )
         return self._routes
 
 
@@ -120,10 +130,7 @@ def _with_map_limits(
     A point without a known limit has that of the last known one before it, else of the first one
     after it. Without any, the desired speed is `DESIRED_MPS`.
     """
-    step = np.gradient(route, axis=0)
-    heading = np.arctan2(step[:, 1], step[:, 0])
-    on_route = np.concatenate([route, heading[:, None], np.zeros((len(route), 1))], axis=1)
-    known = lanes.speed_limits(road_map, on_route)
+    known = lanes.speed_limits(road_map, _states_on(route))
     if not known.valid.any():
         return speed_limits(route, DESIRED_MPS, idm)
     points = np.arange(len(route))
@@ -134,6 +141,13 @@ def _with_map_limits(
     falling = 2.0 * idm.comfortable_braking_mps2 * points
     square = np.minimum.accumulate((limits**2 + falling)[::-1])[::-1] - falling
     return np.sqrt(square)
+
+
+def _states_on(route: Float[np.ndarray, "p 2"]) -> Float[np.ndarray, "p 4"]:
+    """States [x m, y m, heading rad, speed 0] along a route."""
+    step = np.gradient(route, axis=0)
+    heading = np.arctan2(step[:, 1], step[:, 0])
+    return np.concatenate([route, heading[:, None], np.zeros((len(route), 1))], axis=1)
 
 
 def _route_arcs(scene: Scene) -> Float[np.ndarray, " b"]:

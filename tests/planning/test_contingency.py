@@ -1,9 +1,12 @@
 """The planner `contingency`."""
 
+import dataclasses
+
 import numpy as np
 import pytest
 
 from asp_env.data.classes import AgentClass
+from asp_env.data.road_map import Ragged
 from asp_env.metrics.driving.comfort import comfortable
 from asp_env.planning.contingency import (
     FIRST_MPS2,
@@ -12,7 +15,7 @@ from asp_env.planning.contingency import (
     ContingencyWeights,
 )
 from asp_env.planning.idm import DESIRED_MPS
-from tests.builders import DRIVES, Drive, make_recording
+from tests.builders import DRIVES, Drive, make_map, make_recording
 from tests.planning.situations import (
     STEPS,
     approach,
@@ -147,6 +150,24 @@ def test_slows_down_for_a_bend():
     inside = (states[:, 2] > 1.9) & (states[:, 2] < 2.8)
     assert inside.sum() > 5
     assert states[inside, 3] == pytest.approx(5.5, abs=0.6)
+
+
+def test_follows_a_route_that_is_off_the_mapped_road():
+    """Maps have gaps and offsets: the ego of a route 1 m beside the mapped road drives off.
+
+    The road ends at y = -0.75, and the ego's right side is at y = -1.75 - 0.9. On a road that it is
+    on, the same ego does not leave it by as much.
+    """
+    square = np.array([(-150.0, -0.75), (200.0, -0.75), (200.0, 150.0), (-150.0, 150.0)])
+    beside = dataclasses.replace(make_map(), name="beside", drivable=Ragged.pack([square]))
+    scene = approach(speed_mps=3.0, road_map=beside).world.scene()
+    planner = ContingencyPlanner()
+    assert _gain(planner.plan(scene, straight_ahead(scene)).states[0]) > 8
+    candidates = planner.candidates(scene, STEPS)
+    right_m = candidates.states[0, ..., 1].min(axis=-1)
+    leaves = candidates.fixed_costs[0] >= ContingencyWeights().off_road - 40
+    assert not leaves[right_m > -1.9].any()
+    assert leaves[right_m < -2.2].all()
 
 
 def test_plans_depend_on_the_weights():
