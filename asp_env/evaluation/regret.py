@@ -1,7 +1,7 @@
 """Planning regret at logged states: which forecasts lead a planner to worse plans, and by how much.
 
 No drive is needed: the ego is where the recording has it, the planner rates its candidates with
-each forecast and with the truth, and the difference is the regret (`asp_env.planning.regret`). The
+each forecast and with the truth, and the difference is the regret (`planning_regret`). The
 truth is the forecast of the predictor `oracle`. Agents that are not present yet are unknown to all
 predictors, the oracle included.
 """
@@ -24,8 +24,7 @@ from asp_env.errors import AspEnvError
 from asp_env.evaluation import statistics
 from asp_env.evaluation.closed_loop.episodes import forecast_for_planner, targets_near_egos
 from asp_env.evaluation.statistics import Estimate
-from asp_env.planning.planner import CandidatePlanner, load_planner
-from asp_env.planning.regret import planning_regret
+from asp_env.planning.planner import CandidatePlanner, load_planner, planning_regret
 from asp_env.sim.world import ReplayWorld, recorded_future
 
 REFERENCE = "constant-velocity"

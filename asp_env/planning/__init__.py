@@ -3,8 +3,14 @@
 from asp_env.planning.contingency import ContingencyPlanner, ContingencyWeights
 from asp_env.planning.idm import IDMPlanner
 from asp_env.planning.pdm import PDMPlanner, PDMWeights
-from asp_env.planning.planner import CandidatePlanner, Expert, Plan, Planner, load_planner
-from asp_env.planning.regret import planning_regret
+from asp_env.planning.planner import (
+    CandidatePlanner,
+    Expert,
+    Plan,
+    Planner,
+    load_planner,
+    planning_regret,
+)
 from asp_env.planning.sampling import SamplingPlanner, SamplingWeights
 
 __all__ = [

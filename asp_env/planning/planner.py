@@ -58,7 +58,7 @@ class CandidatePlanner(Planner, Protocol[CandidatesT]):
     """A planner that executes the cheapest of C candidates, which do not depend on the forecast.
 
     So the same candidates can be rated by several forecasts, as planning regret does
-    (`asp_env.planning.regret`). A candidate is what is decided now: a plan, or a first phase that
+    (`planning_regret`). A candidate is what is decided now: a plan, or a first phase that
     several continuations may follow. The class of the candidates is the planner's own.
     """
 
@@ -81,6 +81,28 @@ class CandidatePlanner(Planner, Protocol[CandidatesT]):
             candidates: C candidates for each situation.
         """
         ...
+
+
+def planning_regret(
+    costs: Float[np.ndarray, "b c"], true_costs: Float[np.ndarray, "b c"]
+) -> Float[np.ndarray, " b"]:
+    """Planning regret: what an imperfect forecast costs a planner, by the planner's own costs.
+
+    It is the cost under the truth of the candidate chosen with a forecast, less the lowest one.
+    Regret is zero wherever the forecast leads to the same choice, however wrong it is. Related
+    measures are in "Injecting Planning-Awareness into Prediction and Detection Evaluation"
+    (Ivanovic and Pavone, arXiv 2110.03270) and "Not All Errors Are Made Equal" (arXiv 2403.04745).
+
+    Args:
+        costs: costs of C candidates in each of B situations under a forecast, by which the first of
+            the cheapest is chosen.
+        true_costs: costs of the same candidates under the recorded future.
+
+    Returns:
+        Regrets, at least 0, in the unit of the costs.
+    """
+    chosen = np.take_along_axis(true_costs, costs.argmin(axis=1)[:, None], axis=1)[:, 0]
+    return chosen - true_costs.min(axis=1)
 
 
 def load_planner(name: str) -> Planner:

@@ -5,7 +5,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
-from asp_env.planning.regret import planning_regret
+from asp_env.planning.planner import planning_regret
 
 SHAPE = (3, 6)
 COSTS = arrays(np.float64, SHAPE, elements=st.floats(-100, 100))
