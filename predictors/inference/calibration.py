@@ -4,18 +4,21 @@ from collections.abc import Callable, Iterable
 
 import numpy as np
 import torch
-from jaxtyping import Float, Int
+from jaxtyping import Bool, Float, Int
 from lightning.fabric.utilities import move_data_to_device
 
 from predictors.models.batch import Batch, Labels
-from predictors.models.losses import best_mode
-from predictors.models.network import AbstractNetwork, Modes
+from predictors.models.losses import best_mode, stands
+from predictors.models.network import FAST_LOGIT, AbstractNetwork, Modes
 
 LIMITS = (0.05, 20.0)
 """Lowest and highest temperature. Chosen by hand."""
 
 STEPS = 60
 """Steps of the search; each reduces the interval to 0.62 of it, so the last is 2e-12 wide."""
+
+NEWTON_STEPS = 20
+"""Steps of the logistic fit, which converges in fewer."""
 
 _GOLDEN = (np.sqrt(5.0) - 1) / 2
 
@@ -41,6 +44,7 @@ def calibrate(network: AbstractNetwork, batches: Iterable[tuple[Batch, Labels]])
         merging = _temperature(lambda batch: network.chain(batch, "full"), batches, device)
         network.merging_temperature.fill_(merging)
     temperature = _temperature(network, batches, device)
+    _calibrate_standing(network, batches, device)
     network.cpu()
     return temperature
 
@@ -90,7 +94,54 @@ def _temperature(
         for sample in batches:
             batch, labels = move_data_to_device(sample, device)
             modes = forecast(batch)
-            logits.append(modes.logits.cpu().numpy())
             nearest = best_mode(modes.states[..., :2], labels.states[..., :2], "distance")
-            best.append(nearest.cpu().numpy())
+            learned = torch.ones_like(nearest, dtype=torch.bool)
+            if modes.standing is not None:
+                learned = ~stands(labels.states)
+            logits.append(modes.logits[learned].cpu().numpy())
+            best.append(nearest[learned].cpu().numpy())
     return fit_temperature(np.concatenate(logits), np.concatenate(best))
+
+
+def _calibrate_standing(
+    network: AbstractNetwork, batches: Iterable[tuple[Batch, Labels]], device: torch.device
+) -> None:
+    """Fits the slope and the shift of the logit of standing on slow targets, if there is one."""
+    if network.standing_head is None:
+        return
+    logits, stand = [], []
+    with torch.inference_mode():
+        for sample in batches:
+            batch, labels = move_data_to_device(sample, device)
+            logit = network(batch).standing
+            assert logit is not None
+            slow = logit > FAST_LOGIT
+            logits.append(logit[slow].cpu().numpy())
+            stand.append(stands(labels.states)[slow].cpu().numpy())
+    fitted = fit_logistic(np.concatenate(logits), np.concatenate(stand))
+    network.get_buffer("standing_calibration").copy_(torch.tensor(fitted))
+
+
+def fit_logistic(
+    logits: Float[np.ndarray, " n"], outcomes: Bool[np.ndarray, " n"]
+) -> tuple[float, float]:
+    """Fits a slope and a shift of logits to outcomes (Platt 1999), by Newton's method.
+
+    A weak Gaussian prior about slope 1 and shift 0 with unit variances bounds both.
+
+    Args:
+        logits: Logits of probabilities.
+        outcomes: Whether each event happened.
+
+    Returns:
+        Slope and shift; 1 and 0 without samples.
+    """
+    design = np.stack([logits.astype(np.float64), np.ones(len(logits))], axis=-1)
+    prior = np.array([1.0, 0.0])
+    fitted = prior.copy()
+    for _ in range(NEWTON_STEPS):
+        probability = 1 / (1 + np.exp(-np.clip(design @ fitted, -30, 30)))
+        gradient = design.T @ (probability - outcomes) + fitted - prior
+        weighted = design * (probability * (1 - probability))[:, None]
+        fitted = fitted - np.linalg.solve(design.T @ weighted + np.eye(2), gradient)
+    return float(fitted[0]), float(fitted[1])

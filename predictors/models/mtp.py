@@ -66,7 +66,8 @@ class MTPNetwork(AbstractNetwork):
         with torch.autocast(z.device.type, enabled=False):
             outputs, logits = self.head(torch.cat([z, self.scaled_motion(batch)], dim=-1))
             states = states_along(outputs * POSITION_SCALE_M, self.shape.dt_s)
-        return Modes(states, logits)
+            standing = self.standing_logit(z, batch)
+        return Modes(states, logits, standing=standing)
 
 
 def states_along(positions: Float[Tensor, "n m t 2"], dt_s: float) -> Float[Tensor, "n m t 4"]:

@@ -39,7 +39,14 @@ from predictors.models.batch import Batch, Labels
 from predictors.models.chaining import Chaining, Chains, chains_to_extend, extend, merge, prune
 from predictors.models.encoders import make_encoder
 from predictors.models.heads import ConnectedHead, RecurrentReader
-from predictors.models.losses import HUBER_M, best_mode, into_frame, mode_terms
+from predictors.models.losses import (
+    HUBER_M,
+    best_mode,
+    into_frame,
+    mode_terms,
+    standing_loss,
+    stands,
+)
 from predictors.models.network import (
     AbstractNetwork,
     Features,
@@ -190,7 +197,8 @@ class SSPASPNetwork(AbstractNetwork):
                 )
                 chains = extend(chains, self._next_segment(chains, batch))
                 chains = self._reduce(chains, chaining, batch)
-        return Modes(chains.states, chains.log_probs, chains.actions)
+            standing = self.standing_logit(self.norm(z), batch)
+        return Modes(chains.states, chains.log_probs, chains.actions, standing)
 
     def encode(self, batch: Batch) -> Float[Tensor, "n z"]:
         """φ: the features of the observation."""
@@ -233,12 +241,16 @@ class SSPASPNetwork(AbstractNetwork):
         encoded, targets = self._encode_all(batch, labels)
         with torch.autocast(batch.actions.device.type, enabled=False):
             segments = list(self._terms(batch, labels, progress, encoded, targets))
+            standing = self.standing_logit(self.norm(encoded[0]), batch)
         terms = {name: torch.stack([s[name] for s in segments]).mean() for name in segments[0]}
+        if standing is not None and not progress.pretraining:
+            terms["standing"] = standing_loss(standing, labels.states)
         weights = {
             "actions": self._options.action_weight,
             "features": self._options.feature_weight,
             "regression": self._options.regression_weight,
             "classification": self._options.classification_weight,
+            "standing": 1.0,
         }
         total = torch.stack([weights[name] * value for name, value in terms.items()]).sum()
         return {"loss": total, **terms}
@@ -401,6 +413,7 @@ class SSPASPNetwork(AbstractNetwork):
             assignment=self.config.assignment,
             classification=self.config.classification,
             share=progress.share if self.config.annealed else None,
+            learned=~stands(labels.states).repeat(len(branches)) if self.config.standing else None,
         )
         continued = best_mode(positions.detach(), truth, self.config.assignment)
         rows = torch.arange(len(continued), device=continued.device)

@@ -18,6 +18,7 @@ from predictors.models.ffw_asp import FFWASPConfig
 from predictors.models.mtp import MTPConfig
 from predictors.models.network import NetworkConfig
 from predictors.models.ssp_asp import SSPASPConfig
+from predictors.training.augmentation import Augmentation
 
 SEGMENT_S = 3.0
 """Length of the segments that `ssp-asp` chains, seconds: the paper's shorter horizon."""
@@ -72,6 +73,8 @@ class TrainingConfig:
     """Precision of the encoder; the rest of the network is always float32."""
     threads: int | None = None
     """Threads of torch within one operation; None for its default."""
+    augmentation: Augmentation | None = None
+    """Random changes of the samples, in training and in validation; None for none."""
 
     def __post_init__(self) -> None:
         """Checks the numbers.
