@@ -216,9 +216,7 @@ def stands(label: Float[Tensor, "n t _"]) -> Bool[Tensor, " n"]:
     return (torch.linalg.vector_norm(label[..., :2], dim=-1) <= STANDS_M).all(dim=1)
 
 
-def standing_loss(
-    logit: Float[Tensor, " n"], label: Float[Tensor, "n t _"]
-) -> Float[Tensor, ""]:
+def standing_loss(logit: Float[Tensor, " n"], label: Float[Tensor, "n t _"]) -> Float[Tensor, ""]:
     """Cross-entropy of the probability of standing.
 
     Args:

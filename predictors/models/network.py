@@ -206,9 +206,7 @@ class AbstractNetwork(nn.Module, ABC):
         modes = modes._replace(logits=(modes.logits / divisor).log_softmax(dim=-1))
         return self.with_standing(batch, modes)
 
-    def standing_logit(
-        self, z: Float[Tensor, "n z"], batch: Batch
-    ) -> Float[Tensor, " n"] | None:
+    def standing_logit(self, z: Float[Tensor, "n z"], batch: Batch) -> Float[Tensor, " n"] | None:
         """The logit of standing, from features, motion and past actions.
 
         Args:

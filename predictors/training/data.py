@@ -134,9 +134,7 @@ class Batches:
 
     def __iter__(self) -> Iterator[Sample]:
         every = (self.shard_rows(batch) for batch in range(len(self)))
-        batches = (
-            BatchRequest(self.snippets.select(rows), self._visited + rows) for rows in every
-        )
+        batches = (BatchRequest(self.snippets.select(rows), self._visited + rows) for rows in every)
         if self._workers is None:
             return load_by_thread(self.source, batches)
         return load_by_workers(*self._workers, batches)

@@ -156,6 +156,17 @@ def ffw_asp_ours(view: str, horizon_s: float) -> TrainingConfig:
     )
 
 
+def ffw_asp_robust(view: str, horizon_s: float) -> TrainingConfig:
+    """`asp-env train ffw-asp DATA --recipe robust`: `ours` for traffic that it is not trained on.
+
+    See `_robust`.
+
+    Raises:
+        AspEnvError: The view renders rasters.
+    """
+    return _robust(ffw_asp_ours(view, horizon_s))
+
+
 def ssp_asp_paper(view: str, horizon_s: float) -> TrainingConfig:
     """`asp-env train ssp-asp DATA --recipe paper`: the paper's SSP-ASP.
 
@@ -214,6 +225,17 @@ def ssp_asp_ours(view: str, horizon_s: float) -> TrainingConfig:
     return _small("ssp-asp", "ours", network, view, horizon_s)
 
 
+def ssp_asp_robust(view: str, horizon_s: float) -> TrainingConfig:
+    """`asp-env train ssp-asp DATA --recipe robust`: `ours` for traffic that it is not trained on.
+
+    See `_robust`.
+
+    Raises:
+        AspEnvError: The view renders rasters, or the horizon is not a whole number of segments.
+    """
+    return _robust(ssp_asp_ours(view, horizon_s))
+
+
 Recipe = Callable[[str, float], TrainingConfig]
 """Makes a configuration of a view and a horizon in seconds."""
 
@@ -221,8 +243,18 @@ RECIPES: Mapping[str, Mapping[str, Recipe]] = MappingProxyType(
     {
         "mtp": {"cpu": mtp_cpu, "paper": mtp_paper},
         "dkm": {"cpu": dkm_cpu, "paper": dkm_paper},
-        "ffw-asp": {"cpu": ffw_asp_cpu, "paper": ffw_asp_paper, "ours": ffw_asp_ours},
-        "ssp-asp": {"cpu": ssp_asp_cpu, "paper": ssp_asp_paper, "ours": ssp_asp_ours},
+        "ffw-asp": {
+            "cpu": ffw_asp_cpu,
+            "paper": ffw_asp_paper,
+            "ours": ffw_asp_ours,
+            "robust": ffw_asp_robust,
+        },
+        "ssp-asp": {
+            "cpu": ssp_asp_cpu,
+            "paper": ssp_asp_paper,
+            "ours": ssp_asp_ours,
+            "robust": ssp_asp_robust,
+        },
     }
 )
 """Recipes by predictor and name."""
@@ -292,6 +324,26 @@ def _small(
         schedule="one-cycle",
         precision="32-true" if vectors else "bf16-mixed",
         threads=1,
+    )
+
+
+def _robust(config: TrainingConfig) -> TrainingConfig:
+    """Augmented samples, a mode of its own for standing targets, and more of these.
+
+    Raises:
+        AspEnvError: The view renders rasters.
+    """
+    if config.network.encoder != "vector":
+        raise AspEnvError(
+            f"recipe robust augments vectors, the view {config.view} renders rasters: give "
+            "--view vectors"
+        )
+    return dataclasses.replace(
+        config,
+        preset="robust",
+        network=dataclasses.replace(config.network, standing=True),
+        standing_share=0.5,
+        augmentation=Augmentation(),
     )
 
 

@@ -81,9 +81,7 @@ def test_ranges_of_nothing_change_nothing() -> None:
     for before, after in zip(tensors(plain), tensors(same), strict=True):
         torch.testing.assert_close(after, before, atol=1e-4, rtol=1e-4)
     torch.testing.assert_close(same_labels.states, labels.states, atol=1e-4, rtol=1e-4)
-    for before, after in zip(
-        tensors(labels.later[0]), tensors(same_labels.later[0]), strict=True
-    ):
+    for before, after in zip(tensors(labels.later[0]), tensors(same_labels.later[0]), strict=True):
         torch.testing.assert_close(after, before, atol=1e-4, rtol=1e-4)
 
 
