@@ -32,7 +32,7 @@ from asp_env.errors import AspEnvError
 from asp_env.geometry import from_frame, states_to_frame, wrap_angle
 from asp_env.views.vectors import KINDS, LINE_FIELDS
 from predictors.counter_random import mixed, nearly_normal, uniform
-from predictors.models.batch import Batch, Labels, VectorTensors
+from predictors.models.batch import Batch, VectorTensors
 
 _STILL_MPS = 0.5
 """Below this speed, headings wobble."""

@@ -19,10 +19,10 @@ from asp_env.metrics.forecast.errors import moving
 from asp_env.views import SceneView
 from predictors.training.augmentation import Augmentation
 from predictors.training.data_loading import (
+    BatchRequest,
     BatchSource,
     BatchWorkers,
     Sample,
-    BatchRequest,
     load_by_thread,
     load_by_workers,
 )
