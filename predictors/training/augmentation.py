@@ -4,9 +4,9 @@ Every draw is a function of the seed and of how many snippets were visited befor
 depends neither on the batch nor on the process that makes it.
 
 - The scene is measured again: positions, headings and speeds of all agents get errors that are
-  correlated over time, of a size that is drawn for each snippet; actions are inferred from the
-  result. Sizes are wrong by a factor for each agent. Labels are the recorded future, seen from the
-  measured pose.
+  correlated over time, of a size that is drawn for each snippet, and speeds a share of the rate at
+  which the errors of positions change; actions are inferred from the result. Sizes are wrong by a
+  factor for each agent. Labels are the recorded future, seen from the measured pose.
 - Some other agents are missing, and some are only seen from a later tick on.
 - The map is displaced and turned against the agents; lines of some kinds, single lines or all lines
   are missing.
@@ -126,6 +126,11 @@ def measured_again(
         fresh = np.sqrt(1 - keep**2) * noise[:, :, tick]
         noise[:, :, tick] = keep * noise[:, :, tick - 1] + fresh
     noise *= sigma[:, None, None]
+    # Trackers that differentiate positions have errors of speed that belong to those of positions.
+    drift_mps = np.gradient(noise[..., :2], scene.dt_s, axis=2)
+    heading = scene.states[..., 2]
+    along_mps = drift_mps[..., 0] * np.cos(heading) + drift_mps[..., 1] * np.sin(heading)
+    noise[..., 3] += uniform(keys, np.array([7]))[:, None, None] * along_mps
     still = np.abs(scene.states[..., 3]) < _STILL_MPS
     wobble = 1 + (ranges.still_heading - 1) * uniform(keys, np.array([5]))
     noise[..., 2] *= np.where(still, wobble[:, None, None], 1)

@@ -73,6 +73,8 @@ class TrainingConfig:
     """Precision of the encoder; the rest of the network is always float32."""
     threads: int | None = None
     """Threads of torch within one operation; None for its default."""
+    paces: tuple[float, ...] = ()
+    """Other paces at which the training recordings are played as well, see `PacedRecordings`."""
     augmentation: Augmentation | None = None
     """Random changes of the samples, in training and in validation; None for none."""
 
