@@ -37,6 +37,13 @@ from predictors.models.batch import Batch, VectorTensors
 _STILL_MPS = 0.5
 """Below this speed, headings wobble."""
 
+FAST_MPS = 3.0
+"""From this speed on, errors of positions have their full size. Chosen by hand: trackers hold
+vehicles at standstill in place."""
+
+REACH_TICKS = 6
+"""Ticks before and after that a smoothed error depends on."""
+
 _FIRST_KIND = LINE_FIELDS.index(KINDS[0])
 
 
@@ -48,16 +55,22 @@ class Augmentation:
     """Probability of a mirrored sample."""
     largest_scale: float = 1.35
     """Lengths and speeds are multiplied by up to this factor or its inverse (log-uniform)."""
-    position_m: tuple[float, float] = (0.005, 0.12)
-    """Standard deviation of positions (log-uniform)."""
+    position_m: tuple[float, float] = (0.03, 0.7)
+    """Standard deviation of positions along each axis, for agents that move (log-uniform)."""
+    still_share: float = 0.1
+    """Share of that standard deviation for agents at standstill; it grows linearly with speed."""
+    smoothing_s: tuple[float, float] = (0.1, 0.5)
+    """Standard deviation of the Gaussian that the errors of positions are smoothed with
+    (log-uniform)."""
     heading_rad: tuple[float, float] = (0.002, 0.04)
-    """Standard deviation of headings (log-uniform)."""
+    """Standard deviation of headings (log-uniform), besides the direction of the errors of
+    positions."""
     still_heading: float = 3.0
     """Largest factor on the errors of headings at standstill."""
     speed_mps: tuple[float, float] = (0.01, 0.3)
-    """Standard deviation of speeds (log-uniform)."""
+    """Standard deviation of speeds (log-uniform), besides the rate of the errors of positions."""
     correlation_s: tuple[float, float] = (0.05, 1.5)
-    """Time constant of the errors (log-uniform)."""
+    """Time constant of the errors of headings and speeds (log-uniform)."""
     largest_size: float = 1.15
     """Sizes are multiplied by up to this factor or its inverse (log-uniform)."""
     absent_agents: float = 0.4
@@ -107,30 +120,26 @@ def measured_again(
         ranges: Ranges of the draws.
         part: Index of the segment at whose start the scene is; errors differ between segments.
     """
-    ticks = scene.states.shape[2]
-    sigma = np.stack(
-        [
-            _log_uniform(keys, number, *each)
-            for number, each in enumerate(
-                (ranges.position_m, ranges.position_m, ranges.heading_rad, ranges.speed_mps)
-            )
-        ],
-        axis=-1,
-    )
-    sigma[:, 1] = sigma[:, 0]
+    ticks, count = scene.states.shape[2], scene.states.shape[2] + 2 * REACH_TICKS
     agents = mixed(keys[:, None] ^ mixed(scene.ids.astype(np.int64).view(np.uint64)))
-    counters = np.arange(part * 4 * ticks, (part + 1) * 4 * ticks).reshape(ticks, 4)
-    noise = nearly_normal(mixed(agents)[..., None, None], counters)
+    counters = np.arange(part * 4 * count, (part + 1) * 4 * count).reshape(count, 4)
+    drawn = nearly_normal(mixed(agents)[..., None, None], counters).astype(np.float32)
+    positions_m, rates_mps = _smooth_errors(scene, drawn[..., :2], keys, ranges)
     keep = np.exp(-scene.dt_s / _log_uniform(keys, 4, *ranges.correlation_s))[:, None, None]
+    noise = np.concatenate([positions_m, drawn[:, :, :ticks, 2:]], axis=-1)
     for tick in range(1, ticks):
-        fresh = np.sqrt(1 - keep**2) * noise[:, :, tick]
-        noise[:, :, tick] = keep * noise[:, :, tick - 1] + fresh
-    noise *= sigma[:, None, None]
-    # Trackers that differentiate positions have errors of speed that belong to those of positions.
-    drift_mps = np.gradient(noise[..., :2], scene.dt_s, axis=2)
-    heading = scene.states[..., 2]
-    along_mps = drift_mps[..., 0] * np.cos(heading) + drift_mps[..., 1] * np.sin(heading)
-    noise[..., 3] += uniform(keys, np.array([7]))[:, None, None] * along_mps
+        fresh = np.sqrt(1 - keep**2) * noise[:, :, tick, 2:]
+        noise[:, :, tick, 2:] = keep * noise[:, :, tick - 1, 2:] + fresh
+    noise[..., 2] *= _log_uniform(keys, 2, *ranges.heading_rad)[:, None, None]
+    noise[..., 3] *= _log_uniform(keys, 3, *ranges.speed_mps)[:, None, None]
+    # Trackers that differentiate positions have errors of speed and course that belong to those.
+    cos, sin = np.cos(scene.states[..., 2]), np.sin(scene.states[..., 2])
+    shares = uniform(keys[:, None], np.array([7, 8]))[..., None, None]
+    noise[..., 3] += (0.5 + 0.5 * shares[:, 0]) * (
+        rates_mps[..., 0] * cos + rates_mps[..., 1] * sin
+    )
+    across_mps = rates_mps[..., 1] * cos - rates_mps[..., 0] * sin
+    noise[..., 2] += shares[:, 1] * across_mps / np.maximum(np.abs(scene.states[..., 3]), FAST_MPS)
     still = np.abs(scene.states[..., 3]) < _STILL_MPS
     wobble = 1 + (ranges.still_heading - 1) * uniform(keys, np.array([5]))
     noise[..., 2] *= np.where(still, wobble[:, None, None], 1)
@@ -147,6 +156,31 @@ def measured_again(
         sizes=sizes,
         actions=infer_actions(states, valid, sizes[..., 0], scene.dt_s),
     )
+
+
+def _smooth_errors(
+    scene: Scene,
+    drawn: Float[np.ndarray, "n a count 2"],
+    keys: UInt64[np.ndarray, " n"],
+    ranges: Augmentation,
+) -> tuple[Float[np.ndarray, "n a ticks 2"], Float[np.ndarray, "n a ticks 2"]]:
+    """Errors of positions and the rates at which they change, from independent draws.
+
+    Recorded tracks are smoothed, so that their errors of speed are waves of a second or two.
+    """
+    width_ticks = _log_uniform(keys, 1, *ranges.smoothing_s) / scene.dt_s
+    at = np.arange(-REACH_TICKS, REACH_TICKS + 1)
+    kernel = np.exp(-0.5 * (at / width_ticks[:, None]) ** 2)
+    slope = at / width_ticks[:, None] ** 2 * kernel / scene.dt_s
+    kernels = np.stack([kernel, slope], axis=-1).astype(np.float32)
+    kernels /= np.linalg.norm(kernel, axis=-1)[:, None, None].astype(np.float32)
+    windows = np.lib.stride_tricks.sliding_window_view(drawn, len(at), axis=2)
+    smoothed = np.einsum("natcw,nwk->knatc", windows, kernels, optimize=True)
+    speed = np.abs(scene.states[..., 3]).max(axis=2)
+    share = ranges.still_share + (1 - ranges.still_share) * np.minimum(speed / FAST_MPS, 1)
+    sigma_m = _log_uniform(keys, 0, *ranges.position_m)[:, None] * share
+    errors, rates = smoothed * sigma_m[..., None, None]
+    return errors, rates
 
 
 def _seen(

@@ -15,6 +15,7 @@ from asp_env.views import make_view
 from predictors.models.batch import Batch, VectorTensors, make_batch
 from predictors.models.network import rollout_from_now
 from predictors.training.augmentation import (
+    FAST_MPS,
     Augmentation,
     measured_again,
     off_the_map,
@@ -134,18 +135,31 @@ def test_a_mirrored_and_enlarged_sample_by_hand() -> None:
     torch.testing.assert_close(after.actions[..., 1], -before.actions[..., 1])
 
 
-def test_errors_have_the_asked_standard_deviation() -> None:
-    """Positions of 0.1 m, speeds of 0.2 m/s: over 400 visits, within a tenth."""
+def test_errors_of_speeds_have_the_asked_deviation_and_correlation() -> None:
+    """Speeds of 0.2 m/s with a time constant of 0.3 s: over 400 visits, within a tenth."""
     scene = scene_of((8,) * 400)
-    ranges = dataclasses.replace(
-        NONE, position_m=(0.1, 0.1), speed_mps=(0.2, 0.2), correlation_s=(0.3, 0.3)
-    )
+    ranges = dataclasses.replace(NONE, speed_mps=(0.2, 0.2), correlation_s=(0.3, 0.3))
     again = measured_again(scene, sample_keys(0, np.arange(400)), ranges)
     error = (again.states - scene.states)[np.arange(400), scene.targets[:, 1]]
-    assert error[..., 0].std() == pytest.approx(0.1, rel=0.1)
     assert error[..., 3].std() == pytest.approx(0.2, rel=0.1)
     lag = np.corrcoef(error[:, 5, 3], error[:, 6, 3])[0, 1]
     assert lag == pytest.approx(np.exp(-0.2 / 0.3), abs=0.15)
+
+
+def test_errors_of_speeds_belong_to_those_of_positions() -> None:
+    """Half to all of the rate of the errors along the heading, which have the asked deviation."""
+    scene = scene_of((8,) * 400)
+    ranges = dataclasses.replace(NONE, position_m=(0.1, 0.1), smoothing_s=(0.4, 0.4))
+    again = measured_again(scene, sample_keys(0, np.arange(400)), ranges)
+    rows = (np.arange(400), scene.targets[:, 1])
+    before, error = scene.states[rows], (again.states - scene.states)[rows]
+    assert before[..., 3].min() > FAST_MPS
+    assert error[..., :2].std() == pytest.approx(0.1, rel=0.1)
+    along = error[..., 0] * np.cos(before[..., 2]) + error[..., 1] * np.sin(before[..., 2])
+    rate = (along[:, 2:] - along[:, :-2]) / 0.4  # about 0.9 of the slope of such an error
+    share = (rate * error[:, 1:-1, 3]).sum(axis=1) / (rate**2).sum(axis=1)
+    assert 0.5 < share.min() < 0.6
+    assert 0.95 < share.max() < 1.15
 
 
 def test_the_target_is_always_seen() -> None:
