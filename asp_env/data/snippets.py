@@ -1,6 +1,5 @@
 """Snippets: the past and future around one tick of one track, stored as indices into recordings."""
 
-import dataclasses
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -47,15 +46,6 @@ class SnippetIndex:
             dt_s=self.dt_s,
             history=self.history,
             horizon_ticks=self.horizon_ticks,
-        )
-
-    def joined(self, other: "SnippetIndex") -> "SnippetIndex":
-        """These snippets, then others of the same length from the same recordings."""
-        return dataclasses.replace(
-            self,
-            recording=np.concatenate([self.recording, other.recording]),
-            track=np.concatenate([self.track, other.track]),
-            tick=np.concatenate([self.tick, other.tick]),
         )
 
     def shifted(self, ticks: int) -> "SnippetIndex":

@@ -17,6 +17,9 @@ LIMITS = (0.05, 20.0)
 STEPS = 60
 """Steps of the search; each reduces the interval to 0.62 of it, so the last is 2e-12 wide."""
 
+ACCELERATION_SCALES = (1.0, 0.9, 0.8, 0.7, 0.6, 0.5)
+"""Factors on forecast accelerations that are tried. Chosen by hand."""
+
 NEWTON_STEPS = 20
 """Steps of the logistic fit, which converges in fewer."""
 
@@ -26,9 +29,10 @@ _GOLDEN = (np.sqrt(5.0) - 1) / 2
 def calibrate(network: AbstractNetwork, batches: Iterable[tuple[Batch, Labels]]) -> float:
     """Fits the temperatures of a network on validation data.
 
-    The merging temperature is fitted first, if the network merges chains, and stored in the
-    network; the temperature of its forecasts is fitted next. A GPU is used if there is one: at full
-    size a CPU would take longer than the training. Afterwards the network is on the CPU, in
+    The factor of the accelerations is fitted first, if the network has one, then the merging
+    temperature, if it merges chains, and both are stored in the network; the temperature of its
+    forecasts and the probability of standing are fitted next. A GPU is used if there is one: at
+    full size a CPU would take longer than the training. Afterwards the network is on the CPU, in
     evaluation mode.
 
     Args:
@@ -40,6 +44,7 @@ def calibrate(network: AbstractNetwork, batches: Iterable[tuple[Batch, Labels]])
     """
     device = torch.device("cuda" if torch.cuda.is_available() else "cpu")
     network.eval().to(device)
+    _fit_acceleration_scale(network, batches, device)
     if network.merging_temperature is not None:
         merging = _temperature(lambda batch: network.chain(batch, "full"), batches, device)
         network.merging_temperature.fill_(merging)
@@ -101,6 +106,31 @@ def _temperature(
             logits.append(modes.logits[learned].cpu().numpy())
             best.append(nearest[learned].cpu().numpy())
     return fit_temperature(np.concatenate(logits), np.concatenate(best))
+
+
+def _fit_acceleration_scale(
+    network: AbstractNetwork, batches: Iterable[tuple[Batch, Labels]], device: torch.device
+) -> None:
+    """Fits the factor on the FDE of the most probable mode of targets that do not stand."""
+    if network.acceleration_scale is None:
+        return
+    errors_m = []
+    for scale in ACCELERATION_SCALES:
+        network.acceleration_scale.fill_(scale)
+        total, count = 0.0, 0
+        with torch.inference_mode():
+            for sample in batches:
+                batch, labels = move_data_to_device(sample, device)
+                modes = network(batch)
+                rows = torch.arange(len(modes.logits), device=device)
+                ends = modes.states[rows, modes.logits.argmax(dim=1), -1, :2]
+                error_m = torch.linalg.vector_norm(ends - labels.states[:, -1, :2], dim=-1)
+                away = ~stands(labels.states)
+                total += float(error_m[away].double().sum())
+                count += int(away.sum())
+        errors_m.append(total / max(count, 1))
+    best = ACCELERATION_SCALES[int(np.argmin(errors_m))]
+    network.acceleration_scale.fill_(best)
 
 
 def _calibrate_standing(

@@ -111,6 +111,10 @@ class NetworkConfig:
     standing: bool = False
     """Whether forecasts have a further mode, in which the target stands, with a probability that
     is learned and calibrated apart. The other modes then learn from no label that stands."""
+    shrunk: bool = False
+    """Whether forecast accelerations are multiplied by a factor, fitted after the training on the
+    validation data. It is below 1 if these are of other traffic, in which vehicles accelerate and
+    brake at other places than the training data show."""
 
     def __post_init__(self) -> None:
         """Checks the sizes.
@@ -137,6 +141,9 @@ class AbstractNetwork(nn.Module, ABC):
     The names of modules and buffers are keys of the files of weights.
     """
 
+    acceleration_scale: Tensor | None
+    """Scalar factor on forecast accelerations, fitted after the training; None without the option
+    `shrunk`."""
     merging_temperature: Tensor | None
     """Scalar divisor of the log-probabilities of chains before they are merged, fitted after the
     training; None for a network that merges none."""
@@ -151,6 +158,8 @@ class AbstractNetwork(nn.Module, ABC):
         self.register_buffer("merging_temperature", None)
         self.standing_head: nn.Module | None = None
         self.register_buffer("standing_calibration", None)
+        # As `merging_temperature` of SSP-ASP, a weight: it belongs to what was trained.
+        self.register_buffer("acceleration_scale", torch.ones(()) if config.shrunk else None)
         if config.standing:
             inputs = config.features + len(MOTION_SCALE) + 2 * shape.history
             self.standing_head = nn.Sequential(
@@ -320,8 +329,16 @@ class AbstractNetwork(nn.Module, ABC):
         return (batch.motion / self.get_buffer("motion_scale")).clamp(-3, 3)
 
     def bounded_actions(self, outputs: Float[Tensor, "n m t 2"]) -> Float[Tensor, "n m t 2"]:
-        """Actions of unbounded outputs: tanh times the action range, within the limits."""
-        return clip_actions(outputs.tanh() * self.get_buffer("action_range"))
+        """Actions of unbounded outputs: tanh times the action range, within the limits.
+
+        Accelerations are multiplied by the fitted factor, if there is one.
+        """
+        actions = outputs.tanh() * self.get_buffer("action_range")
+        if self.acceleration_scale is not None:
+            actions = actions * torch.stack(
+                [self.acceleration_scale, torch.ones_like(self.acceleration_scale)]
+            )
+        return clip_actions(actions)
 
 
 def stopping_actions(batch: Batch, ticks: int, dt_s: float) -> Float[Tensor, "n t 2"]:

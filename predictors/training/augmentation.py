@@ -51,11 +51,11 @@ _FIRST_KIND = LINE_FIELDS.index(KINDS[0])
 class Augmentation:
     """Ranges of the draws. Chosen by hand, wider than what drone datasets show."""
 
-    mirrored: float = 0.2
+    mirrored: float = 0.05
     """Probability of a mirrored sample."""
-    largest_scale: float = 1.35
+    largest_scale: float = 1.2
     """Lengths and speeds are multiplied by up to this factor or its inverse (log-uniform)."""
-    position_m: tuple[float, float] = (0.03, 0.7)
+    position_m: tuple[float, float] = (0.01, 0.15)
     """Standard deviation of positions along each axis, for agents that move (log-uniform)."""
     still_share: float = 0.1
     """Share of that standard deviation for agents at standstill; it grows linearly with speed."""
@@ -73,17 +73,17 @@ class Augmentation:
     """Time constant of the errors of headings and speeds (log-uniform)."""
     largest_size: float = 1.15
     """Sizes are multiplied by up to this factor or its inverse (log-uniform)."""
-    absent_agents: float = 0.4
+    absent_agents: float = 0.2
     """Largest share of other agents that are missing; the share is drawn for each snippet."""
     late_agents: float = 0.15
     """Share of other agents that are only seen from a later tick on."""
-    map_offset_m: float = 0.5
+    map_offset_m: float = 0.3
     """Standard deviation of the displacement of the map along each axis."""
     map_turn_rad: float = 0.01
     """Standard deviation of the angle by which the map is turned about the target."""
-    no_map: float = 0.1
+    no_map: float = 0.03
     """Probability that all lines are missing."""
-    no_kind: float = 0.15
+    no_kind: float = 0.05
     """Probability that all lines of a kind are missing, for each kind."""
     no_line: float = 0.3
     """Largest share of single lines that are missing; the share is drawn for each snippet."""

@@ -1,17 +1,15 @@
 """Training data: the snippets of a run, their split, their order in an epoch, and their batches."""
 
 import copy
-import dataclasses
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
-from functools import partial
-from typing import Any, final
+from typing import final
 
 import numpy as np
 from jaxtyping import Bool, Int, Shaped
 
 from asp_env.data.causal import causal_histories
-from asp_env.data.recording import Recording, frames_per_tick
+from asp_env.data.recording import Recording
 from asp_env.data.snippets import SnippetIndex, gather_future, gather_present, index_snippets
 from asp_env.data.source import Recordings, join_data, open_data
 from asp_env.data.split import TrainedOn, snippet_parts
@@ -146,7 +144,7 @@ class Batches:
 class DatasetSplit:
     """The snippets of one part of the data."""
 
-    recordings: Sequence[Recording]
+    recordings: Recordings
     snippets: SnippetIndex
 
     def batches(
@@ -173,63 +171,6 @@ class DatasetSplit:
             augmentation=config.augmentation,
             seed=config.seed,
         )
-
-
-@final
-class PacedRecordings(Sequence[Any]):  # not of Recording: run-time checks would open all
-    """Recordings followed by the same ones at other paces.
-
-    At a pace p the frames follow each other p times as fast: speeds are p times as high and
-    accelerations p² times, on the same paths. The pace of a recording is the possible one that is
-    nearest to the asked one: a tick must be a whole number of its frames.
-    """
-
-    def __init__(
-        self, recordings: Sequence[Recording], paces: Sequence[float], *, dt_s: float
-    ) -> None:
-        """Stores the arguments.
-
-        Args:
-            recordings: The recordings.
-            paces: The other paces.
-            dt_s: Time step.
-        """
-        self._recordings = recordings
-        self._paces = tuple(paces)
-        self._dt_s = dt_s
-        self._opened: dict[int, Recording] = {}
-
-    def __len__(self) -> int:
-        return len(self._recordings) * (1 + len(self._paces))
-
-    def __getitem__(self, index: Any) -> Any:
-        """A recording; those at pace 1 come first, then those of each other pace."""
-        number, which = int(index) % len(self._recordings), int(index) // len(self._recordings)
-        recording = self._recordings[number]
-        if not which:
-            return recording
-        if index not in self._opened:
-            stride = frames_per_tick(recording.frame_rate_hz, self._dt_s)
-            pace = max(1, round(stride * self._paces[which - 1])) / stride
-            self._opened[index] = at_pace(recording, pace)
-        return self._opened[index]
-
-    def __reduce__(self) -> tuple[Any, ...]:
-        """A copy in another process makes the other paces again."""
-        return partial(PacedRecordings, dt_s=self._dt_s), (self._recordings, self._paces)
-
-
-def at_pace(recording: Recording, pace: float) -> Recording:
-    """The recording played faster or slower.
-
-    Args:
-        recording: The recording.
-        pace: Factor on its frame rate and on all speeds.
-    """
-    states = np.array(recording.states)
-    states[:, 3] *= pace
-    rate_hz = recording.frame_rate_hz * pace
-    return dataclasses.replace(recording, frame_rate_hz=rate_hz, states=states)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -281,8 +222,6 @@ def open_training_data(config: TrainingConfig, data: str | Sequence[str]) -> Tra
                 f"data {data!r}: no snippet is left for {part} after the split by "
                 f"{config.split}; give more recordings or longer ones"
             )
-    if config.paces:
-        training = _paced(training, config)
     return TrainingData(
         training=_chosen(training, config, config.standing_share, config.max_snippets),
         validation=_chosen(validation, config, 1.0, config.max_validation_snippets),
@@ -406,23 +345,6 @@ def action_range(recordings: Sequence[Recording], snippets: SnippetIndex) -> tup
 def _chunks(snippets: SnippetIndex) -> Iterator[SnippetIndex]:
     for first in range(0, len(snippets), CHUNK):
         yield snippets.select(np.arange(first, min(first + CHUNK, len(snippets))))
-
-
-def _paced(split: DatasetSplit, config: TrainingConfig) -> DatasetSplit:
-    """The snippets, and those of the same recordings at other paces."""
-    if config.split == "blocks":
-        raise AspEnvError(
-            "training: other paces need whole recordings, the split is by blocks: give --split "
-            "recording or separate --validation data"
-        )
-    paced = PacedRecordings(split.recordings, config.paces, dt_s=config.dt_s)
-    every = index_snippets(paced, dt_s=config.dt_s, horizon_s=config.horizon_s)
-    count = len(split.recordings)
-    rates_hz = np.array([recording.frame_rate_hz for recording in paced])
-    other = rates_hz[every.recording] != rates_hz[every.recording % count]
-    trained = np.isin(every.recording % count, split.snippets.recording)
-    further = every.select(other & trained)
-    return DatasetSplit(recordings=paced, snippets=split.snippets.joined(further))
 
 
 def _index(recordings: Recordings, config: TrainingConfig) -> SnippetIndex:

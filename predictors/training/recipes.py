@@ -73,8 +73,6 @@ class TrainingConfig:
     """Precision of the encoder; the rest of the network is always float32."""
     threads: int | None = None
     """Threads of torch within one operation; None for its default."""
-    paces: tuple[float, ...] = ()
-    """Other paces at which the training recordings are played as well, see `PacedRecordings`."""
     augmentation: Augmentation | None = None
     """Random changes of the samples, in training and in validation; None for none."""
 
@@ -330,7 +328,10 @@ def _small(
 
 
 def _robust(config: TrainingConfig) -> TrainingConfig:
-    """Augmented samples, a mode of its own for standing targets, and more of these.
+    """Augmented samples, a standing mode with more standing targets, and shrunk accelerations.
+
+    Give validation data of other traffic than the training data: the epoch, the probabilities and
+    the factor of the accelerations are chosen on them.
 
     Raises:
         AspEnvError: The view renders rasters.
@@ -343,7 +344,7 @@ def _robust(config: TrainingConfig) -> TrainingConfig:
     return dataclasses.replace(
         config,
         preset="robust",
-        network=dataclasses.replace(config.network, standing=True),
+        network=dataclasses.replace(config.network, standing=True, shrunk=True),
         standing_share=0.5,
         augmentation=Augmentation(),
     )
