@@ -23,13 +23,16 @@ from predictors.inference.calibration import calibrate
 from predictors.inference.checkpoint import (
     CONFIG,
     PredictorSpec,
+    load_trained,
     read_config,
     save_trained,
     shape_for,
     write_json,
 )
+from predictors.inference.fit_features import feature_distance_of
 from predictors.training.data import (
     VALIDATION_BATCH,
+    DatasetSplit,
     action_range,
     open_all,
     open_training_data,
@@ -70,8 +73,8 @@ def train(
         config: Everything that decides the weights, besides the data and the start.
         data: One or several DATA, as `open_data` takes them.
         out: The run's folder. It holds `logs` and, until the run is finished, `unfinished`; then
-            `config.json`, `weights.safetensors` and `README.md`, of the epoch with the lowest
-            `validation FDE moving`.
+            `config.json`, `weights.safetensors`, `README.md` and `features.safetensors` (statistics
+            of the features), of the epoch with the lowest `validation FDE moving`.
         start: The folder of a finished run, or a file of ResNet18 weights, to start from.
         hardware: Devices and nodes.
 
@@ -164,12 +167,27 @@ def train(
             "best_value": best.best_value,
             "processes": trainer.world_size,
             "compiled": hardware.compiled,
-            "versions": _versions(),
+            "versions": versions(),
         },
     )
+    add_features(spec, out, chosen.validation, config)
     shutil.rmtree(state)
     trainer.strategy.barrier()
     return out
+
+
+def add_features(
+    spec: PredictorSpec, run: Path, validation: DatasetSplit, config: TrainingConfig
+) -> None:
+    """Adds the statistics of features on validation data to a finished run.
+
+    With too few validation snippets there are none.
+    """
+    found = feature_distance_of(
+        load_trained(spec, str(run)), validation.histories(config), validation.snippets
+    )
+    if found is not None:
+        found.save(run)
 
 
 def train_stages(
@@ -280,5 +298,6 @@ def _retain_freed_memory() -> None:
         libc.mallopt(trim_threshold, 2**31 - 1)
 
 
-def _versions() -> dict[str, str]:
+def versions() -> dict[str, str]:
+    """Versions of the packages that decide the weights, for the provenance of a run."""
     return {name: version(name) for name in ("asp-env", "lightning", "numpy", "torch")}
