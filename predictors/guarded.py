@@ -37,19 +37,12 @@ from asp_env.dynamics import rollout
 from asp_env.dynamics.bicycle import Integrator
 from asp_env.errors import AspEnvError
 from asp_env.geometry import wrap_angle
+from predictors.inference.feature_distance import FeatureDistance
 
 FULL_AT = 1.5
 """Score from which a forecast is constant velocity alone. Chosen by hand: a smaller one makes
 forecasts jump between consecutive ticks, a larger one leaves forecasts unguarded that are far from
 all validation data."""
-
-
-class FeatureScore(Protocol):
-    """Scores features; above 1 they are outside of what a network learned."""
-
-    def score(self, features: Float[np.ndarray, "n z"]) -> Float[np.ndarray, " n"]:
-        """Scores N targets by their features z."""
-        ...
 
 
 @runtime_checkable
@@ -67,8 +60,8 @@ class Guarded:
 
     inner: FeaturePredictor
     """The trained predictor."""
-    distance: FeatureScore
-    """Scores of its features."""
+    distance: FeatureDistance
+    """Scores its features."""
     integrator: Integrator
     """Integrator of its bicycle model."""
 

@@ -1,6 +1,6 @@
 """How far a scene lies outside what a network learned: the Mahalanobis distance of its features.
 
-The distance of features z to the features of validation data, with their mean μ and covariance Σ, is
+The distance of features z to those of validation data, with their mean μ and covariance Σ, is
 `sqrt((z - μ)ᵀ Σ⁻¹ (z - μ))` (Lee et al., "A Simple Unified Framework for Detecting
 Out-of-Distribution Samples and Adversarial Attacks", NeurIPS 2018, with a single class). Directions
 in which features hardly vary would dominate it, so the covariance is shrunk towards a multiple of

@@ -33,6 +33,7 @@ from predictors.inference.fit_features import feature_distance_of
 from predictors.training.data import (
     VALIDATION_BATCH,
     DatasetSplit,
+    TrainingData,
     action_range,
     open_all,
     open_training_data,
@@ -86,7 +87,32 @@ def train(
             files; the data or the start are bad; the hardware is not available; or the loss is not
             finite.
     """
-    chosen = open_training_data(config, data)
+    return train_on(config, open_training_data(config, data), out, start=start, hardware=hardware)
+
+
+def train_on(
+    config: TrainingConfig,
+    chosen: TrainingData,
+    out: Path,
+    *,
+    start: Path | None = None,
+    hardware: Hardware = ONE_PROCESS,
+) -> Path:
+    """Trains a predictor as `train` does, on data that are open and split.
+
+    Args:
+        config: As for `train`.
+        chosen: Training and validation snippets.
+        out: As for `train`.
+        start: As for `train`.
+        hardware: As for `train`.
+
+    Returns:
+        `out`.
+
+    Raises:
+        AspEnvError: As `train`.
+    """
     run = {"config": dataclasses.asdict(config), "data_hash": chosen.data_hash}
     if chosen.validation_hash is not None:
         run["validation_hash"] = chosen.validation_hash
