@@ -144,7 +144,9 @@ class Guarded:
         if len(rows):
             score = self.distance.score(self.inner.features(scene)[rows])
             share[rows] = fallback_share(score)
-        return blended(forecast, scene, share, self.integrator)
+        guarded = blended(forecast, scene, share, self.integrator)
+        stated = np.where(forecast.valid, share, np.float32(np.nan))
+        return dataclasses.replace(guarded, fallback=stated)
 
 
 def fallback_share(score: Float[np.ndarray, " n"]) -> Float[np.ndarray, " n"]:
@@ -180,7 +182,7 @@ def blended(
             states[rows, ..., 2] = wrap_angle(states[rows, ..., 2])
         full = rows[share[rows] >= 1]
         states[full] = straight[share[rows] >= 1]
-    return dataclasses.replace(forecast, states=states, actions=actions, fallback=share)
+    return dataclasses.replace(forecast, states=states, actions=actions)
 
 
 def _rolled_out(

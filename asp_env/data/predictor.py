@@ -40,8 +40,9 @@ class Forecast:
     dt_s: float
     """Seconds per tick."""
     fallback: Float[np.ndarray, " t"] | None = None
-    """Share of constant velocity in each target's forecast, within [0, 1]; None from a predictor
-    that has no guard against scenes outside of what it learned."""
+    """Share of constant velocity in each target's forecast, within [0, 1], NaN for a target that
+    the predictor does not forecast; None from a predictor that has no guard against scenes outside
+    of what it learned."""
 
     @property
     def probabilities(self) -> Float[np.ndarray, "t m"]:

@@ -63,7 +63,7 @@ from predictors.training.data import (
     open_training_data,
     snippets_of,
 )
-from predictors.training.fitting import add_features, versions
+from predictors.training.fitting import add_features, torch_threads, versions
 from predictors.training.recipes import TrainingConfig
 
 FINE_TUNED = "fine-tuned"
@@ -198,7 +198,8 @@ def fine_tune_on(
             data.validation.batches(size=VALIDATION_BATCH, **settings),
             own=own,
         )
-        course.run()
+        with torch_threads(config.threads):
+            course.run()
         share, errors = course.average(before.network)
         temperature = read_config(start)["temperature"]
         calibrated = len(data.validation.snippets) >= MIN_CALIBRATION_TARGETS
@@ -254,9 +255,11 @@ def config_from(predictor: str, start: Path, options: FineTuning) -> TrainingCon
     network = load_trained(spec, str(start)).network
     stored = read_config(start)["provenance"].get("config", {})
     known = {field.name for field in dataclasses.fields(TrainingConfig)}
-    fields = {name: value for name, value in stored.items() if name in known}
-    if fields.get("pixels") is not None:
-        fields["pixels"] = tuple(fields["pixels"])
+    fields = {  # JSON has lists for tuples
+        name: tuple(value) if isinstance(value, list) else value
+        for name, value in stored.items()
+        if name in known
+    }
     fields["network"] = network.config
     try:
         config = TrainingConfig(**fields)

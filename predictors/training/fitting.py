@@ -295,12 +295,13 @@ def _fit(trainer: pl.Trainer, module: TrainingModule, state: Path, hardware: Har
     _retain_freed_memory()
     if hardware.compiled:
         module.network.get_submodule("encoder").compile()
-    with quiet(), _threads(module.config.threads):
+    with quiet(), torch_threads(module.config.threads):
         trainer.fit(module, ckpt_path=str(state) if state.exists() else None)
 
 
 @contextmanager
-def _threads(count: int | None) -> Iterator[None]:
+def torch_threads(count: int | None) -> Iterator[None]:
+    """Limits the threads of torch's operations in a `with` block; None for its default."""
     before = torch.get_num_threads()
     torch.set_num_threads(before if count is None else count)
     try:

@@ -290,14 +290,15 @@ def fallback_share(forecasts: Sequence[Forecast], num_episodes: int) -> Masked:
         num_episodes: B.
 
     Returns:
-        Shares (b,) of all targets of all ticks; missing for episodes without a target, and for a
-        predictor without a guard.
+        Shares (b,) of the targets that the predictor forecasts, over all ticks; missing for
+        episodes without any, and for a predictor without a guard.
     """
     targets, blended = np.zeros(num_episodes), np.zeros(num_episodes)
     for forecast in forecasts:
         if forecast.fallback is not None:
             episode = forecast.targets[:, 0]
-            targets += np.bincount(episode, minlength=num_episodes)
+            made = np.isfinite(forecast.fallback)
+            targets += np.bincount(episode[made], minlength=num_episodes)
             blended += np.bincount(episode[forecast.fallback > 0], minlength=num_episodes)
     return Masked(value=blended / np.maximum(targets, 1), valid=targets > 0)
 

@@ -290,7 +290,7 @@ def _fallback(forecast: Forecast) -> dict[tuple[str, str], Masked]:
     if forecast.fallback is None:
         return {}
     blended = (forecast.fallback > 0).astype(np.float32)
-    return {(ALL_MODES, FALLBACK): Masked(value=blended, valid=np.ones(len(blended), dtype=bool))}
+    return {(ALL_MODES, FALLBACK): Masked(value=blended, valid=np.isfinite(forecast.fallback))}
 
 
 def _put_modes(

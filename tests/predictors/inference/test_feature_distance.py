@@ -42,7 +42,7 @@ def test_distance_by_hand() -> None:
 
 
 def test_one_percent_of_new_features_lie_above_the_threshold() -> None:
-    """Of features with the same distribution that nothing was fitted on; 20 standard errors more."""
+    """Of features with the same distribution, which nothing was fitted on."""
     score = fitted(gaussian(4000)).score(gaussian(20_000, seed=1))
     assert (score > 1).mean() == pytest.approx(0.01, abs=0.004)
 
