@@ -255,7 +255,7 @@ def config_from(predictor: str, start: Path, options: FineTuning) -> TrainingCon
     network = load_trained(spec, str(start)).network
     stored = read_config(start)["provenance"].get("config", {})
     known = {field.name for field in dataclasses.fields(TrainingConfig)}
-    fields = {  # JSON has lists for tuples
+    fields: dict[str, Any] = {  # JSON has lists for tuples
         name: tuple(value) if isinstance(value, list) else value
         for name, value in stored.items()
         if name in known

@@ -22,6 +22,7 @@ from predictors.training.fine_tuning import (
     mixed_rows,
 )
 from predictors.training.fitting import train
+from tests.data.levelx_files import write_map, write_recording
 from tests.predictors.tiny import save_random, tiny_config, write_data
 
 
@@ -147,8 +148,6 @@ def test_one_recording_is_split_by_blocks_with_a_notice(
 
 def own_long(folder: Path) -> str:
     """One recording whose blocks of 12 s are longer than a snippet."""
-    from tests.data.levelx_files import write_map, write_recording
-
     write_recording(folder / "long", number=0, classes=("car",) * 3, num_frames=3000)
     write_map(folder / "long")
     return str(folder / "long")
