@@ -123,13 +123,14 @@ class Delayed:
         actions = np.zeros((*states.shape[:-1], 2), dtype=np.float32)
         known = min(end, then.actions.shape[2])
         actions[:, :, :known] = then.actions[:, :, :known]
-        return make_forecast(
+        forecast = make_forecast(
             scene,
             states=states[:, :, first:end],
             actions=actions[:, :, first:end] if then.actions_valid.any() else None,
             log_probs=then.log_probs,
             valid=then.valid & since_then.all(axis=1),
         )
+        return dataclasses.replace(forecast, fallback=then.fallback)
 
 
 def _scene_before(scene: Scene, ticks: int) -> Scene:

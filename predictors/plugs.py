@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any
 
 from predictors.controls import Blend, Blind, InteractiveOracle, NoisyOracle, ShuffledOracle
 from predictors.delayed import Delayed
+from predictors.guarded import Guarded
 from predictors.most_probable import MostProbable
 from predictors.physical import ConstantTurnRate, ConstantVelocity, Oracle
 
@@ -30,6 +31,7 @@ __all__ = [
     "ConstantTurnRate",
     "ConstantVelocity",
     "Delayed",
+    "Guarded",
     "InteractiveOracle",
     "MostProbable",
     "NoisyOracle",

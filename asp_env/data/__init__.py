@@ -4,6 +4,7 @@ from asp_env.data.causal import causal_histories
 from asp_env.data.classes import AgentClass
 from asp_env.data.predictor import (
     Forecast,
+    GuardablePlug,
     InteractivePredictor,
     Predictor,
     PredictorPlug,
@@ -29,6 +30,7 @@ __all__ = [
     "AgentClass",
     "Forecast",
     "Future",
+    "GuardablePlug",
     "InteractivePredictor",
     "Predictor",
     "PredictorPlug",

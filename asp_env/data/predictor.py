@@ -39,6 +39,10 @@ class Forecast:
     """False for targets that the predictor does not forecast; their rows are zeros."""
     dt_s: float
     """Seconds per tick."""
+    fallback: Float[np.ndarray, " t"] | None = None
+    """Share of constant velocity in each target's forecast, within [0, 1], NaN for a target that
+    the predictor does not forecast; None from a predictor that has no guard against scenes outside
+    of what it learned."""
 
     @property
     def probabilities(self) -> Float[np.ndarray, "t m"]:
@@ -135,6 +139,28 @@ class PredictorPlug(Protocol):
 
         Raises:
             AspEnvError: the argument is missing, superfluous, or cannot be loaded.
+        """
+        ...
+
+
+@runtime_checkable
+class GuardablePlug(PredictorPlug, Protocol):
+    """A plug whose predictors have a form with a guard, `guarded:NAME:RUN`.
+
+    A guard replaces forecasts by constant velocity where a scene lies outside of what the predictor
+    learned, and states the share in `Forecast.fallback`.
+    """
+
+    def load_guarded(self, argument: str, *, horizon: int, dt_s: float) -> Predictor:
+        """Makes the predictor with its guard.
+
+        Args:
+            argument: as for `from_name`.
+            horizon: as for `from_name`.
+            dt_s: as for `from_name`.
+
+        Raises:
+            AspEnvError: the argument cannot be loaded, or the predictor has no guard.
         """
         ...
 

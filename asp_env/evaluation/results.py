@@ -24,6 +24,9 @@ see `asp_env.evaluation.ladder`."""
 HEADROOM = "headroom"
 """Metric: gain of a method's score over constant velocity as a share of the oracle's gain."""
 
+FALLBACK = "fallback"
+"""Metric: share of the forecasts of targets that a guard has blended to constant velocity."""
+
 _DIFFERENCE = " - "
 
 
@@ -84,6 +87,28 @@ class Row:
     """Minimal detectable effect of a difference, in the unit of the metric."""
     p_holm: float | None = None
     """Two-sided p value of a difference, adjusted by Holm's method over all methods."""
+
+
+def fallback_shares(rows: Sequence[Row]) -> dict[str, float]:
+    """Share of the forecasts that were blended to constant velocity, by guarded predictor."""
+    return {
+        row.predictor: round(row.value, 4)
+        for row in rows
+        if row.metric == FALLBACK and row.subset == "all"
+    }
+
+
+def fallback_sentences(shares: Mapping[str, float], what: str) -> list[str]:
+    """A sentence for each guarded predictor.
+
+    Args:
+        shares: as of `fallback_shares`.
+        what: what the shares are of, in the plural.
+    """
+    return [
+        f"{name}: {100 * share:.1f} % of the {what} are blended to constant velocity"
+        for name, share in shares.items()
+    ]
 
 
 def write_metrics(folder: Path, rows: Sequence[Row]) -> None:

@@ -10,7 +10,8 @@ from typing import Literal
 import numpy as np
 from jaxtyping import Bool
 
-from asp_env.data.predictor import Predictor, load_predictor
+from asp_env import registry
+from asp_env.data.predictor import GuardablePlug, Predictor, load_predictor
 from asp_env.data.snippets import SnippetIndex, index_snippets
 from asp_env.data.source import Recordings
 from asp_env.data.split import (
@@ -21,6 +22,12 @@ from asp_env.data.split import (
     unseen_ticks,
 )
 from asp_env.errors import AspEnvError
+
+GUARDED = "guarded"
+"""Name of the predictor that guards another one by a fallback to constant velocity."""
+
+_WRAPPERS = re.compile(r"(delayed:\d+:|most-probable:)*")
+"""Names of predictors that change the forecast of another one, before its name."""
 
 PartChoice = Literal["auto", "train", "validation", "test", "all"]
 
@@ -70,6 +77,24 @@ def _matching_runs(name: str) -> tuple[str, ...]:
 
 def _named_repeatedly(name: str, count: int) -> AspEnvError:
     return AspEnvError(f"--predictors: {name} is named {count} times; name it once")
+
+
+def with_fallback(names: Sequence[str]) -> tuple[str, ...]:
+    """The names with a guard for every trained predictor: `ffw-asp:RUN` is `guarded:ffw-asp:RUN`.
+
+    The guard is of the predictor itself, so `delayed:2:ffw-asp:RUN` becomes
+    `delayed:2:guarded:ffw-asp:RUN`. Predictors without a guard keep their names.
+
+    Raises:
+        AspEnvError: a name is unknown.
+    """
+    return tuple(_with_fallback(name) for name in names)
+
+
+def _with_fallback(name: str) -> str:
+    start = len(_WRAPPERS.match(name)[0])  # pyright: ignore[reportOptionalSubscript]
+    plug = registry.find("predictors", name[start:].partition(":")[0])
+    return f"{name[:start]}{GUARDED}:{name[start:]}" if isinstance(plug, GuardablePlug) else name
 
 
 def load_predictors(names: Sequence[str], *, horizon: int, dt_s: float) -> list[Predictor]:
@@ -126,10 +151,10 @@ def split_name(name: str) -> tuple[str, str]:
 
     Numbers in the name belong to the label: `noisy-oracle:2` is `noisy-oracle 2`, and
     `delayed:2:mtp:runs/1` is `delayed 2 mtp` with the folder `runs/1`. So does the predictor in
-    `most-probable:mtp:runs/1`.
+    `most-probable:mtp:runs/1` and in `guarded:mtp:runs/1`.
     """
     kind, _, argument = name.partition(":")
-    if kind == "most-probable" and argument:
+    if kind in ("most-probable", GUARDED) and argument:
         label, run = split_name(argument)
         return f"{kind} {label}", run
     number, _, inner = argument.partition(":")

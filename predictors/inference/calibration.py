@@ -54,6 +54,26 @@ def calibrate(network: AbstractNetwork, batches: Iterable[tuple[Batch, Labels]])
     return temperature
 
 
+def forecast_temperature(
+    network: AbstractNetwork, batches: Iterable[tuple[Batch, Labels]]
+) -> float:
+    """Fits the temperature of a network's forecasts alone, which changes no position and no order.
+
+    The merging temperature remains, because the merged modes depend on it.
+
+    Args:
+        network: The network; as after `calibrate`.
+        batches: Inputs and labels.
+
+    Returns:
+        The divisor of the logits of its forecasts.
+    """
+    device = torch.device("cuda" if torch.cuda.is_available() else "cpu")
+    temperature = _temperature(network.eval().to(device), batches, device)
+    network.cpu()
+    return temperature
+
+
 def fit_temperature(logits: Float[np.ndarray, "n m"], best: Int[np.ndarray, " n"]) -> float:
     """Finds the divisor of logits that minimises the cross-entropy of the best modes.
 

@@ -18,9 +18,12 @@ from torch import Tensor
 
 from asp_env.data.predictor import Predictor
 from asp_env.data.split import TrainedOn
+from asp_env.dynamics.bicycle import Integrator
 from asp_env.errors import AspEnvError, CheckpointError, unknown_name
 from asp_env.files import atomic_file, remove_stale
 from asp_env.views import BinaryView, SceneView, view_from_config
+from predictors.guarded import Guarded
+from predictors.inference.feature_distance import FeatureDistance
 from predictors.inference.model_card import model_card
 from predictors.inference.pretrained import PRETRAINED, pretrained_folder, pretrained_names
 from predictors.inference.trained import TrainedPredictor
@@ -69,6 +72,27 @@ class PredictorSpec:
         """
         del horizon
         return load_trained(self, argument, dt_s=dt_s)
+
+    def load_guarded(self, argument: str, *, horizon: int, dt_s: float) -> Predictor:
+        """Loads the predictor with a guard, as `guarded:NAME:RUN`; see `predictors.guarded`.
+
+        Args:
+            argument: As for `from_name`.
+            horizon: As for `from_name`.
+            dt_s: As for `from_name`.
+
+        Raises:
+            CheckpointError: As `from_name`, or the run has no statistics of its features.
+            AspEnvError: As `from_name`.
+        """
+        del horizon
+        inner = load_trained(self, argument, dt_s=dt_s)
+        run, _ = _split_chaining(argument)
+        folder, _ = folder_and_chaining(self.name, argument)
+        distance = FeatureDistance.load(
+            folder, name=f"{self.name}:{run}", features=inner.network.config.features
+        )
+        return Guarded(inner=inner, distance=distance, integrator=_integrator(inner))
 
 
 def save_trained(
@@ -265,6 +289,11 @@ def _build(
     with torch.random.fork_rng(devices=[]):  # for initial weights, which are replaced
         network = spec.network(spec.config(**config["network"]), shape)
     return view, network, trained_on
+
+
+def _integrator(predictor: TrainedPredictor) -> Integrator:
+    """The integrator of the network's bicycle model; Heun's method for a network without one."""
+    return getattr(predictor.network.config, "integrator", "heun")
 
 
 def _positive(field: str, given: Any) -> float:

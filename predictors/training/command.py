@@ -8,7 +8,15 @@ from typing import Annotated, Any, Literal
 import tyro
 from rich.console import Console
 
-from asp_env.errors import MissingExtraError
+from asp_env.errors import AspEnvError, MissingExtraError
+
+DEFAULT_RECIPE, DEFAULT_VIEW, DEFAULT_HORIZON_S = "cpu", "chauffeurnet", 3.0
+
+RUN_DECIDES: dict[str, Any] = {
+    **dict.fromkeys(("view", "recipe", "variant", "horizon", "history", "start", "precision")),
+    **{"devices": 1, "nodes": 1, "strategy": "auto", "compile": False, "num_workers": 0},
+}
+"""Options that cannot be given with `--from`, and their defaults."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -22,16 +30,24 @@ class Train:
     sample:…, synthetic:… or highway:…. Several are trained on together."""
     out: Path
     """Folder of the run."""
-    recipe: str = "cpu"
-    """Recipe: cpu (the paper's structure, minutes on two
-    cores), ours (more accurate at the same size) or paper
-    (the paper's size and schedule)."""
+    from_run: Annotated[str | None, tyro.conf.arg(name="from", metavar="NAME:RUN")] = None
+    """Fine-tune a finished run, such as ssp-asp:pretrained: at a
+    low learning rate, until the validation error no longer
+    falls. View, recipe, horizon and histories are the run's."""
+    mix: Annotated[tuple[str, ...], tyro.conf.arg(metavar="DATA …")] = ()
+    """With --from: other data, which half of each batch is taken
+    from, so that the network does not forget them."""
+    recipe: str | None = None
+    """Recipe: cpu (the default; the paper's structure, minutes
+    on two cores), ours (more accurate at the same size) or
+    paper (the paper's size and schedule)."""
     variant: str | None = None
     """Variant of the recipe by name, such as no-trail, for ablations."""
-    view: str = "chauffeurnet"
-    """View that the network observes: chauffeurnet, mtp or vectors."""
-    horizon: float = 3.0
-    """Horizon of the forecasts in seconds. Above 3 s, ssp-asp
+    view: str | None = None
+    """View that the network observes: chauffeurnet (the
+    default), mtp or vectors."""
+    horizon: float | None = None
+    """Horizon of the forecasts in seconds, by default 3. Above 3 s, ssp-asp
     and the variant staged of the others start from a run for
     3 s in OUT/3s."""
     start: str | None = None
@@ -40,14 +56,17 @@ class Train:
     file of ResNet18 weights."""
     validation: Annotated[tuple[str, ...], tyro.conf.arg(metavar="DATA …")] = ()
     """Separate validation data. All of DATA is then used for training."""
-    history: Literal["recorded", "causal"] = "recorded"
-    """Histories that the network observes: as recorded
-    (smoothed with later frames), or filtered again without
-    later frames."""
-    split: Literal["recording", "blocks"] = "recording"
-    """What is held out: whole recordings, or blocks of time within each."""
+    history: Literal["recorded", "causal"] | None = None
+    """Histories that the network observes: recorded (the
+    default; smoothed with later frames), or causal (filtered
+    again without later frames)."""
+    split: Literal["recording", "blocks"] | None = None
+    """What is held out: whole recordings (the default), or blocks
+    of time within each; with --from, blocks if there are too
+    few recordings."""
     epochs: int | None = None
-    """Number of epochs instead of the recipe's; with two stages, the number for each."""
+    """Number of epochs instead of the recipe's; with two stages,
+    the number for each; with --from, the largest number."""
     seed: int = 0
     """Seed of the initial weights and of the order of the data."""
     max_snippets: int | None = None
@@ -77,6 +96,11 @@ class Train:
         Raises:
             AspEnvError: An option, the data or the folder is bad.
         """
+        if self.from_run is not None:
+            self._fine_tune(self.from_run)
+            return
+        if self.mix:
+            raise AspEnvError("--mix: only a fine-tuning mixes data; give --from NAME:RUN as well")
         try:
             from predictors.inference.pretrained import PRETRAINED, pretrained_folder
             from predictors.training.fitting import train, train_stages
@@ -98,17 +122,56 @@ class Train:
         if warm_starts_from_3s(self.predictor, self.variant):
             run = train_stages(
                 self.config_for,
-                self.horizon,
+                self.horizon or DEFAULT_HORIZON_S,
                 self.data,
                 self.out,
                 start=start,
                 hardware=hardware,
             )
         else:
-            config = self.config_for(self.horizon)
+            config = self.config_for(self.horizon or DEFAULT_HORIZON_S)
             run = train(config, self.data, self.out, start=start, hardware=hardware)
         if is_first_process():
             Console().print(f"wrote {run}: name it as {self.predictor}:{run}")
+
+    def _fine_tune(self, name: str) -> None:
+        """Fine-tunes a run.
+
+        Raises:
+            AspEnvError: The name or an option are bad, or the data or the folder.
+        """
+        given = [
+            f"--{option.replace('_', '-')}"
+            for option, default in RUN_DECIDES.items()
+            if getattr(self, option) != default
+        ]
+        if given:
+            raise AspEnvError(
+                f"{' '.join(given)} with --from {name}: a fine-tuning takes view, recipe, horizon "
+                "and histories from the run, and runs on one device; leave it out"
+            )
+        kind, _, argument = name.partition(":")
+        if kind != self.predictor or not argument:
+            raise AspEnvError(
+                f"--from {name}: expected a finished run of {self.predictor}, such as "
+                f"{self.predictor}:RUN"
+            )
+        try:
+            from predictors.inference.checkpoint import folder_and_chaining
+            from predictors.training.fine_tuning import EPOCHS, FineTuning, fine_tune
+        except ModuleNotFoundError as error:
+            raise MissingExtraError(str(error.name), "train", "training") from error
+        start, _ = folder_and_chaining(kind, argument)
+        options = FineTuning(
+            split=self.split,
+            validation=self.validation,
+            mix=self.mix,
+            epochs=EPOCHS if self.epochs is None else self.epochs,
+            seed=self.seed,
+            max_snippets=self.max_snippets,
+        )
+        run = fine_tune(self.predictor, start, self.data, self.out, options)
+        Console().print(f"wrote {run}: name it as {self.predictor}:{run}")
 
     def config_for(self, horizon_s: float) -> Any:
         """The configuration of a run for a horizon in seconds.
@@ -119,13 +182,18 @@ class Train:
         from predictors.training.recipes import recipe
         from predictors.training.variants import variant
 
-        config = recipe(self.predictor, self.recipe, view=self.view, horizon_s=horizon_s)
+        config = recipe(
+            self.predictor,
+            self.recipe or DEFAULT_RECIPE,
+            view=self.view or DEFAULT_VIEW,
+            horizon_s=horizon_s,
+        )
         config = dataclasses.replace(
             config,
-            split=self.split,
+            split=self.split or config.split,
             seed=self.seed,
             validation=self.validation,
-            history=self.history,
+            history=self.history or config.history,
             max_snippets=self.max_snippets,
             epochs=config.epochs if self.epochs is None else self.epochs,
             precision=config.precision if self.precision is None else self.precision,

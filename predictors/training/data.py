@@ -158,19 +158,22 @@ class DatasetSplit:
             later_ticks: Ticks ahead at which labels hold future inputs.
             config: The configuration; its `history` decides what the inputs show.
         """
-        histories: Sequence[Recording] = self.recordings
-        if config.history == "causal":
-            histories = causal_histories(self.recordings)
         return Batches(
             self.recordings,
             self.snippets,
             view=view,
             batch_size=size,
             later_ticks=later_ticks,
-            histories=histories,
+            histories=self.histories(config),
             augmentation=config.augmentation,
             seed=config.seed,
         )
+
+    def histories(self, config: TrainingConfig) -> Sequence[Recording]:
+        """The recordings as inputs show them, as `history` of the configuration says."""
+        if config.history == "causal":
+            return causal_histories(self.recordings)
+        return self.recordings
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -202,7 +205,7 @@ def open_training_data(config: TrainingConfig, data: str | Sequence[str]) -> Tra
     """
     opened = open_all(data)
     recordings = join_data(opened)
-    index = _index(recordings, config)
+    index = snippets_of(recordings, config)
     if not config.validation:
         parts, trained_on = _split(opened, recordings.source, config)
         training, validation = (
@@ -213,7 +216,7 @@ def open_training_data(config: TrainingConfig, data: str | Sequence[str]) -> Tra
     else:
         separate = join_data(open_all(config.validation))
         training = DatasetSplit(recordings=recordings, snippets=index)
-        validation = DatasetSplit(recordings=separate, snippets=_index(separate, config))
+        validation = DatasetSplit(recordings=separate, snippets=snippets_of(separate, config))
         trained_on = _separate_parts(recordings, separate)
         validation_hash = separate.data_hash()
     for part, split in (("training", training), ("validation", validation)):
@@ -347,7 +350,8 @@ def _chunks(snippets: SnippetIndex) -> Iterator[SnippetIndex]:
         yield snippets.select(np.arange(first, min(first + CHUNK, len(snippets))))
 
 
-def _index(recordings: Recordings, config: TrainingConfig) -> SnippetIndex:
+def snippets_of(recordings: Recordings, config: TrainingConfig) -> SnippetIndex:
+    """All snippets of recordings, as the configuration needs them."""
     return index_snippets(recordings, dt_s=config.dt_s, horizon_s=config.horizon_s)
 
 
@@ -355,7 +359,7 @@ def _split(
     opened: Sequence[Recordings], source: str, config: TrainingConfig
 ) -> tuple[Shaped[np.ndarray, " n"], TrainedOn]:
     """The parts of the snippets of several data sets, in the order of their joined recordings."""
-    splits = [snippet_parts(each, _index(each, config), config.split) for each in opened]
+    splits = [snippet_parts(each, snippets_of(each, config), config.split) for each in opened]
     by_hash = {key: part for _, trained_on in splits for key, part in trained_on.parts.items()}
     parts = np.concatenate([of_data for of_data, _ in splits])
     return parts, TrainedOn(source=source, split=config.split, parts=by_hash)

@@ -23,13 +23,17 @@ from predictors.inference.calibration import calibrate
 from predictors.inference.checkpoint import (
     CONFIG,
     PredictorSpec,
+    load_trained,
     read_config,
     save_trained,
     shape_for,
     write_json,
 )
+from predictors.inference.fit_features import feature_distance_of
 from predictors.training.data import (
     VALIDATION_BATCH,
+    DatasetSplit,
+    TrainingData,
     action_range,
     open_all,
     open_training_data,
@@ -70,8 +74,8 @@ def train(
         config: Everything that decides the weights, besides the data and the start.
         data: One or several DATA, as `open_data` takes them.
         out: The run's folder. It holds `logs` and, until the run is finished, `unfinished`; then
-            `config.json`, `weights.safetensors` and `README.md`, of the epoch with the lowest
-            `validation FDE moving`.
+            `config.json`, `weights.safetensors`, `README.md` and `features.safetensors` (statistics
+            of the features), of the epoch with the lowest `validation FDE moving`.
         start: The folder of a finished run, or a file of ResNet18 weights, to start from.
         hardware: Devices and nodes.
 
@@ -83,7 +87,32 @@ def train(
             files; the data or the start are bad; the hardware is not available; or the loss is not
             finite.
     """
-    chosen = open_training_data(config, data)
+    return train_on(config, open_training_data(config, data), out, start=start, hardware=hardware)
+
+
+def train_on(
+    config: TrainingConfig,
+    chosen: TrainingData,
+    out: Path,
+    *,
+    start: Path | None = None,
+    hardware: Hardware = ONE_PROCESS,
+) -> Path:
+    """Trains a predictor as `train` does, on data that are open and split.
+
+    Args:
+        config: As for `train`.
+        chosen: Training and validation snippets.
+        out: As for `train`.
+        start: As for `train`.
+        hardware: As for `train`.
+
+    Returns:
+        `out`.
+
+    Raises:
+        AspEnvError: As `train`.
+    """
     run = {"config": dataclasses.asdict(config), "data_hash": chosen.data_hash}
     if chosen.validation_hash is not None:
         run["validation_hash"] = chosen.validation_hash
@@ -164,12 +193,27 @@ def train(
             "best_value": best.best_value,
             "processes": trainer.world_size,
             "compiled": hardware.compiled,
-            "versions": _versions(),
+            "versions": versions(),
         },
     )
+    add_features(spec, out, chosen.validation, config)
     shutil.rmtree(state)
     trainer.strategy.barrier()
     return out
+
+
+def add_features(
+    spec: PredictorSpec, run: Path, validation: DatasetSplit, config: TrainingConfig
+) -> None:
+    """Adds the statistics of features on validation data to a finished run.
+
+    With too few validation snippets there are none.
+    """
+    found = feature_distance_of(
+        load_trained(spec, str(run)), validation.histories(config), validation.snippets
+    )
+    if found is not None:
+        found.save(run)
 
 
 def train_stages(
@@ -251,12 +295,13 @@ def _fit(trainer: pl.Trainer, module: TrainingModule, state: Path, hardware: Har
     _retain_freed_memory()
     if hardware.compiled:
         module.network.get_submodule("encoder").compile()
-    with quiet(), _threads(module.config.threads):
+    with quiet(), torch_threads(module.config.threads):
         trainer.fit(module, ckpt_path=str(state) if state.exists() else None)
 
 
 @contextmanager
-def _threads(count: int | None) -> Iterator[None]:
+def torch_threads(count: int | None) -> Iterator[None]:
+    """Limits the threads of torch's operations in a `with` block; None for its default."""
     before = torch.get_num_threads()
     torch.set_num_threads(before if count is None else count)
     try:
@@ -280,5 +325,6 @@ def _retain_freed_memory() -> None:
         libc.mallopt(trim_threshold, 2**31 - 1)
 
 
-def _versions() -> dict[str, str]:
+def versions() -> dict[str, str]:
+    """Versions of the packages that decide the weights, for the provenance of a run."""
     return {name: version(name) for name in ("asp-env", "lightning", "numpy", "torch")}

@@ -3,7 +3,7 @@
 All registered predictors are tested. Trained ones have random weights and read rasters or vectors;
 those that chain segments are tested with every chaining at 6 s. The recipes `ours` are tested on
 vectors. A predictor with an argument is tested with each of `ARGUMENTS`. The pretrained ones are
-tested with their own weights.
+tested with their own weights, and guarded ones with statistics by which most targets are blended.
 """
 
 import re
@@ -29,7 +29,7 @@ from predictors.inference.pretrained import PRETRAINED, pretrained_names
 from predictors.models.chaining import CHAININGS
 from predictors.training.recipes import RECIPES
 from tests.builders import make_recording
-from tests.predictors.tiny import save_random
+from tests.predictors.tiny import save_distance, save_random
 
 VIEWS = ("chauffeurnet", "vectors")
 SEGMENT = 15
@@ -74,19 +74,22 @@ class Case(NamedTuple):
             preset = self.preset or "cpu"
             kind = self.name.rpartition(":")[2]
             save_random(run, kind, self.view, horizon=self.horizon, seed=seed, preset=preset)
+            if self.name.startswith("guarded"):
+                save_distance(run)
         return f"{self.name}:{run}" + (f"@{self.chaining}" if self.chaining else "")
 
 
 PHYSICAL = tuple(
     Case(":".join(part for part in (name, argument) if part))
     for name in registry.names("predictors")
-    if name not in RECIPES
+    if name not in RECIPES and name != "guarded"
     for argument in ARGUMENTS.get(name, ("",))
 )
 ONE_SEGMENT = tuple(Case(name, view) for name in RECIPES for view in VIEWS)
 CHAINED = tuple(Case("ssp-asp", "vectors", chaining) for chaining in CHAININGS)
 OURS = tuple(Case(name, "vectors", preset="ours") for name, of in RECIPES.items() if "ours" in of)
 OURS_CHAINED = tuple(Case("ssp-asp", "vectors", chaining, "ours") for chaining in CHAININGS)
+GUARDED = tuple(Case(f"guarded:{name}", "vectors") for name in ("ffw-asp", "mtp"))
 DELAYED = tuple(Case(f"delayed:2:{name}", "vectors") for name in ("ffw-asp", "mtp"))
 TRAINED = ONE_SEGMENT + CHAINED + OURS + OURS_CHAINED
 SHIPPED = tuple(Case(f"{name}:{PRETRAINED}") for name in pretrained_names())
@@ -98,7 +101,7 @@ def with_predictors(cases: tuple[Case, ...]) -> pytest.MarkDecorator:
     return pytest.mark.parametrize("predictor", cases, ids=labels, indirect=True)
 
 
-every = with_predictors(PHYSICAL + TRAINED + DELAYED + SHIPPED)
+every = with_predictors(PHYSICAL + TRAINED + DELAYED + GUARDED + SHIPPED)
 
 
 @cache
@@ -114,7 +117,7 @@ def snippets_for(predictor: Predictor) -> SnippetIndex:
 
 def forecasts_all_classes(predictor: Predictor) -> bool:
     """Whether it also forecasts agents that trained predictors do not, such as pedestrians."""
-    kind = re.sub(r"(delayed:\d+|most-probable):", "", predictor.name).partition(":")[0]
+    kind = re.sub(r"(delayed:\d+|most-probable|guarded):", "", predictor.name).partition(":")[0]
     return kind in (
         "oracle",
         "blind",

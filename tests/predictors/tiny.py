@@ -13,6 +13,7 @@ from asp_env.data.recording import Recording
 from asp_env.data.snippets import index_snippets
 from asp_env.views import make_view
 from predictors.inference.checkpoint import PredictorSpec, save_trained, shape_for
+from predictors.inference.feature_distance import FeatureDistance
 from predictors.models.batch import Batch, Labels
 from predictors.models.network import AbstractNetwork, NetworkConfig, NetworkShape
 from predictors.training.data import Batches
@@ -136,3 +137,11 @@ def save_random(
         },
     )
     return folder
+
+
+def save_distance(run: Path, *, threshold: float = 2.5) -> FeatureDistance:
+    """Adds statistics of features to a tiny run: the distance from zero over a threshold."""
+    size = SIZES["features"]
+    distance = FeatureDistance(mean=np.zeros(size), whitening=np.eye(size), threshold=threshold)
+    distance.save(run)
+    return distance

@@ -29,15 +29,17 @@ from asp_env.evaluation.closed_loop.scenario_table import write_scenario_table
 from asp_env.evaluation.ladder import BASELINE, ORACLE
 from asp_env.evaluation.report import check_report_possible, write_report
 from asp_env.evaluation.results import (
+    FALLBACK,
     HEADROOM,
     ORACLE_SHARE,
     SCORE,
     Row,
     difference_name,
+    fallback_sentences,
     write_manifest,
     write_metrics,
 )
-from asp_env.evaluation.selection import short_names
+from asp_env.evaluation.selection import short_names, with_fallback
 from asp_env.evaluation.statistics import is_resolved
 from asp_env.evaluation.verdicts import share_text
 from asp_env.files import atomic_file, atomic_folder
@@ -53,7 +55,7 @@ PLANNER = "contingency"
 FROZEN = "scenarios.json"
 """List of scenarios in the folder of the data, which is used by default."""
 
-ESTIMATES = ("score", "difference", "oracle_share", "headroom")
+ESTIMATES = ("score", "difference", "oracle_share", "headroom", "fallback")
 """Fields of a row that have an interval."""
 
 HASH_DIGITS = 12
@@ -84,6 +86,10 @@ class Benchmark:
     """Largest number of scenarios, at even spacing; the hash is then another."""
     rules: str = DEFAULT_RULES
     """Driving rules: nuplan, pdms, waymax, strict or graded."""
+    fallback: bool = False
+    """Guard every trained predictor: where a scene lies outside
+    of what it learned, its forecast is blended to constant
+    velocity. As naming it guarded:NAME:RUN."""
     jobs: int = 1
     """Number of processes that drive. The results do not depend on it."""
 
@@ -104,6 +110,10 @@ class Benchmark:
             f"{first.scenarios_hash[:HASH_DIGITS]}; rules {first.rules}, traffic {first.traffic}, "
             f"horizon {first.horizon_s:g} s, asp-env {first.version}"
         )
+        for row in rows:
+            if row.fallback is not None:
+                shares = {row.predictor: row.fallback.value}
+                console.print(*fallback_sentences(shares, "forecasts"))
         console.print(f"wrote {self.out}/benchmark.csv and report.html")
 
 
@@ -127,6 +137,8 @@ class BenchmarkRow:
     """Score less that of constant velocity with the same planner, paired by scenario."""
     oracle_share: Row | None
     headroom: Row | None
+    fallback: Row | None
+    """Share of the forecasts that a guard has blended to constant velocity."""
     n: int
     """Number of scenarios."""
     places: int
@@ -179,6 +191,11 @@ def benchmark(config: Benchmark) -> tuple[list[BenchmarkRow], list[ClosedLoopRes
         raise AspEnvError("no METHOD: expected at least one, such as constant-velocity")
     data = _data(config)
     parsed = {name: parse_method(name) for name in config.methods}
+    if config.fallback:
+        parsed = {
+            name: (planner, predictor and with_fallback([predictor])[0])
+            for name, (planner, predictor) in parsed.items()
+        }
     for planner, predictor in parsed.values():
         needs = load_planner(planner).uses_forecasts
         if needs != bool(predictor):
@@ -247,6 +264,7 @@ def _row(name: str, planner: str, predictor: str, result: ClosedLoopResult) -> B
         difference=mine.get(difference_name(SCORE, BASELINE)),
         oracle_share=mine.get(ORACLE_SHARE),
         headroom=mine.get(HEADROOM),
+        fallback=mine.get(FALLBACK),
         n=len(scenarios),
         places=len({scenarios.locations[i] for i in np.unique(scenarios.recording).tolist()}),
         rules=first.rules,

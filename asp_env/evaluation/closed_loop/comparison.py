@@ -22,6 +22,7 @@ from asp_env.data.scenarios.scenario import Scenario, ScenarioSet
 from asp_env.data.snippets import HISTORY_S
 from asp_env.data.source import Recordings
 from asp_env.evaluation.closed_loop.episodes import EpisodeSettings, drive_episodes
+from asp_env.evaluation.results import FALLBACK
 from asp_env.evaluation.selection import load_predictors
 from asp_env.metrics.driving.rules import Rules, find_rules
 from asp_env.metrics.driving.scores import driving_metrics
@@ -174,7 +175,7 @@ class Methods:
             )
         metrics = driving_metrics(driven.drives, self.settings.rules)
         return EpisodeScores(
-            metrics={**metrics, **driven.realism},
+            metrics={**metrics, **driven.realism, FALLBACK: driven.fallback},
             endings=tuple(Ending(kind) for kind in driven.endings.tolist()),
             rollouts=driven.rollouts,
         )

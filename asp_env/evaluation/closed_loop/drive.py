@@ -32,13 +32,21 @@ from asp_env.evaluation.closed_loop.summary import Comparison, MethodScores, com
 from asp_env.evaluation.hard import HARD_NOTE, is_hard, select_scenarios
 from asp_env.evaluation.ladder import BASELINE, missing_controls
 from asp_env.evaluation.report import check_report_possible, write_report
-from asp_env.evaluation.results import SCORE, Row, write_manifest, write_metrics
+from asp_env.evaluation.results import (
+    SCORE,
+    Row,
+    fallback_sentences,
+    fallback_shares,
+    write_manifest,
+    write_metrics,
+)
 from asp_env.evaluation.selection import (
     PartChoice,
     expand_runs,
     no_data_error,
     short_names,
     ticks_to_evaluate,
+    with_fallback,
 )
 from asp_env.evaluation.tables import driving_tables, headlines
 from asp_env.files import atomic_folder
@@ -88,6 +96,10 @@ class Drive:
     trained or selected on."""
     rules: str = DEFAULT_RULES
     """Driving rules that define the metrics: nuplan, pdms, waymax, strict or graded."""
+    fallback: bool = False
+    """Guard every trained predictor: where a scene lies outside
+    of what it learned, its forecast is blended to constant
+    velocity. As naming it guarded:NAME:RUN."""
     jobs: int = 1
     """Number of processes that drive. The results do not depend on it."""
 
@@ -115,6 +127,8 @@ class Drive:
         for table in driving_tables(result.rows, result.manifest["privileged"], shown):
             console.print(table)
         for sentence in headlines(result.rows, result.manifest["privileged"]):
+            console.print(sentence)
+        for sentence in fallback_sentences(result.manifest["fallback"], "forecasts"):
             console.print(sentence)
         console.print(f"wrote {self.out}/report.html")
 
@@ -145,6 +159,7 @@ def drive(config: Drive) -> ClosedLoopResult:
     """
     if config.jobs < 1:
         raise AspEnvError(f"--jobs {config.jobs}: expected at least 1 process")
+    config = _guarded(config) if config.fallback else config
     config = replace(config, traffic=config.traffic or world_class(config.data).traffic)
     runs = _runs_to_drive(config)
     methods = Methods(  # raises errors before anything is computed
@@ -170,8 +185,9 @@ def drive(config: Drive) -> ClosedLoopResult:
     labels = _labels(methods)
     rules, predictors = methods.settings.rules, methods.predictors
     worst = [chosen[number] for number in scores.worst]
+    rows = comparison_rows(_comparison(config, rules, by_method, chosen))
     return ClosedLoopResult(
-        rows=comparison_rows(_comparison(config, rules, by_method, chosen)),
+        rows=rows,
         methods=by_method,
         manifest={
             "data": config.data,
@@ -190,6 +206,7 @@ def drive(config: Drive) -> ClosedLoopResult:
             "part": part,
             **({"note": HARD_NOTE} if is_hard(config.scenarios) else {}),
             "asked for": {"scenarios": config.scenarios, "max_scenarios": config.max_scenarios},
+            "fallback": fallback_shares(rows),
             "scenarios": {scenario.name: {"seed": scenario.seed} for scenario in chosen},
             "endings": {
                 label: dict(Counter(kind.name for kind in each.endings))
@@ -202,6 +219,12 @@ def drive(config: Drive) -> ClosedLoopResult:
         scenarios=chosen,
         recordings=recordings,
     )
+
+
+def _guarded(config: Drive) -> Drive:
+    """The same with guarded predictors."""
+    reference = None if config.reference is None else with_fallback([config.reference])[0]
+    return replace(config, predictors=with_fallback(config.predictors), reference=reference)
 
 
 def _runs_to_drive(config: Drive) -> dict[str, tuple[str, ...]]:

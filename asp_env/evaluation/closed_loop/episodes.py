@@ -80,6 +80,9 @@ class DrivenEpisodes:
     drives: EpisodeRecord
     realism: Mapping[str, Masked]
     """Realism of the traffic (b,); missing where it was replayed."""
+    fallback: Masked
+    """Share of the forecasts (b,) that a guard has blended to constant velocity, over all targets
+    and ticks of an episode; missing for a predictor without a guard."""
     endings: Int[np.ndarray, " b"]
     """`Ending` of each episode."""
     rollouts: tuple[Rollout, ...]
@@ -138,6 +141,7 @@ def drive_episodes(
     return DrivenEpisodes(
         drives=drives,
         realism=traffic_realism(world, drives.active),
+        fallback=fallback_share([each.forecast for each in decisions], len(scenarios)),
         endings=endings,
         rollouts=tuple(
             _rollout(world, scenario, b, int(drives.active[b].sum()), flags[b], decisions)
@@ -276,6 +280,27 @@ def _measure(
         active=active,
         dt_s=world.dt_s,
     )
+
+
+def fallback_share(forecasts: Sequence[Forecast], num_episodes: int) -> Masked:
+    """Share of the forecasts of each episode that are blended to constant velocity.
+
+    Args:
+        forecasts: the forecasts at all ticks.
+        num_episodes: B.
+
+    Returns:
+        Shares (b,) of the targets that the predictor forecasts, over all ticks; missing for
+        episodes without any, and for a predictor without a guard.
+    """
+    targets, blended = np.zeros(num_episodes), np.zeros(num_episodes)
+    for forecast in forecasts:
+        if forecast.fallback is not None:
+            episode = forecast.targets[:, 0]
+            made = np.isfinite(forecast.fallback)
+            targets += np.bincount(episode[made], minlength=num_episodes)
+            blended += np.bincount(episode[forecast.fallback > 0], minlength=num_episodes)
+    return Masked(value=blended / np.maximum(targets, 1), valid=targets > 0)
 
 
 def traffic_realism(world: World, active: Bool[np.ndarray, "b t"]) -> dict[str, Masked]:

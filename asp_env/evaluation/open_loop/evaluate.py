@@ -33,7 +33,13 @@ from asp_env.evaluation.open_loop.scoring import (
 )
 from asp_env.evaluation.regret import RegretScores, load_candidate_planner, score_regrets
 from asp_env.evaluation.report import ForecastExamples, check_report_possible, write_report
-from asp_env.evaluation.results import Row, write_manifest, write_metrics
+from asp_env.evaluation.results import (
+    Row,
+    fallback_sentences,
+    fallback_shares,
+    write_manifest,
+    write_metrics,
+)
 from asp_env.evaluation.selection import (
     PartChoice,
     expand_runs,
@@ -41,6 +47,7 @@ from asp_env.evaluation.selection import (
     shared_metadata,
     snippets_within,
     ticks_to_evaluate,
+    with_fallback,
 )
 from asp_env.evaluation.statistics import Estimate
 from asp_env.evaluation.tables import open_loop_tables, regret_tables
@@ -95,6 +102,10 @@ class Evaluate:
     predictor at states of the logged ego; none for no regret."""
     max_states: int = 2000
     """Largest number of these states; chosen at even spacing."""
+    fallback: bool = False
+    """Guard every trained predictor: where a scene lies outside
+    of what it learned, its forecast is blended to constant
+    velocity. As naming it guarded:NAME:RUN."""
 
     def run(self) -> None:
         """Evaluates, writes the folder and prints the tables.
@@ -117,6 +128,8 @@ class Evaluate:
             *regret_tables(result.rows, privileged, planner=self.planner),
         ):
             console.print(table)
+        for sentence in fallback_sentences(result.manifest["fallback"], "targets"):
+            console.print(sentence)
         console.print(f"wrote {self.out}/report.html")
 
 
@@ -142,7 +155,8 @@ def evaluate(config: Evaluate) -> OpenLoopResult:
     recordings = open_data(config.data)
     horizon = ticks(config.horizon, config.dt)
     planner = None if config.planner in NO_PLANNER else load_candidate_planner(config.planner)
-    runs = expand_runs(config.predictors)
+    named = with_fallback(config.predictors) if config.fallback else config.predictors
+    runs = expand_runs(named)
     names = [run for members in runs.values() for run in members]
     loaded = load_predictors(names, horizon=horizon, dt_s=config.dt)
     allowed, part = ticks_to_evaluate(recordings, loaded, config.part, dt_s=config.dt)
@@ -166,15 +180,11 @@ def evaluate(config: Evaluate) -> OpenLoopResult:
         if planner is None
         else _regrets(config, planner, predictors, recordings, scenes, allowed)
     )
+    rows = make_rows(
+        scores, predictors, runs, data=config.data, horizon_s=config.horizon, regrets=regrets
+    )
     return OpenLoopResult(
-        rows=make_rows(
-            scores,
-            predictors,
-            runs,
-            data=config.data,
-            horizon_s=config.horizon,
-            regrets=regrets,
-        ),
+        rows=rows,
         manifest={
             "data": config.data,
             "data_hash": recordings.data_hash(),
@@ -190,6 +200,7 @@ def evaluate(config: Evaluate) -> OpenLoopResult:
             "moving snippets": int(moving.sum()),
             "planner": config.planner if regrets is not None else "none",
             "states": 0 if regrets is None else len(regrets.recording),
+            "fallback": fallback_shares(rows),
             "best_by": config.best_by,
             "best-of-3": f"of the three most probable modes, {MODE_RULES[config.best_by]}",
             "intervals": "95 %, bootstrap over recordings and, with several, over training runs",

@@ -25,6 +25,7 @@ from asp_env.data.snippets import (
 )
 from asp_env.errors import AspEnvError
 from asp_env.evaluation.open_loop.ground_truth import GroundTruth, gather_ground_truth
+from asp_env.evaluation.results import FALLBACK
 from asp_env.metrics.forecast.calibration import brier, mixture_nll, nearest_modes
 from asp_env.metrics.forecast.errors import (
     SELECTIONS,
@@ -139,6 +140,7 @@ def score_forecasts(
             metrics = forecast_metrics(sample, truth, best_by, on_road, dt_s=index.dt_s)
             table.put(name, rows, metrics)
             table.put(name, rows, _inconsistency(history, name, rows, sample))
+            table.put(name, rows, _fallback(forecast))
             if sample.log_probs.shape[1] > 1:
                 _put_modes(modes, name, count, rows, sample, truth)
     return ForecastScores(
@@ -281,6 +283,14 @@ def _inconsistency(
     earlier, paired = history.update(name, rows, positions)
     value = inconsistency(earlier, positions, paired, apart=history.apart_ticks)
     return {("most-probable", "inconsistency"): value}
+
+
+def _fallback(forecast: Forecast) -> dict[tuple[str, str], Masked]:
+    """Whether each target's forecast is blended to constant velocity; nothing without a guard."""
+    if forecast.fallback is None:
+        return {}
+    blended = (forecast.fallback > 0).astype(np.float32)
+    return {(ALL_MODES, FALLBACK): Masked(value=blended, valid=np.isfinite(forecast.fallback))}
 
 
 def _put_modes(

@@ -46,11 +46,12 @@ def test_other_seed_gives_other_weights(data: str, finished: Path, tmp_path: Pat
 
 
 def test_run_folder_holds_no_pickles(finished: Path) -> None:
-    """It holds the configuration, weights, card and logs only."""
+    """It holds the configuration, weights, statistics of features, card and logs only."""
     files = {str(path.relative_to(finished)) for path in finished.rglob("*") if path.is_file()}
     assert "logs/from-epoch-00/metrics.csv" in files
     logs = {name for name in files if name.startswith("logs/")}
-    assert files - logs == {"config.json", "weights.safetensors", "README.md"}
+    written = {"config.json", "weights.safetensors", "features.safetensors", "README.md"}
+    assert files - logs == written
     assert all("events" in n or n.endswith(("metrics.csv", "hparams.yaml")) for n in logs)
 
 
