@@ -28,22 +28,50 @@ from predictors.inference.checkpoint import (
     weights_hash,
     write_json,
 )
+from predictors.inference.fit_features import add_feature_distance
 from predictors.inference.pretrained import PRETRAINED
 from predictors.training.command import Train
 
 MODULE = "predictors.experiments.pretrained"
 
-SITES = ("intersection", "roundabout")
 TRAINING = {
-    "normal": {"recordings": 24, "locations": 24, "minutes": 2.5, "seed": 7301},
-    "dense": {"recordings": 12, "locations": 12, "minutes": 2.5, "seed": 7303},
+    f"{traffic}-{site}": {"site": site, "traffic": traffic, "minutes": 2.5, **options}
+    for traffic, options in {
+        "normal": {"recordings": 24, "locations": 24, "seed": 7301},
+        "dense": {"recordings": 12, "locations": 12, "seed": 7303},
+    }.items()
+    for site in ("intersection", "roundabout")
 }
+"""Options of `asp-env synthesize` by name: many locations of SUMO with one short recording each.
+Dense traffic has about twice as many snippets in a minute."""
+
 VALIDATION = {
-    "normal": {"recordings": 6, "locations": 6, "minutes": 2.5, "seed": 7302},
-    "dense": {"recordings": 4, "locations": 4, "minutes": 2.5, "seed": 7304},
+    "varied-intersection": {"site": "intersection", "traffic": "varied"},
+    "varied-roundabout": {"site": "roundabout", "traffic": "varied"},
+    "highway-intersection": {"site": "highway:intersection"},
+    "highway-roundabout": {"site": "highway:roundabout"},
 }
-"""Options of `asp-env synthesize` for each site, by `--traffic`: many locations with one short
-recording each. Dense traffic has about twice as many snippets in a minute."""
+"""Other traffic than that of the training, on which the epoch is selected and probabilities are
+calibrated: of another generator, or of sites, maps and trackers from wider ranges."""
+
+VALIDATION_OPTIONS = {
+    "varied": {"recordings": 10, "locations": 10, "minutes": 2.0, "seed": 9102},
+    "highway": {"recordings": 4, "minutes": 3.0, "seed": 8812},
+}
+
+FAMILIAR = {
+    f"normal-{site}": {
+        "site": site,
+        "traffic": "normal",
+        "recordings": 6,
+        "locations": 6,
+        "minutes": 2.5,
+        "seed": 7302,
+    }
+    for site in ("intersection", "roundabout")
+}
+"""Traffic like that of the training at other locations: the guard of the forecasts is fitted on it,
+and the card has the errors on it."""
 
 SOURCE = "synthetic traffic"
 """Name of the training data in tables, instead of four folders."""
@@ -70,8 +98,12 @@ class Pretrain:
         Raises:
             AspEnvError: A package is missing, or the data are bad.
         """
-        training = [self._traffic("train", **options) for options in _data(TRAINING)]
-        validation = [self._traffic("validation", **options) for options in _data(VALIDATION)]
+        training = [self._traffic("train", name, options) for name, options in TRAINING.items()]
+        familiar = [self._traffic("familiar", name, options) for name, options in FAMILIAR.items()]
+        validation = [
+            self._traffic("validation", name, VALIDATION_OPTIONS[name.partition("-")[0]] | options)
+            for name, options in VALIDATION.items()
+        ]
         for name in self.predictors:
             run = self.out / "runs" / name
             if not (run / CONFIG).exists():
@@ -81,25 +113,28 @@ class Pretrain:
                     validation=tuple(validation),
                     out=run,
                     view="vectors",
-                    recipe="ours",
+                    recipe="robust",
                     epochs=EPOCHS,
                 ).run()
             shipped = self.out / PRETRAINED / name
             if not shipped.exists():
                 ship(run, shipped)
-            self._complete_card(name, shipped, validation)
+                add_feature_distance(shipped, familiar)
+            self._complete_card(name, shipped, {"familiar": familiar, "other traffic": validation})
 
-    def _traffic(self, part: str, **options: Any) -> str:
-        folder = self.out / "traffic" / f"{part}-{options['site']}-{options['traffic']}"
+    def _traffic(self, part: str, name: str, options: Mapping[str, Any]) -> str:
+        folder = self.out / "traffic" / f"{part}-{name}"
         if not folder.exists():
             registry.find("commands", "synthesize")(out=folder, noise=True, **options).run()
         return str(folder)
 
-    def _complete_card(self, name: str, shipped: Path, validation: Sequence[str]) -> None:
+    def _complete_card(
+        self, name: str, shipped: Path, generated: Mapping[str, Sequence[str]]
+    ) -> None:
         """Adds the command and the errors to the model card."""
         rows = [
             _errors(name, shipped, data, note)
-            for note, names in (("validation", validation), ("held out", self.held_out))
+            for note, names in {**generated, "held out": self.held_out}.items()
             for data in names
         ]
         card = (shipped / CARD).read_text().partition(_HEADING)[0].rstrip()
@@ -109,14 +144,6 @@ class Pretrain:
 
 _HEADING = "## Pretrained weights\n"
 _TERMS = "license: other\nlicense_name: terms-of-the-training-data\n"
-
-
-def _data(by_traffic: Mapping[str, Mapping[str, Any]]) -> list[dict[str, Any]]:
-    return [
-        {**options, "site": site, "traffic": traffic}
-        for site in SITES
-        for traffic, options in by_traffic.items()
-    ]
 
 
 def ship(run: Path, shipped: Path) -> None:

@@ -186,16 +186,13 @@ def fine_tune_on(
         own = len(data.training.snippets)
         training, mixed = _with_mix(data.training, mix, config)
         network = copy.deepcopy(before.network)
-        settings: dict[str, Any] = {
-            "view": before.view,
-            "later_ticks": network.later_ticks,
-            "config": config,
-        }
+        settings: dict[str, Any] = {"view": before.view, "later_ticks": network.later_ticks}
+        as_recorded = dataclasses.replace(config, augmentation=None)
         course = _Course(
             network,
             config,
-            training.batches(size=config.batch_size, **settings),
-            data.validation.batches(size=VALIDATION_BATCH, **settings),
+            training.batches(size=config.batch_size, config=config, **settings),
+            data.validation.batches(size=VALIDATION_BATCH, config=as_recorded, **settings),
             own=own,
         )
         with torch_threads(config.threads):
