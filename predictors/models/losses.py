@@ -33,9 +33,9 @@ RULES: Mapping[Assignment, ModeRule] = MappingProxyType(
 HUBER_M = 1.0
 """Cut-off h of the Huber loss (equation 9 of Janjoš et al. 2021)."""
 
-STANDS_M = 0.5
+STANDS_M = 1.0
 """A target that stays within this distance stands. Chosen by hand: above the errors of trackers at
-standstill, below the motion of a vehicle that starts."""
+standstill and the way of a vehicle that creeps, below the motion of a vehicle that starts."""
 
 ANNEAL_FROM_M = 8.0
 """Temperature at the start of annealing. Chosen by hand: far modes still get a gradient."""
@@ -208,7 +208,7 @@ def classification_loss(
 
 
 def stands(label: Float[Tensor, "n t _"]) -> Bool[Tensor, " n"]:
-    """Whether a target stands: it is never more than 0.5 m from where it is now.
+    """Whether a target stands: it is never more than 1 m from where it is now.
 
     Args:
         label: Recorded positions, or states that begin with them, in the targets' frames.

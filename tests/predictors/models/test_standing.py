@@ -56,10 +56,10 @@ def test_standing_is_a_further_mode(predictor: str, sample: tuple[Batch, Labels]
 
 
 def test_stands_by_hand() -> None:
-    """Half a metre away at any tick is the limit, in any direction."""
+    """One metre away at any tick is the limit, in any direction."""
     label = torch.zeros(3, 15, 4)
     label[1, 4, 1] = -STANDS_M
-    label[2, 4, :2] = torch.tensor([0.4, 0.4])
+    label[2, 4, :2] = torch.tensor([0.8, 0.8])
     assert stands(label).tolist() == [True, True, False]
     logit = torch.tensor([0.0, 0.0, math.log(3)])
     expected = (2 * math.log(2) + math.log(4)) / 3
