@@ -344,8 +344,10 @@ def _robust(config: TrainingConfig) -> TrainingConfig:
     return dataclasses.replace(
         config,
         preset="robust",
-        network=dataclasses.replace(config.network, standing=True, shrunk=True),
+        network=dataclasses.replace(config.network, annealed=True, standing=True, shrunk=True),
         standing_share=0.5,
+        snippets_per_epoch=6_000,
+        learning_rate=min(config.learning_rate, 2e-3),
         augmentation=Augmentation(),
     )
 
