@@ -117,6 +117,8 @@ class World(ABC):
         self._maps: tuple[RoadMap, ...] = ()
         self._map_index = np.zeros(num_episodes, dtype=np.int64)
         self._rows = np.arange(num_episodes)
+        self._euler: Bool[np.ndarray, "b a"] | None = None
+        """Mask of agents that move by Euler's method in the step that is under way."""
 
     def __len__(self) -> int:
         """The number of episodes."""
@@ -177,6 +179,7 @@ class World(ABC):
         actions: Float[np.ndarray, "b a 2"],
         controlled: Bool[np.ndarray, "b a"],
         leaving: Bool[np.ndarray, "b a"] | None = None,
+        euler: Bool[np.ndarray, "b a"] | None = None,
     ) -> None:
         """Advances all episodes by one tick; an episode at the end of its scenario stays unchanged.
 
@@ -186,8 +189,10 @@ class World(ABC):
             controlled: mask of the agents that execute their action. The others are moved by the
                 world. An agent that is controlled before it appears stays absent.
             leaving: mask of the agents that leave the episode, none by default.
+            euler: mask of the controlled agents whose action is integrated by Euler's method, as
+                that of `Control`; Heun's method by default.
         """
-        episodes = self.episodes
+        episodes, self._euler = self.episodes, euler
         rows = np.flatnonzero(episodes.elapsed < episodes.length)
         now = self.now[rows]
         if leaving is not None:
@@ -213,7 +218,7 @@ class World(ABC):
     ) -> None:
         """Writes `states` and `valid` of `episodes` at tick `now + 1`.
 
-        Agents that have `departed` must not be valid.
+        Agents that have `departed` must not be valid. `_drive` moves the acting agents.
 
         Args:
             rows: indices of the R episodes that are not over.
@@ -222,6 +227,32 @@ class World(ABC):
             controlled: mask of agents that the world must not move.
             acting: mask of controlled agents that are present: they execute their action.
         """
+
+    def _drive(
+        self,
+        states: Float[np.ndarray, "n 4"],
+        actions: Float[np.ndarray, "n 2"],
+        lengths: Float[np.ndarray, " n"],
+        after_s: float,
+        rows: Int[np.ndarray, " r"],
+        acting: Bool[np.ndarray, "r a"],
+    ) -> Float[np.ndarray, "n 4"]:
+        """The states of the N acting agents some time after the present tick.
+
+        Args:
+            states: their present states, as `gather_controlled` returns them.
+            actions: their actions.
+            lengths: their lengths, m.
+            after_s: the time, at most one tick.
+            rows: as in `_move`.
+            acting: as in `_move`.
+        """
+        after = forward(states, actions, lengths, after_s)
+        if self._euler is not None and (euler := self._euler[rows][acting]).any():
+            after[euler] = forward(
+                states[euler], actions[euler], lengths[euler], after_s, integrator="euler"
+            )
+        return after
 
     def _update_contacts(self) -> None:
         episodes, now = self.episodes, self.now
@@ -352,7 +383,7 @@ class ReplayWorld(World):
         acting: Bool[np.ndarray, "r a"],
     ) -> None:
         states, held, lengths = gather_controlled(self.episodes, rows, now, actions, acting)
-        next_states = forward(states, held, lengths, self.dt_s)
+        next_states = self._drive(states, held, lengths, self.dt_s, rows, acting)
         write_tick(self.episodes, rows, now, controlled, acting, next_states)
 
 
