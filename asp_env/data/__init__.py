@@ -2,6 +2,7 @@
 
 from asp_env.data.causal import causal_histories
 from asp_env.data.classes import AgentClass
+from asp_env.data.histories import histories
 from asp_env.data.predictor import (
     Forecast,
     InteractivePredictor,
@@ -47,6 +48,7 @@ __all__ = [
     "find_scenarios",
     "gather_future",
     "gather_scene",
+    "histories",
     "index_snippets",
     "load_predictor",
     "make_forecast",

@@ -97,6 +97,15 @@ class Recording:
     background: Background | None = None
     repairs: tuple[str, ...] = ()
     """One line for each fault of the files that the reader repaired."""
+    start_hour: float | None = None
+    """Time of day of the first frame, hours after midnight; None where the files give none."""
+    weekday: str | None = None
+    """Day of the recording as the files name it; None where they do not."""
+    accelerations: Float[np.ndarray, " rows"] | None = None
+    """Recorded accelerations along the direction of motion, m/s², signed as the speed: its rate of
+    change according to the files. None where the files have none."""
+    shows_accelerations: bool = False
+    """Whether scenes show `accelerations` in past actions instead of changes of speed."""
 
     def __post_init__(self) -> None:
         """Checks that the columns of the track table have matching lengths.

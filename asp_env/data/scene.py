@@ -25,7 +25,8 @@ class Scene:
     states: Float[np.ndarray, "b a ticks 4"]
     """[x m, y m, heading rad, speed m/s] at n past ticks and, last, now."""
     actions: Float[np.ndarray, "b a ticks-1 2"]
-    """[acceleration m/s², steering rad] between consecutive states, inferred from them."""
+    """[acceleration m/s², steering rad] between consecutive states, inferred from them; with the
+    accelerations of the files for `histories(…, "accelerations")`."""
     valid: Bool[np.ndarray, "b a ticks"]
     """Whether the agent is present at each tick."""
     sizes: Float[np.ndarray, "b a 2"]

@@ -165,11 +165,48 @@ def gather_window(
     return states, valid
 
 
+def gather_accelerations(
+    recording: Recording,
+    tracks: Int[np.ndarray, " a"],
+    *,
+    first_tick: int,
+    num_ticks: int,
+    stride: int,
+) -> Float[np.ndarray, "a k"]:
+    """Recorded accelerations of some tracks between consecutive ticks, m/s².
+
+    Each is the mean over the frames from one tick to the next, both of which count half, so that it
+    is the change of speed that the files state for this time.
+
+    Args:
+        recording: the recording, whose `accelerations` are known.
+        tracks: indices of the tracks.
+        first_tick: the first of the ticks.
+        num_ticks: number of ticks, k + 1.
+        stride: frames per tick.
+
+    Returns:
+        The accelerations, zero where the track is absent at either tick.
+    """
+    assert recording.accelerations is not None
+    frames = first_tick * stride + np.arange((num_ticks - 1) * stride + 1)
+    first = recording.first_frames[tracks].astype(np.int64)[:, None]
+    present = (frames >= first) & (frames <= recording.last_frames[tracks][:, None])
+    rows = np.where(present, recording.starts[tracks][:, None] + frames - first, 0)
+    values = recording.accelerations[rows]
+    halves = 0.5 * (values[:, :-1] + values[:, 1:])
+    means = halves.reshape(len(tracks), num_ticks - 1, stride).mean(axis=-1)
+    both = present[:, :-1:stride] & present[:, stride::stride]
+    return np.where(both, means, 0).astype(np.float32)
+
+
 def gather_scene(recordings: Sequence[Recording], index: SnippetIndex) -> Scene:
     """The scene of some snippets: one situation per distinct tick of a recording.
 
     Slot 0 of a situation is its first target in the order of `index`; the other agents follow by
     first frame, then id. The ego's route is empty, since here its path is what is to be forecast.
+    Past actions are inferred from the states; their accelerations are the recorded ones where
+    `Recording.shows_accelerations`.
 
     Returns:
         A scene whose targets are in the order of `index`.
@@ -200,10 +237,21 @@ def gather_scene(recordings: Sequence[Recording], index: SnippetIndex) -> Scene:
         ids[number, :count] = recording.track_ids[tracks]
         rows = np.flatnonzero(situation == number)
         slots[rows] = (index.track[rows][:, None] == tracks[None]).argmax(axis=1)
+    actions = infer_actions(states, valid, sizes[..., 0], index.dt_s)
+    for number, (row, tracks) in enumerate(zip(first_rows, agents, strict=True)):
+        recording = recordings[int(index.recording[row])]
+        if recording.shows_accelerations:
+            actions[number, : len(tracks), :, 0] = gather_accelerations(
+                recording,
+                tracks,
+                first_tick=int(index.tick[row]) - index.history,
+                num_ticks=index.history + 1,
+                stride=frames_per_tick(recording.frame_rate_hz, index.dt_s),
+            )
     maps, map_index = _maps([recordings[int(index.recording[row])] for row in first_rows])
     return Scene(
         states=states,
-        actions=infer_actions(states, valid, sizes[..., 0], index.dt_s),
+        actions=actions,
         valid=valid,
         sizes=sizes,
         classes=classes,

@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any, Literal
 
 from asp_env.data import cache
-from asp_env.data.causal import causal_histories
+from asp_env.data.histories import History, histories
 from asp_env.data.predictor import load_predictor
 from asp_env.data.recording import DEFAULT_DT_S, ticks
 from asp_env.data.source import open_data
@@ -36,7 +36,7 @@ class EvaluationJob:
     part: Literal["test", "all"]
     """Part of the data."""
     horizon_s: float
-    history: Literal["recorded", "causal"] = "recorded"
+    history: History = "recorded"
     """Histories that a predictor without training observes; trained ones observe what they were
     trained on."""
     per_recording: int | None = None
@@ -90,8 +90,8 @@ class EvaluationJob:
             part=self.part,
             per_recording=self.per_recording,
         )
-        causal = own.metadata.get("history", self.history) == "causal"
-        scenes = causal_histories(recordings) if causal else recordings
+        history: Any = own.metadata.get("history", self.history)
+        scenes = histories(recordings, history)
         errors = compute_errors(
             predictors, index, scenes=scenes, recorded=recordings, stamp=self.stamp
         )

@@ -30,6 +30,7 @@ HISTORIES = MappingProxyType(
         "recorded": "as in the files, which may be smoothed with later frames that a vehicle does "
         "not have",
         "causal": "filtered forward from noisy positions, without later frames",
+        "accelerations": "as recorded, with the recorded accelerations in past actions",
     }
 )
 """What the option `history` of a training means."""

@@ -8,6 +8,8 @@ from typing import Annotated, Any, Literal
 import tyro
 from rich.console import Console
 
+from asp_env.data.histories import History
+from asp_env.data.split import Split
 from asp_env.errors import MissingExtraError
 
 
@@ -40,12 +42,15 @@ class Train:
     file of ResNet18 weights."""
     validation: Annotated[tuple[str, ...], tyro.conf.arg(metavar="DATA …")] = ()
     """Separate validation data. All of DATA is then used for training."""
-    history: Literal["recorded", "causal"] = "recorded"
+    history: History = "recorded"
     """Histories that the network observes: as recorded
-    (smoothed with later frames), or filtered again without
-    later frames."""
-    split: Literal["recording", "blocks"] = "recording"
-    """What is held out: whole recordings, or blocks of time within each."""
+    (smoothed with later frames); filtered again without later
+    frames (causal); or as recorded, with the accelerations of
+    the files in past actions (accelerations)."""
+    split: Split = "recording"
+    """What is held out: whole recordings, whole recordings of
+    other times of day (daytime), or blocks of time within each
+    (blocks)."""
     epochs: int | None = None
     """Number of epochs instead of the recipe's; with two stages, the number for each."""
     seed: int = 0

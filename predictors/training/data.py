@@ -8,7 +8,7 @@ from typing import final
 import numpy as np
 from jaxtyping import Bool, Int, Shaped
 
-from asp_env.data.causal import causal_histories
+from asp_env.data.histories import histories
 from asp_env.data.recording import Recording
 from asp_env.data.snippets import SnippetIndex, gather_future, gather_present, index_snippets
 from asp_env.data.source import Recordings, join_data, open_data
@@ -143,16 +143,13 @@ class DatasetSplit:
             later_ticks: Ticks ahead at which labels hold future inputs.
             config: The configuration; its `history` decides what the inputs show.
         """
-        histories: Sequence[Recording] = self.recordings
-        if config.history == "causal":
-            histories = causal_histories(self.recordings)
         return Batches(
             self.recordings,
             self.snippets,
             view=view,
             batch_size=size,
             later_ticks=later_ticks,
-            histories=histories,
+            histories=histories(self.recordings, config.history),
         )
 
 

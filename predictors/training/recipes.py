@@ -11,6 +11,7 @@ from types import MappingProxyType
 from typing import Literal
 
 from asp_env.data.recording import DEFAULT_DT_S
+from asp_env.data.histories import History
 from asp_env.data.split import Split
 from asp_env.errors import AspEnvError, unknown_name
 from predictors.models.dkm import DKMConfig
@@ -46,9 +47,9 @@ class TrainingConfig:
     split: Split = "recording"
     validation: tuple[str, ...] = ()
     """Separate validation data; all of DATA is trained on if there are any."""
-    history: Literal["recorded", "causal"] = "recorded"
+    history: History = "recorded"
     """Whether inputs show the histories as recorded, smoothed with later frames, or filtered
-    forward."""
+    forward, or with recorded accelerations."""
     seed: int = 0
     max_snippets: int | None = None
     """Largest number of training snippets, chosen at random; None for all."""

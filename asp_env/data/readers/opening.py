@@ -121,6 +121,8 @@ def _recording(files: RecordingFiles, meta: Meta, road_map: RoadMap) -> Recordin
         road_map=road_map,
         background=background,
         repairs=tuple(facts["repairs"]),
+        start_hour=meta.start_hour if isinstance(meta, RecordingMeta) else None,
+        weekday=meta.weekday if isinstance(meta, RecordingMeta) else None,
         **arrays,
     )
 
@@ -145,7 +147,10 @@ def _track_entry(files: RecordingFiles, meta: Meta) -> CacheEntry:
         "metres_per_pixel": scale,
         "repairs": repairs,
     }
-    return facts, {name: getattr(table, name) for name in _TRACK_COLUMNS}
+    arrays = {name: getattr(table, name) for name in _TRACK_COLUMNS}
+    if table.accelerations is not None:
+        arrays["accelerations"] = table.accelerations
+    return facts, arrays
 
 
 def _scale(

@@ -10,7 +10,7 @@ import tyro
 from jaxtyping import Bool, Int
 from rich.console import Console
 
-from asp_env.data.causal import causal_histories
+from asp_env.data.histories import History, histories
 from asp_env.data.predictor import Predictor
 from asp_env.data.recording import DEFAULT_DT_S, ticks
 from asp_env.data.scenarios.scenario import find_scenarios
@@ -83,10 +83,12 @@ class Evaluate:
     part: PartChoice = "auto"
     """Part of DATA; auto is all of it that no predictor was
     trained or selected on."""
-    history: Literal["recorded", "causal"] = "recorded"
+    history: History = "recorded"
     """Histories that predictors observe: as recorded (smoothed
-    with later frames), or filtered again without later frames.
-    The ground truth is always as recorded."""
+    with later frames); filtered again without later frames
+    (causal); or as recorded, with the accelerations of the
+    files in past actions (accelerations). The ground truth is
+    always as recorded."""
     best_by: ModeRule = "fde"
     """How the best of 3 modes is chosen: lowest final error,
     lowest mean error, or the rule of the paper."""
@@ -154,9 +156,7 @@ def evaluate(config: Evaluate) -> OpenLoopResult:
     )
     index = snippets_within(index, allowed)
     predictors = dict(zip(names, loaded, strict=True))
-    scenes: Sequence[Any] = recordings
-    if config.history == "causal":
-        scenes = causal_histories(recordings)
+    scenes = histories(recordings, config.history)
     scores = score_forecasts(
         predictors, index, scenes=scenes, recorded=recordings, best_by=config.best_by
     )
