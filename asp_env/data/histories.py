@@ -9,8 +9,9 @@ from asp_env.data.recording import Recording
 from asp_env.errors import DataError
 
 History = Literal["recorded", "causal", "accelerations"]
-"""What scenes show: states as recorded, and past actions inferred from them; states filtered without
-later frames; or states as recorded, and past actions with the accelerations of the files."""
+"""What scenes show: states as recorded, and past actions inferred from them; states filtered
+without later frames; or states as recorded, and past actions with the accelerations of the files.
+"""
 
 
 class AccelerationHistories(Sequence[Any]):  # not of Recording: checking its items would open them

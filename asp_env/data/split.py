@@ -36,8 +36,8 @@ MIN_RECORDINGS = 3
 """A location with fewer recordings is used for training: each part needs one."""
 
 POOLED_BELOW = 10
-"""Locations with fewer recordings are split together. Ten is the smallest number of equal recordings
-that can be split 8:1:1; with three, each part would get a third."""
+"""Locations with fewer recordings are split together. Ten is the smallest number of equal
+recordings that can be split 8:1:1; with three, each part would get a third."""
 
 _NUM_ORDERS = 1_000
 

@@ -14,6 +14,10 @@ Values are 0 and 255.
 | `agents_0` … `agents_8` | the boxes of all other agents at the states 0, 2, 4, 6, 8, 9, 11, 13 \
 and 15 of the last 16: oldest first, 15 is the present |
 
+The nine snapshots are 15 / 8 = 1.875 ticks apart (0.375 s at ticks of 0.2 s), "at regular
+time-intervals" as in the paper, rounded to whole ticks, halves to even. The steps between them are
+therefore 2, 2, 2, 2, 1, 2, 2 and 2 ticks: 7.5 becomes 8, and 9.375 becomes 9.
+
 The ego has channels of its own and is not among the agents. Agents of every class are drawn with
 their footprint. States that are not valid are not drawn; a target that is not valid now has an
 empty raster. Lines are at least 1.5 pixels wide and boxes at least one pixel, so that both remain
@@ -38,7 +42,8 @@ from asp_env.views.raster import Viewport, place_targets, raster_memory
 from asp_env.views.view import RenderInput
 
 SNAPSHOT_TICKS = (0, 2, 4, 6, 8, 9, 11, 13, 15)
-"""Ticks of the history at which the other agents are drawn, as in the paper; 15 is the present."""
+"""Ticks of the history at which the other agents are drawn; 15 is the present. Nine regular
+intervals, rounded to whole ticks; the paper gives no numbers."""
 
 TRAIL_WIDTH_M = 0.4
 """Chosen by hand: two pixels at full resolution."""

@@ -41,6 +41,9 @@ from predictors.experiments.results import (
 PAPER_DATA = ("inD", "rounD")
 PAPER_HORIZONS_S = (3.0, 6.0)
 CAVEAT = "other data, not comparable in size"
+PER_COORDINATE = "MAE and MSE are means over time and both coordinates, FDE is a distance"
+"""Meaning of the errors. The paper's footnotes call MSE a mean L2 distance; its numbers are of
+squares."""
 
 
 class PaperErrors(NamedTuple):
@@ -139,7 +142,7 @@ def main_table(
     table.caption = (
         f"paper: Janjoš et al. 2021 on {' and '.join(PAPER_DATA)}, mode not stated;\n{CAVEAT};\n"
         f"its SSP-ASP chains segments for 6 s by label matching, as {ORACLE} {MARK} does;\n"
-        f"{MARK} uses the recorded future"
+        f"{MARK} uses the recorded future; {PER_COORDINATE}"
     )
     _add_columns(table, sites, columns)
     lines = _lines(findings, columns, lambda key: not key.variant)

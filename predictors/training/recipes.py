@@ -10,8 +10,8 @@ from dataclasses import dataclass
 from types import MappingProxyType
 from typing import Literal
 
-from asp_env.data.recording import DEFAULT_DT_S
 from asp_env.data.histories import History
+from asp_env.data.recording import DEFAULT_DT_S
 from asp_env.data.split import Split
 from asp_env.errors import AspEnvError, unknown_name
 from predictors.models.dkm import DKMConfig

@@ -111,7 +111,7 @@ def test_split_by_recording() -> None:
 def test_split_by_time_of_day() -> None:
     """Of ten hours of the clock one is unseen; without a start time there is an error."""
     recordings = MadeUp([3_000] * 20)
-    with pytest.raises(AspEnvError, match="no start time.*use --split recording"):
+    with pytest.raises(AspEnvError, match=r"no start time.*use --split recording"):
         snippet_parts(recordings, all_snippets(recordings), "daytime")
     recordings.made = [
         dataclasses.replace(recording, start_hour=8.0 + number // 2)

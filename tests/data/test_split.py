@@ -83,7 +83,7 @@ def test_pooled_locations_keep_training_recordings(counts: list[int], places: in
 
 
 def test_times_of_day() -> None:
-    """Ten hours of the clock with two equal recordings each: one hour each for testing and so on."""
+    """Ten hours of the clock with two equal recordings each, of which one is the test."""
     hours = [8 + number % 10 + number / 40 for number in range(20)]
     parts = split_by_daytime(np.full(20, 5), hours)
     assert sorted(parts) == ["test"] * 2 + ["train"] * 16 + ["validation"] * 2

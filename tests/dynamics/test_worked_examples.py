@@ -108,7 +108,6 @@ def test_a_vehicle_that_drives_backwards() -> None:
     assert states[:, 0] == pytest.approx([-0.2, -0.4, -0.56, -0.64, -0.64, -0.62], abs=1e-12)
 
 
-
 def test_inverse_has_the_time_step_that_the_paper_lacks() -> None:
     """At 8 m/s and 0.1 rad the paper's formula gives 0.020 rad instead of 0.100 rad."""
     start = np.array([0.0, 0.0, 0.0, 8.0])

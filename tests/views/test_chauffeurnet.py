@@ -114,6 +114,13 @@ def test_snapshots_are_those_of_the_paper() -> None:
     assert SNAPSHOT_TICKS == (0, 2, 4, 6, 8, 9, 11, 13, 15)
 
 
+def test_snapshots_are_regular_intervals_rounded_to_ticks() -> None:
+    """Nine snapshots of 3 s are 1.875 ticks apart; each is at most half a tick off, 7.5 at 8."""
+    regular = np.arange(9) * 15 / 8
+    assert np.round(regular).tolist() == list(SNAPSHOT_TICKS)  # halves to even
+    assert np.abs(regular - SNAPSHOT_TICKS).max() == 0.5
+
+
 def test_of_longer_histories_the_last_15_ticks_are_drawn() -> None:
     states = traffic(0)
     longer = np.concatenate([states[:, :, :5] + 1.0, states], axis=2)

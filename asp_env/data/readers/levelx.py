@@ -281,7 +281,8 @@ def read_levelx(files: LevelxFiles) -> TrackTable:
     the vehicle moves backwards. The heading of a vulnerable road user is its direction of motion;
     below 0.3 m/s the previous heading is held, and before the first motion it is that of the file.
     Accelerations are those of the file along the velocity, or along the heading below 0.3 m/s or
-    without the columns `xAcceleration` and `yAcceleration`. A track with a gap in its frames is split there, and the later part gets a new id.
+    without the columns `xAcceleration` and `yAcceleration`. A track with a gap in its frames is
+    split there, and the later part gets a new id.
 
     Raises:
         DataError: a file is damaged, or the two tables list different tracks.

@@ -37,8 +37,9 @@ INTEGRATORS: tuple[Integrator, Integrator] = ("heun", "euler")
 """Methods by which the actions of forecasts may lead to their states."""
 
 SAME_M = 0.01
-"""Forecast states and the rollout of their actions are the same up to this distance. Chosen by hand:
-above the rounding of networks, below the difference of both methods in one tick at 0.5 m/s²."""
+"""Forecast states and the rollout of their actions are the same up to this distance. Chosen by
+hand: above the rounding of networks, below the difference of both methods after a second at 0.5
+m/s²."""
 
 NO_FORECAST = -1
 """Tick of the latest forecast of an agent without a forecast."""

@@ -127,6 +127,24 @@ def test_states_follow_from_actions_by_hand(sample: tuple[Batch, Labels]) -> Non
         assert not states[..., 1].any()
 
 
+def test_a_reversing_target_is_forecast_to_reverse(sample: tuple[Batch, Labels]) -> None:
+    """From -2 m/s without acceleration: -0.4 m every tick. Braking by 1 m/s² ends after 10 ticks.
+
+    A target at 1 m/s that brakes by 2 m/s² stands after 3 ticks and never reverses.
+    """
+    motion = torch.tensor([[-2.0], [-2.0], [1.0], [1.0]]) * torch.tensor([1.0, 0.0, 0.0])
+    batch = sample[0]._replace(motion=motion)
+    actions = torch.zeros(4, 3, 15, 2)
+    actions[1, :, :10, 0], actions[2, ..., 0] = 1.0, -2.0
+    for integrator in ("heun", "euler"):
+        named: Any = integrator
+        states = rollout_from_now(actions, batch, 0.2, named)
+        np.testing.assert_allclose(states[0, 0, :, 0], -0.4 * np.arange(1, 16), atol=1e-5)
+        np.testing.assert_allclose(states[1, 0, 9:, 3], 0.0, atol=1e-5)
+        assert not states[2, :, 2:, 3].any()
+        assert (states[2, :, :, 0].diff() >= 0).all()
+
+
 def test_motion_is_speed_acceleration_and_yaw_rate() -> None:
     """A car that brakes at 1 m/s² and turns left: speed now, -1 m/s², and v·sin β / l_r rad/s."""
     turning = Drive(kind=AgentClass.CAR, start=(0.0, 0.0, 3.0, 12.0), phases=((60.0, -1.0, 0.1),))
