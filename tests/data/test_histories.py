@@ -9,12 +9,13 @@ import pytest
 
 from asp_env import open_data
 from asp_env.data import gather_scene, histories, index_snippets
+from asp_env.data.classes import AgentClass
 from asp_env.data.histories import AccelerationHistories
 from asp_env.errors import DataError
 from tests.builders import Drive, make_recording
 from tests.data.levelx_files import write_folder, write_map, write_recording
 
-CAR = Drive(kind=0, start=(0.0, 0.0, 0.0, 8.0))
+CAR = Drive(kind=AgentClass.CAR, start=(0.0, 0.0, 0.0, 8.0))
 
 
 def test_the_mean_over_a_tick_by_hand():

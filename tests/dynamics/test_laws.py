@@ -198,8 +198,9 @@ def test_a_reversing_neighbour_changes_no_bit(
     both_actions, sizes = np.concatenate([actions, actions[:1]]), np.append(lengths, 4.0)
     together = rollout(backwards, both_actions, sizes, 0.2, integrator=integrator)
     assert together[:3].tobytes() == alone.tobytes()
-    tensors = (torch.from_numpy(array) for array in (backwards, both_actions, sizes))
-    assert apart(rollout(*tensors, 0.2, integrator=integrator).numpy(), together) < 1e-9
+    start, held, lengths_m = (torch.from_numpy(array) for array in (backwards, both_actions, sizes))
+    in_torch = rollout(start, held, lengths_m, 0.2, integrator=integrator)
+    assert apart(in_torch.numpy(), together) < 1e-9
 
 
 @both

@@ -408,7 +408,7 @@ def _check_unique(files: LevelxFiles, ids: Int[np.ndarray, " metas"]) -> None:
 
 def _read_rows(files: LevelxFiles) -> _Rows:
     track, frame, measured, sizes, accelerations = [], [], [], [], []
-    columns: dict[str, Kind] = dict(_TRACKS) | dict.fromkeys(_ACCELERATIONS, "number")
+    columns: dict[str, Kind] = {**_TRACKS, **dict.fromkeys(_ACCELERATIONS, "number")}
     optional = frozenset({"width", "length", *_ACCELERATIONS})
     for chunk in read_columns(files.tracks, columns, optional=optional):
         track.append(chunk["trackId"].astype(np.int32))

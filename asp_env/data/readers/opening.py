@@ -109,6 +109,7 @@ def _recording(files: RecordingFiles, meta: Meta, road_map: RoadMap) -> Recordin
     sources = [*files.tables, *([files.background] if files.background else [])]
     facts, arrays = _cached(files.tracks, sources, lambda: _track_entry(files, meta), "tracks")
     scale = facts["metres_per_pixel"]
+    columns: dict[str, Any] = arrays
     background = None
     if files.background is not None and scale is not None:
         background = Background(path=files.background, metres_per_pixel=scale)
@@ -123,7 +124,7 @@ def _recording(files: RecordingFiles, meta: Meta, road_map: RoadMap) -> Recordin
         repairs=tuple(facts["repairs"]),
         start_hour=meta.start_hour if isinstance(meta, RecordingMeta) else None,
         weekday=meta.weekday if isinstance(meta, RecordingMeta) else None,
-        **arrays,
+        **columns,
     )
 
 
