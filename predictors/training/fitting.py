@@ -204,6 +204,7 @@ def train_stages(
         if (start / CONFIG).exists():
             _check_first_stage(start, first, data)
         else:
+            open_training_data(config, data)  # too short for the horizon: before the first stage
             train(first, data, start, hardware=hardware)
     return train(config, data, out, start=start, hardware=hardware)
 
