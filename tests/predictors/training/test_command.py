@@ -68,9 +68,9 @@ def test_a_chain_of_three_segments_is_evaluated(data: str, tmp_path: Path) -> No
             data=data, predictors=(name,), horizon=9.0, part="all", planner="none", out=tmp_path
         )
     )
-    errors = [row for row in result.rows if row["metric"] == "FDE"]
+    errors = [row.value for row in result.rows if row.metric == "FDE"]
     assert errors
-    assert all(np.isfinite(row["value"]) for row in errors)
+    assert np.isfinite(errors).all()
 
 
 def test_run_at_once_refuses_a_folder_with_a_first_stage(data: str, tmp_path: Path) -> None:
