@@ -64,6 +64,7 @@ def test_short_fade_omits_the_oldest_boxes() -> None:
     states = traffic(0)
     valid = np.ones(states.shape[:3], dtype=bool)
     valid[:, :, :-5] = False
-    expected = MTP.make((90, 90)).render(make_scene(states, valid=valid))
-    short: Any = with_history(MTP.make((90, 90)), 4).render(make_scene(states))
+    view: Any = MTP.make((90, 90))
+    expected = view.render(make_scene(states, valid=valid))
+    short: Any = with_history(view, 4).render(make_scene(states))
     np.testing.assert_array_equal(short, expected)
