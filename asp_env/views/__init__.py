@@ -7,6 +7,7 @@ from asp_env.views.factory import (
     make_raster_view,
     make_view,
     view_from_config,
+    with_history,
 )
 from asp_env.views.mtp import MTP
 from asp_env.views.raster import Viewport
@@ -39,4 +40,5 @@ __all__ = [
     "make_raster_view",
     "make_view",
     "view_from_config",
+    "with_history",
 ]

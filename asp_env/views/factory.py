@@ -74,6 +74,27 @@ def view_from_config(config: Mapping[str, Any]) -> SceneView:
     return _find_entry(str(config.get("name"))).view_class.from_config(dict(config))
 
 
+def with_history(view: SceneView, history: int) -> SceneView:
+    """Makes the view that shows another number of past ticks.
+
+    Args:
+        view: a view; without an option `history` in its configuration it is returned as it is.
+        history: number of past ticks, at least one. The view `mtp` shows at most 10 of them.
+
+    Raises:
+        AspEnvError: the number is not positive, or the view always shows more past ticks.
+    """
+    config = view.config()
+    if "history" in config:
+        return view_from_config({**config, "history": history})
+    if view.history > history:
+        raise AspEnvError(
+            f"view {view.name!r} shows {view.history} past ticks, more than the history of "
+            f"{history}: take a longer history or another view"
+        )
+    return view
+
+
 def _find_entry(name: str) -> ViewEntry:
     if name not in VIEWS:
         raise unknown_name("view", name, VIEWS)

@@ -23,10 +23,10 @@ _GOLDEN = (np.sqrt(5.0) - 1) / 2
 def calibrate(network: AbstractNetwork, batches: Iterable[tuple[Batch, Labels]]) -> float:
     """Fits the temperatures of a network on validation data.
 
-    The merging temperature is fitted first, if the network merges chains, and stored in the
-    network; the temperature of its forecasts is fitted next. A GPU is used if there is one: at full
-    size a CPU would take longer than the training. Afterwards the network is on the CPU, in
-    evaluation mode.
+    The merging temperature is fitted first, if the network merges chains, and stored in it; where
+    all chains of all segments would be too many it is fitted on the first segments. The temperature
+    of its forecasts is fitted next. A GPU is used if there is one: at full size a CPU would take
+    longer than the training. Afterwards the network is on the CPU, in evaluation mode.
 
     Args:
         network: The trained network.
@@ -38,7 +38,7 @@ def calibrate(network: AbstractNetwork, batches: Iterable[tuple[Batch, Labels]])
     device = torch.device("cuda" if torch.cuda.is_available() else "cpu")
     network.eval().to(device)
     if network.merging_temperature is not None:
-        merging = _temperature(lambda batch: network.chain(batch, "full"), batches, device)
+        merging = _temperature(network.all_chains, batches, device)
         network.merging_temperature.fill_(merging)
     temperature = _temperature(network, batches, device)
     network.cpu()
@@ -91,6 +91,7 @@ def _temperature(
             batch, labels = move_data_to_device(sample, device)
             modes = forecast(batch)
             logits.append(modes.logits.cpu().numpy())
-            nearest = best_mode(modes.states[..., :2], labels.states[..., :2], "distance")
+            truth = labels.states[:, : modes.states.shape[2], :2]
+            nearest = best_mode(modes.states[..., :2], truth, "distance")
             best.append(nearest.cpu().numpy())
     return fit_temperature(np.concatenate(logits), np.concatenate(best))

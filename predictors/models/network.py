@@ -153,6 +153,19 @@ class AbstractNetwork(nn.Module, ABC):
         del chaining, label
         return self(batch)
 
+    def all_chains(self, batch: Batch) -> Modes:
+        """Returns all chains of segments, over as many segments as `MAX_CHAINS` allows.
+
+        Networks that predict the whole horizon at once return their modes.
+
+        Args:
+            batch: Inputs.
+
+        Returns:
+            The chains, of at most the horizon, with logits.
+        """
+        return self(batch)
+
     def calibrated(
         self,
         batch: Batch,

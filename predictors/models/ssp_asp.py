@@ -2,7 +2,8 @@
 
 The encoder φ maps the observation to features z. The feature predictor ψ maps z and the past
 actions to the features ẑ at the end of the next segment (equation 15). The action predictor γ maps
-z, ẑ and the past actions to the actions of that segment (equation 18). In training the observation
+z, ẑ and the past actions to the actions of that segment (equation 18), as a GRU in one of the two
+readings of `predictors.models.heads` (`decoder`). In training the observation
 at the end of the segment is encoded too (equation 16); the action reconstructor ξ maps both encoded
 features to the past actions (equation 13), and γ runs on the encoded and on the predicted features.
 A forecast has only the predicted ones, so validation uses those. The loss is L_SSP (equation 20).
@@ -14,12 +15,17 @@ features are unbounded; the loss is the mean over both branches and over the seg
 segment is predicted from what is available at inference, the predicted features and the actions of
 the matched mode.
 
+In the paper the past and the segments have the same length ("the same T-step time interval for all
+the past and future values", section IV-D), 3 s. Here `segment_s` may differ from the history: γ and
+ψ always read the last h actions before a segment, which are recorded ones as far as the segments
+before it do not reach back that far, and ξ reconstructs the last h actions before the segment. A
+horizon has as many segments as fit: the whole horizon in one segment is possible, too.
+
 Options that differ from the paper; the recipe `paper` leaves them off: `normalise`,
 `stop_gradient`, `ema`, `skip`, `hidden`, `scheduled`, `annealed`, `kept`, and, for an ablation,
 `encoded_branch`.
 
-Dimensions: n targets, m modes, k chains, t ticks of a segment (as many as of the history), z
-features.
+Dimensions: n targets, m modes, k chains, h past ticks, t ticks of a segment, z features.
 """
 
 import copy
@@ -36,9 +42,18 @@ from asp_env.dynamics import clip_actions, inverse
 from asp_env.dynamics.bicycle import Integrator
 from asp_env.errors import AspEnvError
 from predictors.models.batch import Batch, Labels
-from predictors.models.chaining import Chaining, Chains, chains_to_extend, extend, merge, prune
+from predictors.models.chaining import (
+    MAX_CHAINS,
+    Chaining,
+    Chains,
+    chains_to_extend,
+    extend,
+    merge,
+    prune,
+    segment_ticks,
+)
 from predictors.models.encoders import make_encoder
-from predictors.models.heads import ConnectedHead, RecurrentReader
+from predictors.models.heads import ConnectedHead, Decoder, RecurrentReader, UnrolledDecoder
 from predictors.models.losses import HUBER_M, best_mode, into_frame, mode_terms
 from predictors.models.network import (
     AbstractNetwork,
@@ -60,6 +75,10 @@ RECONSTRUCTOR = (256, 128, 64)
 class SSPASPConfig(NetworkConfig):
     """Options of SSP-ASP; the defaults are the paper's."""
 
+    segment_s: float = 3.0
+    """Length of the segments that are chained, seconds; 3 s in the paper."""
+    decoder: Decoder = "read"
+    """How γ makes actions, see `heads.Decoder`."""
     gru_width: int = 512
     gru_layers: int = 2
     skip: bool = False
@@ -118,8 +137,8 @@ class SegmentInput(NamedTuple):
 
     z: Float[Tensor, "n z"]
     """Features at the start of the segment."""
-    past: Float[Tensor, "n t 2"]
-    """Actions of the segment before, in units of the action range."""
+    past: Float[Tensor, "n h 2"]
+    """The last actions before the segment, in units of the action range."""
     start: Float[Tensor, "n 4"]
     """State at the start of the segment, in the target's frame now."""
     length_m: Float[Tensor, " n"]
@@ -127,26 +146,27 @@ class SegmentInput(NamedTuple):
 
 @final
 class SSPASPNetwork(AbstractNetwork):
-    """φ (`encoder`), ψ (`forward_*`), ξ (`reconstructor`), γ (`reader`, `head`), the bicycle model.
+    """φ (`encoder`), ψ (`forward_*`), ξ (`reconstructor`), γ and the bicycle model.
 
-    φ maps the observation to z (n, z); ψ maps z and the past actions (n, t, 2) to ẑ (n, z); γ maps
+    γ is `reader` and `head`, or `decoder` if it is unrolled.
+
+    φ maps the observation to z (n, z); ψ maps z and the past actions (n, h, 2) to ẑ (n, z); γ maps
     [z, ẑ] (n, 2z) and the past actions to actions (n, m, t, 2) and logits (n, m); ξ maps two
-    encoded features (n, 2z) to the past actions (n, t, 2).
+    encoded features (n, 2z) to the past actions (n, h, 2).
     """
 
     def __init__(self, config: SSPASPConfig, shape: NetworkShape) -> None:
         """Initialises the weights at random.
 
         Raises:
-            AspEnvError: The horizon is not a whole number of segments as long as the history.
+            AspEnvError: The horizon is not a whole number of segments, or a segment not one of
+                ticks.
         """
         super().__init__(config, shape)
         self._options = config
-        if shape.horizon % shape.history:
-            raise AspEnvError(
-                f"ssp-asp chains segments of {shape.history * shape.dt_s:g} s, the horizon of "
-                f"{shape.horizon * shape.dt_s:g} s is no whole number of them"
-            )
+        self._segment_ticks = segment_ticks(
+            config.segment_s, horizon_s=shape.horizon * shape.dt_s, dt_s=shape.dt_s
+        )
         z, width = config.features, config.gru_width
         self.encoder = make_encoder(config.encoder, shape, z)
         self.target_encoder = copy.deepcopy(self.encoder) if config.ema else None
@@ -159,17 +179,32 @@ class SSPASPNetwork(AbstractNetwork):
         for before, after in zip((2 * z, *RECONSTRUCTOR), RECONSTRUCTOR, strict=False):
             layers += [nn.Linear(before, after), nn.ReLU(inplace=True)]
         self.reconstructor = nn.Sequential(*layers, nn.Linear(RECONSTRUCTOR[-1], 2 * shape.history))
-        self.reader = RecurrentReader(2 * z, width, config.gru_layers)
-        if config.skip:
-            width += 2 * z + 1 + 2 * shape.history
-        self.head = ConnectedHead(width, config.hidden, modes=config.modes, ticks=shape.history)
+        skipped = 2 * z + 1 + 2 * shape.history if config.skip else 0
+        self.reader: RecurrentReader | None = None
+        self.head: ConnectedHead | None = None
+        self.decoder: UnrolledDecoder | None = None
+        if config.decoder == "unrolled":
+            self.decoder = UnrolledDecoder(
+                2 * z,
+                width,
+                config.gru_layers,
+                modes=config.modes,
+                static=skipped,
+                hidden=config.hidden,
+            )
+        else:
+            self.reader = RecurrentReader(2 * z, width, config.gru_layers)
+            self.head = ConnectedHead(
+                width + skipped, config.hidden, modes=config.modes, ticks=self._segment_ticks
+            )
         # A weight: a run that starts from another run is validated with that run's temperature.
         self.register_buffer("merging_temperature", torch.ones(()) if config.kept else None)
 
     @property
     def later_ticks(self) -> tuple[int, ...]:
         """The ends of all segments."""
-        return tuple(range(self.shape.history, self.shape.horizon + 1, self.shape.history))
+        step = self._segment_ticks
+        return tuple(range(step, self.shape.horizon + 1, step))
 
     def forward(self, batch: Batch) -> Modes:
         """Returns the modes of every target; segments are chained by beam."""
@@ -179,12 +214,30 @@ class SSPASPNetwork(AbstractNetwork):
         self, batch: Batch, chaining: Chaining, label: Float[Tensor, "n t 2"] | None = None
     ) -> Modes:
         """Returns the modes of every target; see the base class."""
+        return self._chain(batch, chaining, label, segments=len(self.later_ticks))
+
+    def all_chains(self, batch: Batch) -> Modes:
+        """Returns all chains of the first segments; see the base class."""
+        segments = len(self.later_ticks)
+        while segments > 1 and self.config.modes**segments > MAX_CHAINS:
+            segments -= 1
+        return self._chain(batch, "full", None, segments=segments)
+
+    def _chain(
+        self,
+        batch: Batch,
+        chaining: Chaining,
+        label: Float[Tensor, "n t 2"] | None,
+        *,
+        segments: int,
+    ) -> Modes:
+        """The modes over the first segments."""
         z = self.encode(batch)
         with torch.autocast(z.device.type, enabled=False):
             past = self.scaled_actions(batch.actions)
             chains = self._segment(SegmentInput(z, past, start_states(batch), batch.length_m))
             chains = self._reduce(chains, chaining, batch)
-            for _ in self.later_ticks[1:]:
+            for _ in range(segments - 1):
                 chains = chains_to_extend(
                     chains, chaining, label=label, assignment=self.config.assignment
                 )
@@ -214,11 +267,18 @@ class SSPASPNetwork(AbstractNetwork):
             Actions, states and logits.
         """
         context = torch.cat([self.norm(inputs.z), self.norm(z_next)], dim=-1)
-        readings = [self.reader(context, inputs.past)]
+        static: list[Tensor] = []
         if self._options.skip:
             speed = inputs.start[:, 3:] / self.get_buffer("motion_scale")[0]
-            readings += [context, inputs.past.flatten(1), speed]
-        outputs, logits = self.head(torch.cat(readings, dim=-1))
+            static = [context, inputs.past.flatten(1), speed]
+        if self.decoder is not None:
+            skipped = torch.cat(static, dim=-1) if static else None
+            outputs, logits = self.decoder(context, inputs.past, self._segment_ticks, skipped)
+        else:
+            assert self.reader is not None
+            assert self.head is not None
+            reading = self.reader(context, inputs.past)
+            outputs, logits = self.head(torch.cat([reading, *static], dim=-1))
         actions = self.bounded_actions(outputs)
         start = inputs.start[:, None].expand(-1, actions.shape[1], -1)
         states = rollout_from(
@@ -274,10 +334,13 @@ class SSPASPNetwork(AbstractNetwork):
     def _next_segment(self, chains: Chains, batch: Batch) -> Chains:
         """The segment that follows each chain, (n, k·m) rows."""
         n, k = chains.log_probs.shape
-        recent = chains.actions[:, :, -self.shape.history :].flatten(0, 1)
+        done, history = chains.actions, self.shape.history
+        if done.shape[2] < history:
+            recorded = batch.actions[:, None].expand(-1, k, -1, -1)
+            done = torch.cat([recorded, done], dim=2)
         inputs = SegmentInput(
             chains.z.flatten(0, 1),
-            self.scaled_actions(recent),
+            self.scaled_actions(done[:, :, -history:].flatten(0, 1)),
             chains.states[:, :, -1].flatten(0, 1),
             batch.length_m.repeat_interleave(k),
         )
@@ -387,7 +450,7 @@ class SSPASPNetwork(AbstractNetwork):
         )
         z_next = torch.cat([b[1] for b in branches])
         actions, states, logits = self.predict_actions(inputs, z_next)
-        ticks = self.shape.history
+        ticks = self._segment_ticks
         label = labels.states[:, number * ticks : (number + 1) * ticks].repeat(len(branches), 1, 1)
         positions, truth = states[..., :2], label[..., :2]
         if number:
@@ -408,9 +471,10 @@ class SSPASPNetwork(AbstractNetwork):
             # The order of a batch is random, so its first rows are a random share of it.
             free = rows % len(labels.states) < progress.share * len(labels.states)
             continued = torch.where(free, logits.argmax(dim=1), continued)
+        done = torch.cat([inputs.past, self.scaled_actions(actions[rows, continued])], dim=1)
         end = SegmentInput(
             z_next,
-            self.scaled_actions(actions[rows, continued]),
+            done[:, -self.shape.history :],
             states[rows, continued, -1],
             inputs.length_m,
         )

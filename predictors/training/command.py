@@ -9,8 +9,9 @@ import tyro
 from rich.console import Console
 
 from asp_env.data.histories import History
+from asp_env.data.snippets import HISTORY_S
 from asp_env.data.split import Split
-from asp_env.errors import MissingExtraError
+from asp_env.errors import AspEnvError, MissingExtraError
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -33,9 +34,14 @@ class Train:
     view: str = "chauffeurnet"
     """View that the network observes: chauffeurnet, mtp or vectors."""
     horizon: float = 3.0
-    """Horizon of the forecasts in seconds. Above 3 s, ssp-asp
-    and the variant staged of the others start from a run for
-    3 s in OUT/3s."""
+    """Horizon of the forecasts in seconds. Above one segment,
+    ssp-asp starts from a run for one segment in OUT/3s, and
+    so does the variant staged of the others above 3 s."""
+    segment_s: float | None = None
+    """Length of the segments that ssp-asp chains, seconds; 3 if
+    omitted. The horizon is a whole number of them."""
+    history_s: float = HISTORY_S
+    """Length of the past that the network observes, seconds."""
     start: str | None = None
     """What to start from: a finished run, pretrained (the
     weights that ship with this package), or a safetensors
@@ -124,7 +130,23 @@ class Train:
         from predictors.training.recipes import recipe
         from predictors.training.variants import variant
 
-        config = recipe(self.predictor, self.recipe, view=self.view, horizon_s=horizon_s)
+        chosen = None if self.variant is None else variant(self.predictor, self.variant)
+        segment_s = self.segment_s
+        if chosen is not None and chosen.segment_s is not None:
+            if segment_s is not None:
+                raise AspEnvError(
+                    f"variant {self.variant} has segments of {chosen.segment_s:g} s: leave out "
+                    f"the other length, {segment_s:g} s"
+                )
+            segment_s = chosen.segment_s
+        config = recipe(
+            self.predictor,
+            self.recipe,
+            view=self.view,
+            horizon_s=horizon_s,
+            segment_s=segment_s,
+            history_s=self.history_s,
+        )
         config = dataclasses.replace(
             config,
             split=self.split,
@@ -135,6 +157,4 @@ class Train:
             epochs=config.epochs if self.epochs is None else self.epochs,
             precision=config.precision if self.precision is None else self.precision,
         )
-        if self.variant is not None:
-            config = variant(self.predictor, self.variant).apply(config, self.variant)
-        return config
+        return config if chosen is None else chosen.apply(config, str(self.variant))

@@ -328,7 +328,9 @@ def _chunks(snippets: SnippetIndex) -> Iterator[SnippetIndex]:
 
 
 def _index(recordings: Recordings, config: TrainingConfig) -> SnippetIndex:
-    return index_snippets(recordings, dt_s=config.dt_s, horizon_s=config.horizon_s)
+    return index_snippets(
+        recordings, dt_s=config.dt_s, horizon_s=config.horizon_s, history_s=config.history_s
+    )
 
 
 def _split(

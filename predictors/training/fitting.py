@@ -16,9 +16,10 @@ import torch
 from safetensors.torch import load_file
 
 from asp_env import registry
+from asp_env.data.recording import ticks
 from asp_env.data.source import join_data
 from asp_env.errors import AspEnvError
-from asp_env.views import make_view
+from asp_env.views import make_view, with_history
 from predictors.inference.calibration import calibrate
 from predictors.inference.checkpoint import (
     CONFIG,
@@ -37,7 +38,7 @@ from predictors.training.data import (
 from predictors.training.data_loading import batch_workers
 from predictors.training.initial_weights import InitialWeights
 from predictors.training.lightning_parts import BestCheckpoint, EpochLogger, TrainingModule
-from predictors.training.recipes import SEGMENT_S, TrainingConfig
+from predictors.training.recipes import TrainingConfig
 from predictors.training.trainer import LOGS, Hardware, SafetensorsIO, make_trainer, quiet
 
 RUN = "run.json"
@@ -45,9 +46,6 @@ RUN = "run.json"
 
 STATE = "unfinished"
 """Folder of an unfinished run's state."""
-
-FIRST_STAGE = "3s"
-"""Folder of the run for 3 s that a run for a longer horizon starts from."""
 
 ONE_PROCESS = Hardware()
 
@@ -88,12 +86,13 @@ def train(
     if chosen.validation_hash is not None:
         run["validation_hash"] = chosen.validation_hash
     spec: PredictorSpec = registry.find("predictors", config.predictor)
-    view = make_view(config.view, pixels=config.pixels)
+    history = ticks(config.history_s, config.dt_s)
+    view = with_history(make_view(config.view, pixels=config.pixels), history)
     initial = None
     if start is not None:
         initial = InitialWeights.read(start, spec, view=view, dt_s=config.dt_s)
         run["start"] = initial.weights_hash
-    resumed = _resumes(out, run, staged=start == out / FIRST_STAGE)
+    resumed = _resumes(out, run, first_stage=_first_stage(config, out), start=start)
 
     training = chosen.training
     if initial is None or initial.action_range is None:
@@ -102,7 +101,7 @@ def train(
         scale = initial.action_range
     shape = shape_for(
         view,
-        history=training.snippets.history,
+        history=history,
         horizon=training.snippets.horizon_ticks,
         dt_s=config.dt_s,
         action_range=scale,
@@ -181,9 +180,9 @@ def train_stages(
     start: Path | None = None,
     hardware: Hardware = ONE_PROCESS,
 ) -> Path:
-    """Trains in stages: a run for more than 3 s starts from a run for 3 s in `out/3s`.
+    """Trains in stages: a long run starts from a run for one segment, or for 3 s, within `out`.
 
-    The first stage is trained if it is missing.
+    The first stage, such as `out/3s`, is trained if it is missing and the horizon is longer.
 
     Args:
         config_for: Maps a horizon in seconds to the configuration.
@@ -200,13 +199,19 @@ def train_stages(
         AspEnvError: As `train`, or the first stage is of another configuration or other data.
     """
     config = config_for(horizon_s)
-    if start is None and horizon_s > SEGMENT_S:
-        start, first = out / FIRST_STAGE, config_for(SEGMENT_S)
+    if start is None and horizon_s > config.first_stage_s:
+        start, first = _first_stage(config, out), config_for(config.first_stage_s)
         if (start / CONFIG).exists():
             _check_first_stage(start, first, data)
         else:
+            open_training_data(config, data)  # too short for the horizon: before the first stage
             train(first, data, start, hardware=hardware)
     return train(config, data, out, start=start, hardware=hardware)
+
+
+def _first_stage(config: TrainingConfig, out: Path) -> Path:
+    """Folder of the run that a run in two stages starts from."""
+    return out / f"{config.first_stage_s:g}s"
 
 
 def _check_first_stage(start: Path, config: TrainingConfig, data: str | Sequence[str]) -> None:
@@ -223,7 +228,7 @@ def _check_first_stage(start: Path, config: TrainingConfig, data: str | Sequence
         )
 
 
-def _resumes(out: Path, run: dict[str, Any], *, staged: bool) -> bool:
+def _resumes(out: Path, run: dict[str, Any], *, first_stage: Path, start: Path | None) -> bool:
     """Whether the folder holds this run unfinished; False if it is new or empty."""
     if (out / CONFIG).exists():
         raise AspEnvError(f"{out} holds a finished run: give another --out, or delete it")
@@ -239,7 +244,7 @@ def _resumes(out: Path, run: dict[str, Any], *, staged: bool) -> bool:
             )
         return True
     # An interruption right after the folder was made leaves it without `run.json`.
-    allowed = (FIRST_STAGE, STATE) if staged else (STATE,)
+    allowed = (first_stage.name, STATE) if start == first_stage else (STATE,)
     if out.exists() and (
         not out.is_dir() or any(each.name not in allowed for each in out.iterdir())
     ):

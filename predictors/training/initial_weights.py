@@ -1,15 +1,15 @@
 """Weights that a run starts from instead of random ones."""
 
 import hashlib
-import json
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 from torch import Tensor
 
 from asp_env.data.split import TrainedOn
-from asp_env.errors import CheckpointError
-from asp_env.views import SceneView
+from asp_env.errors import AspEnvError, CheckpointError
+from asp_env.views import SceneView, view_from_config
 from predictors.inference.checkpoint import WEIGHTS, PredictorSpec, read_config, read_weights
 from predictors.models.encoders import load_resnet18
 from predictors.models.network import AbstractNetwork
@@ -56,7 +56,7 @@ class InitialWeights:
                 "start from"
             )
         # Rasters of the same size may show other things: the weights would fit, and be wrong.
-        if config.get("view") != json.loads(json.dumps(view.config())):
+        if not _is_view(config.get("view"), view):
             raise CheckpointError(
                 f"{path} has another view than this run: start from one of the same"
             )
@@ -112,3 +112,11 @@ class InitialWeights:
             )
         network.load_state_dict(fitting, strict=False)
         return sorted(set(own) - set(fitting))
+
+
+def _is_view(config: Any, view: SceneView) -> bool:
+    """Whether a stored configuration, which may lack newer options, describes a view."""
+    try:
+        return view_from_config(config) == view
+    except (AspEnvError, AttributeError, TypeError, ValueError):
+        return False

@@ -11,9 +11,11 @@ from types import MappingProxyType
 from typing import Literal
 
 from asp_env.data.histories import History
-from asp_env.data.recording import DEFAULT_DT_S
+from asp_env.data.recording import DEFAULT_DT_S, ticks
+from asp_env.data.snippets import HISTORY_S
 from asp_env.data.split import Split
 from asp_env.errors import AspEnvError, unknown_name
+from predictors.models.chaining import segment_ticks
 from predictors.models.dkm import DKMConfig
 from predictors.models.ffw_asp import FFWASPConfig
 from predictors.models.mtp import MTPConfig
@@ -21,7 +23,7 @@ from predictors.models.network import NetworkConfig
 from predictors.models.ssp_asp import SSPASPConfig
 
 SEGMENT_S = 3.0
-"""Length of the segments that `ssp-asp` chains, seconds: the paper's shorter horizon."""
+"""Length of the segments that `ssp-asp` chains by default, seconds: the paper's shorter horizon."""
 
 CHAINED = frozenset({"ssp-asp"})
 """Predictors whose runs for longer horizons start from the weights of a run for one segment, as in
@@ -50,6 +52,8 @@ class TrainingConfig:
     history: History = "recorded"
     """Whether inputs show the histories as recorded, smoothed with later frames, or filtered
     forward, or with recorded accelerations."""
+    history_s: float = HISTORY_S
+    """Length of the past that inputs show, in actions and in the view (`mtp` shows at most 2 s)."""
     seed: int = 0
     max_snippets: int | None = None
     """Largest number of training snippets, chosen at random; None for all."""
@@ -99,6 +103,16 @@ class TrainingConfig:
             raise AspEnvError(
                 f"training: standing_share is {self.standing_share}, expected within (0, 1]"
             )
+
+    @property
+    def segment_s(self) -> float | None:
+        """Length of the segments that are chained, seconds; None if the horizon is one forecast."""
+        return self.network.segment_s if isinstance(self.network, SSPASPConfig) else None
+
+    @property
+    def first_stage_s(self) -> float:
+        """Horizon of the run that a run in two stages starts from: one segment, or 3 s."""
+        return SEGMENT_S if self.segment_s is None else self.segment_s
 
     @property
     def all_epochs(self) -> int:
@@ -154,55 +168,57 @@ def ffw_asp_ours(view: str, horizon_s: float) -> TrainingConfig:
     )
 
 
-def ssp_asp_paper(view: str, horizon_s: float) -> TrainingConfig:
+def ssp_asp_paper(view: str, horizon_s: float, segment_s: float = SEGMENT_S) -> TrainingConfig:
     """`asp-env train ssp-asp DATA --recipe paper`: the paper's SSP-ASP.
 
-    Three epochs of pre-training come before the ten of the paper. A run for more than 3 s starts
-    from one for 3 s, without pre-training.
+    Three epochs of pre-training come before the ten of the paper. A run for more than one segment
+    (3 s) starts from one for one segment, without pre-training.
 
     Raises:
-        AspEnvError: The horizon is not a whole number of segments.
+        AspEnvError: The horizon is not a whole number of segments, or a segment not one of ticks.
     """
-    _check_segments(horizon_s)
-    config = _paper("ssp-asp", SSPASPConfig(), view, horizon_s)
+    segment_ticks(segment_s, horizon_s=horizon_s, dt_s=DEFAULT_DT_S)
+    config = _paper("ssp-asp", SSPASPConfig(segment_s=segment_s), view, horizon_s)
     return _pretrained(config, horizon_s, 3, of=config.epochs + 3)
 
 
-def ssp_asp_cpu(view: str, horizon_s: float) -> TrainingConfig:
+def ssp_asp_cpu(view: str, horizon_s: float, segment_s: float = SEGMENT_S) -> TrainingConfig:
     """`asp-env train ssp-asp DATA`: SSP-ASP at small size, see `_small`, by Heun's method.
 
     Pre-training takes two of the eight epochs, so that the time is that of the other predictors.
 
     Raises:
-        AspEnvError: The horizon is not a whole number of segments.
+        AspEnvError: The horizon is not a whole number of segments, or a segment not one of ticks.
     """
-    _check_segments(horizon_s)
-    network = SSPASPConfig(gru_width=128, integrator="heun")
+    segment_ticks(segment_s, horizon_s=horizon_s, dt_s=DEFAULT_DT_S)
+    network = SSPASPConfig(segment_s=segment_s, gru_width=128, integrator="heun")
     config = _small("ssp-asp", "cpu", network, view, horizon_s)
     return _pretrained(config, horizon_s, 2, of=config.epochs)
 
 
-def ssp_asp_ours(view: str, horizon_s: float) -> TrainingConfig:
+def ssp_asp_ours(view: str, horizon_s: float, segment_s: float = SEGMENT_S) -> TrainingConfig:
     """`asp-env train ssp-asp DATA --recipe ours`: small size, improved by the ablations.
 
     Differs from `cpu`: no pre-training; features, speed and past actions skip the GRU, which has
     one layer and is followed by a hidden layer; features are normalised and fixed as targets; modes
-    are assigned by distance and annealed at 3 s, which keeps them apart, and a run for 6 s starts
-    from those; later segments follow the most probable mode ever more often; forecasts are merged
-    into three modes. Chosen on validation data of synthetic traffic (`docs/results.md`).
+    are assigned by distance and annealed in the run for one segment, which keeps them apart, and a
+    longer run starts from those; later segments follow the most probable mode ever more often;
+    forecasts are merged into three modes. Chosen on validation data of synthetic traffic
+    (`docs/results.md`).
 
     Raises:
-        AspEnvError: The horizon is not a whole number of segments.
+        AspEnvError: The horizon is not a whole number of segments, or a segment not one of ticks.
     """
-    _check_segments(horizon_s)
+    segment_ticks(segment_s, horizon_s=horizon_s, dt_s=DEFAULT_DT_S)
     network = SSPASPConfig(
+        segment_s=segment_s,
         gru_width=128,
         gru_layers=1,
         skip=True,
         hidden=256,
         integrator="heun",
         assignment="distance",
-        annealed=horizon_s <= SEGMENT_S,
+        annealed=horizon_s <= segment_s,
         kept=3,
         spread_mps=0.8,
         normalise=True,
@@ -212,8 +228,9 @@ def ssp_asp_ours(view: str, horizon_s: float) -> TrainingConfig:
     return _small("ssp-asp", "ours", network, view, horizon_s)
 
 
-Recipe = Callable[[str, float], TrainingConfig]
-"""Makes a configuration of a view and a horizon in seconds."""
+Recipe = Callable[..., TrainingConfig]
+"""Makes a configuration of a view and a horizon in seconds and, for the predictors of `CHAINED`,
+the length of a segment in seconds."""
 
 RECIPES: Mapping[str, Mapping[str, Recipe]] = MappingProxyType(
     {
@@ -226,7 +243,15 @@ RECIPES: Mapping[str, Mapping[str, Recipe]] = MappingProxyType(
 """Recipes by predictor and name."""
 
 
-def recipe(predictor: str, name: str, *, view: str, horizon_s: float) -> TrainingConfig:
+def recipe(
+    predictor: str,
+    name: str,
+    *,
+    view: str,
+    horizon_s: float,
+    segment_s: float | None = None,
+    history_s: float = HISTORY_S,
+) -> TrainingConfig:
     """Makes the configuration of a recipe.
 
     Args:
@@ -234,16 +259,30 @@ def recipe(predictor: str, name: str, *, view: str, horizon_s: float) -> Trainin
         name: Name of the recipe.
         view: Name of the view.
         horizon_s: Horizon, seconds.
+        segment_s: Length of the segments that are chained, seconds; None for the default. Only for
+            the predictors of `CHAINED`.
+        history_s: Length of the past that inputs show, seconds.
 
     Raises:
-        AspEnvError: A name is unknown (known ones are listed), or the horizon does not fit.
+        AspEnvError: A name is unknown (known ones are listed), the horizon is no whole number of
+            segments, the predictor chains no segments, or a duration is no whole number of ticks.
     """
     if predictor not in RECIPES:
         raise unknown_name("trainable predictor", predictor, RECIPES)
     recipes = RECIPES[predictor]
     if name not in recipes:
         raise unknown_name(f"recipe of {predictor}", name, recipes)
-    return recipes[name](view, horizon_s)
+    ticks(history_s, DEFAULT_DT_S)
+    if predictor in CHAINED:
+        config = recipes[name](view, horizon_s, SEGMENT_S if segment_s is None else segment_s)
+    elif segment_s is None:
+        config = recipes[name](view, horizon_s)
+    else:
+        raise AspEnvError(
+            f"segments of {segment_s:g} s: {predictor} forecasts the whole horizon at once, only "
+            f"{', '.join(sorted(CHAINED))} chains segments; leave their length out"
+        )
+    return dataclasses.replace(config, history_s=history_s)
 
 
 def _paper(predictor: str, network: NetworkConfig, view: str, horizon_s: float) -> TrainingConfig:
@@ -293,19 +332,10 @@ def _small(
     )
 
 
-def _check_segments(horizon_s: float) -> None:
-    """Refuses a horizon that cannot be chained, before anything is trained."""
-    if horizon_s < SEGMENT_S or abs(horizon_s / SEGMENT_S - round(horizon_s / SEGMENT_S)) > 1e-6:
-        raise AspEnvError(
-            f"ssp-asp chains segments of {SEGMENT_S:g} s, the horizon of {horizon_s:g} s is no "
-            "whole number of them: give 3, 6 or 9"
-        )
-
-
 def _pretrained(
     config: TrainingConfig, horizon_s: float, epochs: int, *, of: int
 ) -> TrainingConfig:
     """Makes some of all epochs pre-training, unless the run starts from one that had it."""
-    if horizon_s > SEGMENT_S:
+    if horizon_s > config.first_stage_s:
         return config
     return dataclasses.replace(config, pretraining_epochs=epochs, epochs=of - epochs)

@@ -26,8 +26,10 @@ class Variant:
     horizons_s: tuple[float, ...] = (SEGMENT_S,)
     """The horizons for which it is an ablation, seconds."""
     warm_starts_from_3s: bool | None = None
-    """Whether a run for more than 3 s starts from the weights of a run for 3 s; None for what the
-    predictor's recipe does."""
+    """Whether a longer run starts from the weights of a run for one segment, or 3 s; None for what
+    the predictor's recipe does."""
+    segment_s: float | None = None
+    """Length of the segments that are chained, seconds; None for the recipe's."""
 
     def apply(self, config: TrainingConfig, name: str) -> TrainingConfig:
         """The changed configuration; the name of its recipe ends with that of the variant."""
@@ -58,6 +60,38 @@ def connected_head(config: TrainingConfig) -> TrainingConfig:
     """Replaces the recurrent head by that of DKM, with the same width."""
     hidden = 4096 if config.network.encoder == "resnet18" else 256
     return _network(head="connected", hidden=hidden)(config)
+
+
+def segments(segment_s: float, horizons_s: tuple[float, ...]) -> Variant:
+    """A variant with segments of another length.
+
+    Its runs have as many epochs in total as those of the recipe, for every horizon. With segments
+    shorter than 3 s the pre-training and half of the epochs for 3 s are those of the run for one
+    segment, which longer runs start from; with longer ones there is no such run.
+
+    Args:
+        segment_s: Length of a segment, seconds.
+        horizons_s: The horizons, each a whole number of segments.
+    """
+
+    def change(config: TrainingConfig) -> TrainingConfig:
+        def epochs(horizon_s: float, length_s: float | None = None) -> int:
+            return recipe(
+                config.predictor,
+                config.preset,
+                view=config.view,
+                horizon_s=horizon_s,
+                segment_s=length_s,
+            ).epochs
+
+        whole = epochs(SEGMENT_S)
+        shared = whole / 2 if segment_s < SEGMENT_S else 0.0
+        if config.horizon_s > SEGMENT_S:
+            whole += epochs(config.horizon_s)
+        own = shared if config.horizon_s < SEGMENT_S else whole - shared
+        return _scaled(config, own / epochs(config.horizon_s, segment_s))
+
+    return Variant(change=change, horizons_s=horizons_s, segment_s=segment_s)
 
 
 def no_trail(config: TrainingConfig) -> TrainingConfig:
@@ -121,6 +155,18 @@ _ACTION_SPACE = _COMMON | {
     "literal-classification": Variant(change=_network(classification="softmax")),
 }
 
+_UNROLLED = {"unrolled": Variant(change=_network(decoder="unrolled"), horizons_s=(SEGMENT_S, 6.0))}
+
+_SEGMENTS = {
+    "segment-0.6s": segments(0.6, (3.0, 6.0)),
+    "segment-1s": segments(1.0, (3.0, 6.0, 9.0, 12.0)),
+    "segment-1.2s": segments(1.2, (6.0, 12.0)),
+    "segment-2s": segments(2.0, (6.0, 12.0)),
+    "segment-6s": segments(6.0, (6.0,)),
+}
+"""Lengths that are whole numbers of ticks of 0.2 s and divide the horizons; that of the recipes is
+3 s. 1.5 s are 7.5 ticks."""
+
 _STAGED = {"staged": Variant(change=second_stage, horizons_s=(6.0,), warm_starts_from_3s=True)}
 
 VARIANTS: Mapping[str, Mapping[str, Variant]] = MappingProxyType(
@@ -132,7 +178,8 @@ VARIANTS: Mapping[str, Mapping[str, Variant]] = MappingProxyType(
         | {
             "connected-head": Variant(change=connected_head),
             "skip": Variant(change=_network(skip=True)),
-        },
+        }
+        | _UNROLLED,
         "ssp-asp": _ACTION_SPACE
         | {
             "skip": Variant(change=_network(skip=True)),
@@ -152,7 +199,9 @@ VARIANTS: Mapping[str, Mapping[str, Variant]] = MappingProxyType(
                 )
             ),
             "scheduled": Variant(change=_network(scheduled=True), horizons_s=(6.0,)),
-        },
+        }
+        | _UNROLLED
+        | _SEGMENTS,
     }
 )
 """Variants by predictor and name."""
@@ -171,7 +220,7 @@ def variant(predictor: str, name: str) -> Variant:
 
 
 def warm_starts_from_3s(predictor: str, name: str | None = None) -> bool:
-    """Whether a run for more than 3 s starts from the weights of a run for 3 s.
+    """Whether a longer run starts from the weights of a run for one segment, or 3 s.
 
     Args:
         predictor: Name of the predictor.

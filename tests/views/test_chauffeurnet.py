@@ -35,7 +35,7 @@ def test_channels_are_in_the_documented_order() -> None:
     assert ChauffeurNet().shape == (12, 360, 240)
     assert ChauffeurNet.channels[:4] == ("road_boundary", "ego_box", "ego_trail", "agents_0")
     assert ChauffeurNet.channels[-1] == "agents_8"
-    assert ChauffeurNet.history == 15
+    assert ChauffeurNet().history == 15
 
 
 def test_lone_ego_on_an_empty_map() -> None:

@@ -32,8 +32,8 @@ def test_variant_changes_the_recipe_but_not_the_time(
 ) -> None:
     """A different configuration with as many epochs in total; `long` has three times as many.
 
-    The epochs of a run for 3 s that the run starts from count, too. With the recipe `paper`,
-    `staged` has 20 in total, 6 s at once have 10.
+    The epochs of a run for 3 s that the run starts from count, too, and those of the run for one
+    segment. With the recipe `paper`, `staged` has 20 in total, 6 s at once have 10.
     """
     base, changed = both(predictor, name, recipe_name=recipe_name)
     assert changed.preset == f"{recipe_name}+{name}"
@@ -43,9 +43,54 @@ def test_variant_changes_the_recipe_but_not_the_time(
     before = recipe(predictor, recipe_name, view="chauffeurnet", horizon_s=3.0).all_epochs
     if name == "from-scratch":
         epochs += before
+    segment_s = VARIANTS[predictor][name].segment_s
+    if segment_s is not None:  # 6 s: from scratch, without a run for 3 s
+        epochs = before if base.horizon_s == 3.0 else before + base.all_epochs
+        if segment_s < base.horizon_s:
+            epochs -= first_segment(predictor, name, recipe_name).all_epochs
     if name == "staged":
         epochs = (16 if recipe_name == "cpu" else 20) - before
     assert changed.all_epochs == epochs
+
+
+def first_segment(predictor: str, name: str, recipe_name: str) -> TrainingConfig:
+    """The configuration of the run for one segment that longer runs of a variant start from."""
+    segment_s = VARIANTS[predictor][name].segment_s
+    assert segment_s is not None
+    command = Train(
+        predictor=predictor, data=("",), out=Path(), recipe=recipe_name, variant=name,
+        horizon=segment_s,
+    )  # fmt: skip
+    return command.config_for(segment_s)
+
+
+@pytest.mark.parametrize(
+    ("horizon", "epochs"), [(1.0, 3), (3.0, 3), (6.0, 11), (9.0, 11), (12.0, 11)]
+)
+def test_segments_of_1_s_share_their_first_run(horizon: float, epochs: int) -> None:
+    """Prediction epochs of `segment-1s`: 3 of the recipe's 6 for 1 s; the rest for each horizon."""
+    command = Train(
+        predictor="ssp-asp", data=("",), out=Path(), variant="segment-1s", horizon=horizon
+    )
+    config = command.config_for(horizon)
+    assert (config.epochs, config.segment_s, config.first_stage_s) == (epochs, 1.0, 1.0)
+    assert config.pretraining_epochs == (2 if horizon == 1.0 else 0)
+
+
+def test_lengths_of_segments_that_are_refused() -> None:
+    """1.5 s are 7.5 ticks; two lengths at once; FFW-ASP chains no segments."""
+    fields = {"data": ("",), "out": Path(), "horizon": 6.0}
+    ssp = Train(predictor="ssp-asp", **fields)
+    with pytest.raises(AspEnvError, match=r"1\.5 s, they are no whole number of ticks of 0\.2 s"):
+        dataclasses.replace(ssp, segment_s=1.5).config_for(6.0)
+    with pytest.raises(AspEnvError, match=r"into segments of 0\.2, 0\.4, 0\.6, 1, 1\.2, 2, 3, 6 s"):
+        dataclasses.replace(ssp, segment_s=2.5).config_for(6.0)
+    with pytest.raises(AspEnvError, match="variant segment-1s has segments of 1 s: leave out"):
+        dataclasses.replace(ssp, segment_s=2.0, variant="segment-1s").config_for(6.0)
+    with pytest.raises(AspEnvError, match="ffw-asp forecasts the whole horizon at once"):
+        Train(predictor="ffw-asp", segment_s=1.0, **fields).config_for(6.0)
+    with pytest.raises(AspEnvError, match=r"0\.5 s is no whole number of ticks"):
+        Train(predictor="ffw-asp", history_s=0.5, **fields).config_for(6.0)
 
 
 @pytest.mark.parametrize(("recipe_name", "hidden"), [("cpu", 256), ("paper", 4096)])
