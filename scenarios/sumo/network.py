@@ -44,6 +44,8 @@ class Lane:
     pedestrian: bool
     """Whether only pedestrians may use it."""
     index: int
+    speed_mps: float
+    """Speed limit."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -152,6 +154,7 @@ def _read_network(path: Path) -> Network:
                         width_m=width,
                         pedestrian=lane.get("allow") == "pedestrian",
                         index=int(lane.attrib["index"]),
+                        speed_mps=float(lane.attrib["speed"]),
                     )
     return Network(
         lanes=lanes,
@@ -187,7 +190,13 @@ def _turns(
 
 
 def simulate(
-    folder: Path, routes: str, *, seconds: float, seed: int, impatient: bool = False
+    folder: Path,
+    routes: str,
+    *,
+    seconds: float,
+    seed: int,
+    impatient: bool = False,
+    lenient: bool = False,
 ) -> Movements:
     """Simulates `routes` on the network in `folder` with SUMO.
 
@@ -198,6 +207,8 @@ def simulate(
         seed: of SUMO's random numbers.
         impatient: whether waiting drivers accept shorter gaps after `IMPATIENT_AFTER_S` instead of
             SUMO's 180 s.
+        lenient: whether agents without a possible route are left out instead of an error; on
+            one-way roads not every sidewalk leads to every other.
     """
     (folder / "routes.xml").write_text(f"<routes>{routes}</routes>")
     _run(
@@ -215,6 +226,7 @@ def simulate(
         "--collision.action", "warn",
         "--time-to-teleport", "-1",
         *(("--time-to-impatience", str(IMPATIENT_AFTER_S)) if impatient else ()),
+        "--ignore-route-errors", str(lenient).lower(),
         "--xml-validation", "never",
         "--no-step-log", "true",
     )  # fmt: skip
@@ -257,6 +269,11 @@ def lanelets(network: Network, half_size_m: tuple[float, float]) -> list[Lanelet
     return [*strips.values(), *turns, *crossings]
 
 
+def narrowest_lane_m(network: Network) -> float:
+    """Width of the narrowest lane for vehicles, m."""
+    return min(lane.width_m for lane in network.lanes.values() if not lane.pedestrian)
+
+
 def _lane_strip(lane: Lane, lanes: dict[str, Lane], reach: np.ndarray) -> Lanelet:
     half = 0.5 * lane.width_m
     left, right = offset(lane.shape, half), offset(lane.shape, -half)
@@ -278,6 +295,7 @@ def _lane_strip(lane: Lane, lanes: dict[str, Lane], reach: np.ndarray) -> Lanele
         subtype=subtype,
         left=(Border(line=left[part], marking=left_is),),
         right=(Border(line=right[part], marking=right_is),),
+        speed_limit_mps=None if lane.pedestrian else lane.speed_mps,
     )
 
 
@@ -319,6 +337,7 @@ def _turn_strip(turn: Turn, network: Network, strips: dict[str, Lanelet]) -> Lan
         subtype="road",
         left=(Border(line=left, marking=left_is),),
         right=(Border(line=right, marking=right_is),),
+        speed_limit_mps=max(network.lanes[turn.begin].speed_mps, network.lanes[turn.end].speed_mps),
     )
 
 

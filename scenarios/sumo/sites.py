@@ -30,6 +30,10 @@ ENTRY_TILT_RAD = np.radians(8.0)
 SWING_M = 0.8
 """Additional width of the lanes near the ring, where long vehicles swing out."""
 
+TIGHT_RADIUS_M = 10.0
+"""Rings of a smaller radius have no trucks and buses, which would leave the road. Chosen by
+hand."""
+
 LIMITS_MPS = (11.11, 13.89)
 
 LEFT_TURN_RAD = np.radians(45.0)
@@ -59,6 +63,8 @@ class Arm:
     """Whether vehicles may enter; false for a one-way road that leaves the junction."""
     leaves: bool = True
     """Whether vehicles may leave; false for a one-way road that leads to the junction."""
+    one_lane_leaves: bool = True
+    """Whether vehicles leave on a single lane."""
     length_m: float
     """Length of the edges `enter` and `leave`."""
     starts: Mapping[str, tuple[int, ...]] = field(default_factory=dict)
@@ -82,6 +88,8 @@ class Site:
     """Half the width and half the height of the image."""
     parking: Float[np.ndarray, "lots 4 2"]
     """Corners of the parking lots, beside the pavement."""
+    tight: bool = False
+    """Whether there is no room for long vehicles."""
 
 
 def lane_xml(
@@ -313,6 +321,7 @@ class Road:
             weight=self.weight,
             enters=self.enter > 0,
             leaves=self.leave > 0,
+            one_lane_leaves=self.leave == 1,
             length_m=2.0 * (len(self.line) - 1 - self.split),
         )
 
@@ -589,6 +598,7 @@ def round_site(
         speed_limit_mps=speed_limit_mps,
         half_size_m=half_size_m,
         parking=np.stack(parking) if parking else np.zeros((0, 4, 2)),
+        tight=ring.inner_m + 0.5 * ring.lanes * ring.lane_m < TIGHT_RADIUS_M,
     )
 
 
