@@ -84,7 +84,7 @@ class TrafficRanges:
     """Demand and drivers of a location. Chosen by hand: from almost empty to jams, no class rare
     at every location."""
 
-    vehicles_per_hour: Range = (80.0, 1900.0)
+    vehicles_per_hour: Range = (120.0, 2000.0)
     """Drawn on a logarithmic scale."""
     no_pedestrians: float = 0.25
     """Share of locations without pedestrians."""

@@ -254,7 +254,7 @@ def _junction(
         radius_m=radius_m,
         speed_limit_mps=float(main_mps),
         half_size_m=(68.0, 56.0),
-        lots=1 + int(rng.integers(2)),
+        lots=tuple(range(1 + int(rng.integers(2)))),
     )
 
 
@@ -289,6 +289,12 @@ class Road:
     parking_from_m: float
     """Distance of the parking lot from the centre, along the arm."""
     parking_spaces: int
+
+    @property
+    def half_width_m(self) -> float:
+        """Distance from the line to the outer side of the wider direction's sidewalk."""
+        lanes = max(self.enter, self.leave)
+        return 0.5 * self.median_m + lanes * self.width_m + SIDEWALK_M
 
     @property
     def far_inward(self) -> Polyline:
@@ -359,7 +365,7 @@ def junction(
     radius_m: float,
     speed_limit_mps: float,
     half_size_m: tuple[float, float],
-    lots: int,
+    lots: tuple[int, ...],
     control: Control = "priority",
 ) -> Site:
     """An intersection of given dimensions.
@@ -370,7 +376,7 @@ def junction(
         radius_m: radius of the corners.
         speed_limit_mps: written to the metadata.
         half_size_m: half the width and half the height of the image.
-        lots: number of parking lots, at the first arms.
+        lots: arms with a parking lot.
         control: rule of the right of way.
     """
     nodes = [node_xml("c", np.zeros(2), type=control, radius=f"{radius_m:.2f}")]
@@ -396,7 +402,7 @@ def junction(
         connections += [connection_xml(f"exit{i}", f"out{i}", lane) for lane in lanes]
         if road.crossing:
             connections.append(road.crossing_xml(i))
-    parking = [road.parking() for road in roads[:lots] if road.leave]
+    parking = [roads[i].parking() for i in lots]
     return Site(
         kind=kind,
         nodes="".join(nodes),
@@ -551,7 +557,7 @@ def _round(
         roads,
         speed_limit_mps=limit_mps,
         half_size_m=(72.0, 60.0),
-        lots=1 + int(rng.integers(2)),
+        lots=tuple(range(1 + int(rng.integers(2)))),
     )
 
 
@@ -571,7 +577,7 @@ def round_site(
     *,
     speed_limit_mps: float,
     half_size_m: tuple[float, float],
-    lots: int,
+    lots: tuple[int, ...],
 ) -> Site:
     """A roundabout of given dimensions.
 
@@ -581,13 +587,13 @@ def round_site(
         roads: its arms, counter-clockwise.
         speed_limit_mps: written to the metadata.
         half_size_m: half the width and half the height of the image.
-        lots: number of parking lots, at the first arms.
+        lots: arms with a parking lot.
     """
     plan = _Plan()
     for i in range(len(roads)):
         _add_ring_part(plan, ring, roads, i)
         _add_arm(plan, ring, roads[i], i)
-    parking = [road.parking() for road in roads[:lots] if road.leave]
+    parking = [roads[i].parking() for i in lots]
     return Site(
         kind=kind,
         nodes="".join(plan.nodes),

@@ -4,6 +4,7 @@ Lanelets are joined or cut, opposite lanes become one, lines lose their markings
 moved against the tracks. The background image shows the roads as they are.
 """
 
+from collections.abc import Callable
 from dataclasses import replace
 
 import numpy as np
@@ -18,6 +19,11 @@ _MAP = RANGES.map
 
 _MEETS_M = 0.3
 """Ends of lines that are nearer than this are the same point."""
+
+
+_LEAST_M = 0.2
+"""Lanelets with a shorter side, between roads that meet, are left out: both ends of the side would
+be one point of the map."""
 
 
 def draw_map(
@@ -38,6 +44,7 @@ def draw_map(
     Returns:
         The lanelets and the parking lots that the map shows, in its place.
     """
+    lanelets = [each for each in lanelets if _length_m(each) > _LEAST_M]
     roads = [each for each in lanelets if each.subtype == "road"]
     others = [each for each in lanelets if each.subtype != "road"]
     without = {
@@ -75,12 +82,17 @@ def _offset(rng: np.random.Generator) -> tuple[np.ndarray, float]:
     return away * np.array([np.cos(towards), np.sin(towards)]), float(turn)
 
 
-def _mapped(lanelet: Lanelet, change) -> Lanelet:  # noqa: ANN001
+def _mapped(lanelet: Lanelet, change: Callable[[Polyline], Polyline]) -> Lanelet:
     left, right = (
         tuple(replace(border, line=change(border.line)) for border in side)
         for side in (lanelet.left, lanelet.right)
     )
     return replace(lanelet, left=left, right=right)
+
+
+def _length_m(lanelet: Lanelet) -> float:
+    """Length of the shorter side."""
+    return float(min(arc_lengths(line)[-1] for line in (lanelet.left_line, lanelet.right_line)))
 
 
 def _meet(a: np.ndarray, b: np.ndarray) -> bool:

@@ -45,16 +45,15 @@ def varied_intersection(rng: np.random.Generator) -> Site:
     control = str(rng.choice(controls, p=shares))
     roads = _roads(rng, angles_rad, lines, split=split, main=main)
     roads = _with_lanes(rng, roads)
-    site = junction(
+    return junction(
         "varied-intersection",
         roads,
         radius_m=rng.uniform(*_SITE.corner_m),
         speed_limit_mps=max(road.speed_mps for road in roads),
         half_size_m=half_size_m,
-        lots=int(rng.integers(3)),
+        lots=_lots(rng, roads, half_size_m),
         control=control,  # pyright: ignore[reportArgumentType]  # one of the ranges' controls
     )
-    return site
 
 
 def varied_roundabout(rng: np.random.Generator) -> Site:
@@ -97,7 +96,7 @@ def varied_roundabout(rng: np.random.Generator) -> Site:
         roads,
         speed_limit_mps=max(road.speed_mps for road in roads),
         half_size_m=half_size_m,
-        lots=int(rng.integers(3)),
+        lots=_lots(rng, roads, half_size_m),
     )
 
 
@@ -189,6 +188,24 @@ def _are_clear(line: Polyline, other: Polyline, from_m: float) -> bool:
     return bool(near > _CLEAR_M and centre > 0.8 * from_m)
 
 
+def _lots(
+    rng: np.random.Generator, roads: list[Road], half_size_m: tuple[float, float]
+) -> tuple[int, ...]:
+    """Up to two arms with a parking lot inside the image and clear of all roads."""
+    free = []
+    for i, road in enumerate(roads):
+        lot = road.parking()
+        points = np.concatenate([lot, 0.5 * (lot + np.roll(lot, 1, axis=0))])
+        gaps = [
+            np.hypot(*(points[:, None] - other.line[None]).transpose(2, 0, 1)).min()
+            - other.half_width_m
+            for other in roads
+        ]
+        if road.leave and np.all(np.abs(lot) < np.array(half_size_m) - 2.0) and min(gaps) > 0.0:
+            free.append(i)
+    return tuple(free[: int(rng.integers(3))])
+
+
 def _most_opposite(angles_rad: np.ndarray) -> tuple[int, int]:
     """The two arms that form the straightest road."""
     pairs = [(a, b) for a in range(len(angles_rad)) for b in range(a)]
@@ -207,9 +224,10 @@ def _roads(
     """One-lane roads with their widths, limits and crossings; some are one-way."""
     lane_m, limit_kmh = rng.uniform(*_SITE.lane_m), float(rng.choice(_SITE.limits_kmh))
     crossing = rng.random(len(lines)) < rng.uniform(*_SITE.crossing)
-    crossing[rng.integers(len(lines))] = True
     one_way = rng.random(len(lines)) < _SITE.one_way
-    one_way[rng.permutation(len(lines))[:2]] = False  # a way in and a way out remain for all
+    both = rng.permutation(len(lines))[:2]
+    one_way[both] = False  # a way in and a way out remain for all
+    crossing[both[0]] = True
     roads = []
     for i, line in enumerate(lines):
         differs_kmh = 10.0 * np.round(0.1 * rng.uniform(-1.0, 1.0) * _SITE.limit_differs_kmh)
@@ -229,7 +247,7 @@ def _roads(
                 enter=1 if not one_way[i] or into else 0,
                 leave=1 if not one_way[i] or not into else 0,
                 median_m=median_m if has_median and not one_way[i] else 0.0,
-                crossing=bool(crossing[i]),
+                crossing=bool(crossing[i]) and not one_way[i],
                 weight=float(rng.uniform(0.3, 1.3) * (_MAIN_WEIGHT if i in main else 1.0)),
                 parking_from_m=2.0 * split + rng.uniform(4.0, 16.0),
                 parking_spaces=int(rng.integers(2, 5)),
