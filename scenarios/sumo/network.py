@@ -16,7 +16,7 @@ import pandas as pd
 from jaxtyping import Float
 
 from asp_env.errors import AspEnvError, MissingExtraError
-from asp_env.geometry import arc_lengths
+from asp_env.geometry import arc_lengths, wrap_angle
 from scenarios.lanelet2 import Border, Lanelet, Marking, Subtype
 from scenarios.polylines import Polyline, dense, offset
 from scenarios.sumo.sites import Site
@@ -32,6 +32,9 @@ WIDENING_M = 1.3
 """Additional width of a right-angled turn in its middle, on each side. Chosen by hand."""
 
 _MEETS_M = 0.3
+
+_LEAST_ROAD_M, _MOST_KINK_RAD = 3.0, 1.0
+"""Bounds of sound roads: length, and change of direction at a point. Chosen by hand."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -272,6 +275,33 @@ def lanelets(network: Network, half_size_m: tuple[float, float]) -> list[Lanelet
 def narrowest_lane_m(network: Network) -> float:
     """Width of the narrowest lane for vehicles, m."""
     return min(lane.width_m for lane in network.lanes.values() if not lane.pedestrian)
+
+
+def is_sound(network: Network) -> bool:
+    """Whether vehicles can drive on all roads without a jump or a kink.
+
+    At small angles netconvert enlarges a junction beyond the next one, so that the road between
+    them vanishes or points backwards.
+    """
+    lengths = [
+        arc_lengths(lane.shape)[-1]
+        for lane in network.lanes.values()
+        if not lane.edge.startswith("ring")
+    ]
+    paths = [
+        np.concatenate(
+            [network.lanes[turn.begin].shape[-2:], turn.shape, network.lanes[turn.end].shape[:2]]
+        )
+        for turn in network.turns
+    ]
+    return min(lengths) > _LEAST_ROAD_M and max(map(_sharpest_kink_rad, paths)) < _MOST_KINK_RAD
+
+
+def _sharpest_kink_rad(path: Polyline) -> float:
+    steps = np.diff(path, axis=0)
+    steps = steps[np.hypot(*steps.T) > 0.05]
+    ahead = np.arctan2(steps[:, 1], steps[:, 0])
+    return float(np.abs(wrap_angle(np.diff(ahead))).max(initial=0.0))
 
 
 def _lane_strip(lane: Lane, lanes: dict[str, Lane], reach: np.ndarray) -> Lanelet:

@@ -9,10 +9,11 @@ import cv2
 import numpy as np
 from jaxtyping import Float, UInt8
 
+from asp_env.errors import AspEnvError
 from scenarios.lanelet2 import Area, Border, Lanelet, to_degrees, write_map
 from scenarios.polylines import Polyline, dense
 from scenarios.sumo.demand import Mix, Traffic, usual_mix
-from scenarios.sumo.network import build_network, lanelets, narrowest_lane_m
+from scenarios.sumo.network import build_network, is_sound, lanelets, narrowest_lane_m
 from scenarios.sumo.sites import (
     Site,
     crossroads,
@@ -56,17 +57,37 @@ _SITES_OF: dict[Traffic, dict[str, tuple[Callable[[np.random.Generator], Site], 
 }
 
 
-def draw_site(rng: np.random.Generator, name: str, traffic: Traffic, location: int) -> Site:
+def draw_site(
+    rng: np.random.Generator, name: str, traffic: Traffic, location: int, scratch: Path
+) -> Site:
     """The junction of a location; the kinds of a site take turns.
 
     Args:
         rng: draws the junction.
         name: `intersection` or `roundabout`.
-        traffic: `normal`, `dense` or `varied`.
+        traffic: `normal`, `dense` or `varied`. Varied junctions are drawn until one is sound.
         location: number of the location.
+        scratch: folder in which junctions are tried.
+
+    Raises:
+        AspEnvError: no sound junction was found.
     """
     kinds = _SITES_OF[traffic][name]
-    return kinds[location % len(kinds)](rng)
+    draw = kinds[location % len(kinds)]
+    if traffic != "varied":
+        return draw(rng)
+    for attempt in range(_MOST_ATTEMPTS):
+        site, folder = draw(rng), scratch / f"attempt{attempt}"
+        folder.mkdir(parents=True)
+        if is_sound(build_network(site, folder)):
+            return site
+    raise AspEnvError(
+        f"location {location}: none of {_MOST_ATTEMPTS} junctions drawn has roads without kinks; "
+        "choose another seed"
+    )
+
+
+_MOST_ATTEMPTS = 50
 
 JOIN_M = 0.06
 """Ends of netconvert's lines that are nearer than this belong together."""

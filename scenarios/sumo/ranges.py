@@ -58,7 +58,7 @@ class SiteRanges:
         ("traffic_light", 0.25),
     )
     """Rules of the right of way with their shares; signals are not part of the recording."""
-    split_m: Range = (20.0, 32.0)
+    split_m: Range = (22.0, 34.0)
     """Distance of crossings from the centre of an intersection."""
     ring_radius_m: Range = (7.0, 30.0)
     """Radius of the middle of a ring's lanes; small ones are more frequent than large ones."""
@@ -84,7 +84,7 @@ class TrafficRanges:
     """Demand and drivers of a location. Chosen by hand: from almost empty to jams, no class rare
     at every location."""
 
-    vehicles_per_hour: Range = (120.0, 2000.0)
+    vehicles_per_hour: Range = (200.0, 2000.0)
     """Drawn on a logarithmic scale."""
     no_pedestrians: float = 0.25
     """Share of locations without pedestrians."""

@@ -26,6 +26,11 @@ _LEAST_M = 0.2
 be one point of the map."""
 
 
+_DEVIATES_M = 0.25
+"""Largest distance between a line and its resampled points. Chosen by hand: drawing errors of
+maps."""
+
+
 def draw_map(
     rng: np.random.Generator,
     lanelets: list[Lanelet],
@@ -69,7 +74,7 @@ def draw_map(
         return (line - middle) @ rotation.T + middle + offset_m
 
     lots = np.zeros((0, 4, 2)) if rng.random() < _MAP.no_areas else parking
-    drawn = [_mapped(each, lambda line: place(dense(line, spacing_m))) for each in shown]
+    drawn = [_mapped(each, lambda line: place(_resampled(line, spacing_m))) for each in shown]
     return drawn, place(lots)
 
 
@@ -88,6 +93,18 @@ def _mapped(lanelet: Lanelet, change: Callable[[Polyline], Polyline]) -> Lanelet
         for side in (lanelet.left, lanelet.right)
     )
     return replace(lanelet, left=left, right=right)
+
+
+def _resampled(line: Polyline, spacing_m: float) -> Polyline:
+    """A line with evenly spaced points, closer where it bends, so that it stays near the road."""
+    arc = arc_lengths(line)
+    while True:
+        points = dense(line, spacing_m)
+        along = arc_lengths(points)
+        same = points_at(points, along, arc / arc[-1] * along[-1])
+        if spacing_m < 1.0 or np.hypot(*(same - line).T).max() < _DEVIATES_M:
+            return points
+        spacing_m *= 0.5
 
 
 def _length_m(lanelet: Lanelet) -> float:
