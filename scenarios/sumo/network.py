@@ -294,7 +294,8 @@ def is_sound(network: Network) -> bool:
         )
         for turn in network.turns
     ]
-    return min(lengths) > _LEAST_ROAD_M and max(map(_sharpest_kink_rad, paths)) < _MOST_KINK_RAD
+    sharpest_rad = max(map(_sharpest_kink_rad, paths))
+    return bool(min(lengths) > _LEAST_ROAD_M and sharpest_rad < _MOST_KINK_RAD)
 
 
 def _sharpest_kink_rad(path: Polyline) -> float:

@@ -70,7 +70,7 @@ def draw_map(
         [[np.cos(turn_rad), -np.sin(turn_rad)], [np.sin(turn_rad), np.cos(turn_rad)]]
     )
 
-    def place(line: Polyline) -> Polyline:
+    def place(line: np.ndarray) -> np.ndarray:
         return (line - middle) @ rotation.T + middle + offset_m
 
     lots = np.zeros((0, 4, 2)) if rng.random() < _MAP.no_areas else parking
