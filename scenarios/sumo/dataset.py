@@ -239,9 +239,7 @@ def make_track(
     )
 
 
-def _seen(
-    motion: Motion, place: Place, num_frames: int, frame_rate_hz: float
-) -> slice | None:
+def _seen(motion: Motion, place: Place, num_frames: int, frame_rate_hz: float) -> slice | None:
     """The longest uninterrupted span in which a motion is inside the image."""
     frames = motion.first_frame + np.arange(len(motion.xy)) - round(WARM_UP_S * frame_rate_hz)
     half = np.array(place.site.half_size_m) - _EDGE_M

@@ -146,10 +146,8 @@ class RoadUser:
     """Deviation from the middle of the lane."""
 
 
-def demand(
-    rng: np.random.Generator, site: Site, seconds: float, mix: Mix | None = None
-) -> Demand:
-    """Draws the agents that depart within `seconds` at a site, by default those of normal traffic."""
+def demand(rng: np.random.Generator, site: Site, seconds: float, mix: Mix | None = None) -> Demand:
+    """Draws the agents that depart within `seconds` at a site, by default of normal traffic."""
     mix = mix or usual_mix(site.kind, "normal")
     users: dict[str, RoadUser] = {}
     entries: list[tuple[float, str, str]] = []
@@ -268,9 +266,7 @@ def _stop_xml(
     return f'<stop lane="{on}" endPos="{position:.2f}" duration="{duration:.1f}"/>'
 
 
-def _depart_lane(
-    rng: np.random.Generator, user: RoadUser, begin: Arm, end: Arm, mix: Mix
-) -> int:
+def _depart_lane(rng: np.random.Generator, user: RoadUser, begin: Arm, end: Arm, mix: Mix) -> int:
     """The lane on which a vehicle enters; lane 0 is the sidewalk.
 
     In a ring, vehicles that pass more than half of it mostly start on the left. At a junction the

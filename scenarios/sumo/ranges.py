@@ -5,7 +5,8 @@ on varied traffic meets at a real site something between what it has seen (domai
 """
 
 from dataclasses import dataclass, field
-from typing import Literal
+
+from scenarios.sumo.sites import Control
 
 Range = tuple[float, float]
 """Lowest and highest value."""
@@ -52,7 +53,7 @@ class SiteRanges:
     """Share of arms with two entering lanes whose left one is for left turns only."""
     crossing: Range = (0.0, 0.9)
     """Share of arms with a zebra crossing, at a location."""
-    controls: tuple[tuple[Literal["priority", "right_before_left", "traffic_light"], float], ...] = (
+    controls: tuple[tuple[Control, float], ...] = (
         ("priority", 0.55),
         ("right_before_left", 0.2),
         ("traffic_light", 0.25),
@@ -81,8 +82,10 @@ class SiteRanges:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class TrafficRanges:
-    """Demand and drivers of a location. Chosen by hand: from almost empty to jams, no class rare
-    at every location."""
+    """Demand and drivers of a location.
+
+    Chosen by hand: from almost empty to jams, and no class is rare at every location.
+    """
 
     vehicles_per_hour: Range = (200.0, 2000.0)
     """Drawn on a logarithmic scale."""
@@ -170,8 +173,11 @@ class MapRanges:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class TrackerRanges:
-    """Frame rates and measurement errors of a recording. Chosen by hand: from a drone in still air
-    to cameras on poles. Small errors are more frequent than large ones."""
+    """Frame rates and measurement errors of a recording.
+
+    Chosen by hand: from a drone in still air to cameras on poles. Small errors are more frequent
+    than large ones.
+    """
 
     frame_rates_hz: tuple[int, ...] = (10, 15, 20, 25, 30)
     """Multiples of 5 Hz, so that 0.2 s are whole frames."""

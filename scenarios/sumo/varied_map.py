@@ -133,9 +133,7 @@ def _with_shared_lanes(rng: np.random.Generator, roads: list[Lanelet]) -> list[L
             continue
         taken.add(partners[0])
         opposite = roads[partners[0]]
-        left = tuple(
-            replace(border, line=border.line[::-1]) for border in reversed(opposite.right)
-        )
+        left = tuple(replace(border, line=border.line[::-1]) for border in reversed(opposite.right))
         result.append(replace(lanelet, left=left, one_way=False))
     return result
 
@@ -208,8 +206,7 @@ def _cut(lanelet: Lanelet, piece_m: float) -> list[Lanelet]:
         return [lanelet]
     sides = [_cut_line(side[0], count) for side in (lanelet.left, lanelet.right)]
     return [
-        replace(lanelet, left=(left,), right=(right,))
-        for left, right in zip(*sides, strict=True)
+        replace(lanelet, left=(left,), right=(right,)) for left, right in zip(*sides, strict=True)
     ]
 
 

@@ -272,4 +272,3 @@ def _with_lanes(rng: np.random.Generator, roads: list[Road]) -> list[Road]:
                 road = both
         result.append(road)
     return result
-
