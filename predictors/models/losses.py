@@ -22,6 +22,9 @@ from asp_env.metrics.forecast.errors import ModeRule, ends_in_true_direction
 Assignment = Literal["angle", "distance", "angle-random"]
 """How the best mode of a label is chosen: see `best_mode` and `best_or_random_mode`."""
 
+DEFAULT_ASSIGNMENT: Assignment = "angle-random"
+"""The assignment of every recipe that sets none (`cpu` and `paper` of all predictors)."""
+
 Classification = Literal["cross-entropy", "softmax"]
 """The classification term: see `classification_loss`."""
 

@@ -1,4 +1,4 @@
-"""Variants: each changes the recipe, but not the number of steps, except `long`."""
+"""Variants: each changes the recipe, but not the prediction epochs, except `long`."""
 
 import dataclasses
 from pathlib import Path
@@ -6,11 +6,23 @@ from pathlib import Path
 import pytest
 
 from asp_env.errors import AspEnvError
+from predictors.models.losses import DEFAULT_ASSIGNMENT
 from predictors.training.command import Train
-from predictors.training.recipes import TrainingConfig, recipe
-from predictors.training.variants import VARIANTS, variant, warm_starts_from_3s
+from predictors.training.recipes import RECIPES, TrainingConfig, recipe
+from predictors.training.variants import (
+    ASSIGNMENTS,
+    VARIANTS,
+    ablations,
+    variant,
+    warm_starts_from_3s,
+)
 
-EVERY = [(predictor, name) for predictor, names in VARIANTS.items() for name in names]
+EVERY = [
+    (predictor, name)
+    for predictor, names in VARIANTS.items()
+    for name in names
+    if ASSIGNMENTS.get(name) != DEFAULT_ASSIGNMENT
+]
 
 
 def both(
@@ -30,22 +42,53 @@ def both(
 def test_variant_changes_the_recipe_but_not_the_time(
     predictor: str, name: str, recipe_name: str
 ) -> None:
-    """A different configuration with as many epochs in total; `long` has three times as many.
+    """A different configuration with equal prediction epochs; `long` has three times as many.
 
     The epochs of a run for 3 s that the run starts from count, too. With the recipe `paper`,
-    `staged` has 20 in total, 6 s at once have 10.
+    `staged` has 20 in total, 6 s at once have 10. Pre-training is that of the recipe, or of the
+    run for 3 s that is left out; two variants omit it.
     """
     base, changed = both(predictor, name, recipe_name=recipe_name)
     assert changed.preset == f"{recipe_name}+{name}"
     if (recipe_name, name) not in (("paper", "euler"), ("paper", "staged")):  # equal but for start
         assert dataclasses.replace(changed, preset=base.preset) != base
-    epochs = base.all_epochs * (3 if name == "long" else 1)
-    before = recipe(predictor, recipe_name, view="chauffeurnet", horizon_s=3.0).all_epochs
+    epochs, pretraining = base.epochs * (3 if name == "long" else 1), base.pretraining_epochs
+    first = recipe(predictor, recipe_name, view="chauffeurnet", horizon_s=3.0)
     if name == "from-scratch":
-        epochs += before
+        epochs, pretraining = epochs + first.epochs, first.pretraining_epochs
     if name == "staged":
-        epochs = (16 if recipe_name == "cpu" else 20) - before
-    assert changed.all_epochs == epochs
+        epochs = (16 if recipe_name == "cpu" else 20) - first.epochs
+    if name in ("no-pretraining", "no-future-loss"):
+        pretraining = 0
+    assert (changed.epochs, changed.pretraining_epochs) == (epochs, pretraining)
+
+
+RECIPES_OF = [(predictor, name) for predictor, names in RECIPES.items() for name in names]
+
+
+@pytest.mark.parametrize(("predictor", "recipe_name"), RECIPES_OF)
+def test_every_recipe_has_the_other_rules_for_the_best_mode(
+    predictor: str, recipe_name: str
+) -> None:
+    """`nearest` is `angle`; a variant equal to the recipe's own rule is refused and no ablation."""
+    own = recipe(predictor, recipe_name, view="vectors", horizon_s=3.0).network.assignment
+    offered = ablations(predictor, recipe_name)
+    for name, rule in {
+        "nearest": "angle", "distance": "distance", "angle-random": "angle-random",
+    }.items():  # fmt: skip
+        assert (name in offered) == (rule != own)
+        if rule == own:
+            with pytest.raises(AspEnvError, match=f"has the assignment '{rule}' without a variant"):
+                both(predictor, name, recipe_name=recipe_name)
+        else:
+            network = both(predictor, name, recipe_name=recipe_name)[1].network
+            assert network.assignment == rule
+
+
+def test_long_is_no_ablation_where_the_budget_sets_the_epochs() -> None:
+    """The other variants stay."""
+    offered = ablations("dkm", "cpu"), ablations("dkm", "cpu", budget="cpu")
+    assert set(offered[0]) - set(offered[1]) == {"long"}
 
 
 @pytest.mark.parametrize(("recipe_name", "hidden"), [("cpu", 256), ("paper", 4096)])
