@@ -174,7 +174,7 @@ class TrainingModule(pl.LightningModule):
                 return False
         return not self.is_pretraining
 
-    def _progress(self, epochs: float) -> float:
+    def _progress(self, epochs: int | float) -> float:
         """Share of the progress epochs that is over after a number of epochs, all counted."""
         of = self.config.progress_epochs or self.config.epochs
         return min(1.0, max(0.0, epochs - self.config.pretraining_epochs) / of)

@@ -259,7 +259,7 @@ def test_a_table_of_equal_cpu_time(data: str, tmp_path: Path) -> None:
     assert main(["table", data, "--out", str(out), *OPTIONS, *given]) == 0
     config = json.loads(next(out.glob("runs/*/vectors/dkm/3s/seed0/config.json")).read_text())
     assert config["provenance"]["trained_epochs"] == 2
-    text = (out / "table.txt").read_text()
+    text = " ".join((out / "table.txt").read_text().split())
     assert "training, budget: CPU time of mtp:cpu" in text
     assert re.search(r"DKM +2; \d+ s", text)
     manifest = json.loads((out / "manifest.json").read_text())
@@ -366,7 +366,7 @@ def test_folders_of_other_tables_are_refused(
     assert main(["table", data, "--out", str(table), *OPTIONS, "--epochs", "2"]) == 2
     assert "contains a table with other epochs" in capsys.readouterr().err
     assert main(["table", data, "--out", str(table), *OPTIONS, "--budget", "converged"]) == 2
-    assert "contains a table with other budget, patience" in capsys.readouterr().err
+    assert "contains a table with other budget;" in capsys.readouterr().err
     (tmp_path / "letter.txt").write_text("dear")
     assert main(["table", data, "--out", str(tmp_path), *OPTIONS]) == 2
     assert "contains something that is no table" in capsys.readouterr().err

@@ -120,7 +120,7 @@ def test_no_trail_changes_the_view() -> None:
 
 def test_unknown_variants_list_the_known_ones() -> None:
     """Variants of another predictor are unknown."""
-    with pytest.raises(AspEnvError, match=r"variant of dkm 'skip': known are .*causal, euler, "):
+    with pytest.raises(AspEnvError, match=r"variant of dkm 'skip': known are .*causal, distance, "):
         variant("dkm", "skip")
 
 
