@@ -190,6 +190,8 @@ class Table:
                     train = self._train(cell)
                     train.check_budget()
                     train.unlimited_for(cell.horizon_s, epochs=self.epochs)
+                    if self.budget == "cpu":
+                        train.costly_configs()
         except ModuleNotFoundError as error:
             raise MissingExtraError(str(error.name), "train", "training") from error
         return cells
@@ -282,11 +284,13 @@ class Table:
         if cell.start is None:
             return own
         first = self._training(cell.start, campaign)
-        known = own.cpu_s is not None and first.cpu_s is not None
+        cpu_s = None
+        if own.cpu_s is not None and first.cpu_s is not None:
+            cpu_s = first.cpu_s + own.cpu_s
         return Training(
             epochs=first.epochs + own.epochs,
             pretraining_epochs=first.pretraining_epochs + own.pretraining_epochs,
-            cpu_s=first.cpu_s + own.cpu_s if known else None,
+            cpu_s=cpu_s,
         )
 
     def _job(self, cell: Cell, site: Site) -> Job:

@@ -169,15 +169,16 @@ class TrainingModule(pl.LightningModule):
         It may not in pre-training, nor while annealing lets several modes learn from a label.
         """
         if self.config.network.annealed:
-            ended = self._progress(self.current_epoch + 1)
+            ended = self._progress((self.current_epoch + 1) * self._steps_per_epoch)
             if ended <= ANNEAL_UNTIL and ended < 1:
                 return False
         return not self.is_pretraining
 
-    def _progress(self, epochs: int | float) -> float:
-        """Share of the progress epochs that is over after a number of epochs, all counted."""
-        of = self.config.progress_epochs or self.config.epochs
-        return min(1.0, max(0.0, epochs - self.config.pretraining_epochs) / of)
+    def _progress(self, steps: int) -> float:
+        """Share of the steps of the progress epochs that is over after some steps of the run."""
+        epochs = self.config.progress_epochs or self.config.epochs
+        before = self.config.pretraining_epochs * self._steps_per_epoch
+        return min(1.0, max(0, steps - before) / (epochs * self._steps_per_epoch))
 
     def step_plateau(self, loss: float) -> None:
         """Steps the schedule `plateau` with an epoch's validation loss; ignores other schedules."""
@@ -193,7 +194,7 @@ class TrainingModule(pl.LightningModule):
         """
         batch, labels = sample
         progress = TrainingProgress(
-            share=self._progress(self.global_step / self._steps_per_epoch),
+            share=self._progress(self.global_step),
             pretraining=self.is_pretraining,
         )
         terms: dict[str, Tensor] = self.network.training_loss(batch, labels, progress)

@@ -339,6 +339,7 @@ def test_failed_cells_end_with_status_1(
         (["--epochs", "0"], "epochs is 0"),
         (["--patience", "2"], "patience is 2 with the budget epochs"),
         (["--budget", "cpu", "--ablations", "long"], "unknown ablation 'long'"),
+        (["--budget", "cpu", "--cpu-reference", "dkn"], "did you mean 'dkm'"),
         (["--ablations", "angle-random"], "unknown ablation 'angle-random'"),
         (["--validation", "DATA"], "nothing is left to evaluate on; give --test too"),
         (["--test", "DATA", "DATA"], "--test: 2 given, expected one for each of the 1 DATA"),
