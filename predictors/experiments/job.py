@@ -4,6 +4,7 @@ import dataclasses
 import hashlib
 import json
 import sys
+import time
 import traceback
 from dataclasses import dataclass
 from pathlib import Path
@@ -152,31 +153,41 @@ class Job:
         """Whether the run is finished and its errors are computed."""
         return self.trained and (self.evaluation is None or self.evaluation.done)
 
-    def execute(self) -> None:
+    def execute(self) -> float:
         """Trains and computes the errors.
+
+        Returns:
+            CPU time of the training in seconds, with the opening of the data.
 
         Raises:
             AspEnvError: the run or the data are bad.
         """
         self.check()
+        start_s = trained_s = time.process_time()
         if self.train is not None and not self.trained:
             options = dict(self.train)
             for name in ("data", "validation"):
                 options[name] = () if options.get(name) is None else (options[name],)
-            options["out"] = Path(options["out"])
+            for name in ("out", "costs"):
+                options[name] = None if options.get(name) is None else Path(options[name])
             Train(**options).run()
+            trained_s = time.process_time()
         if self.evaluation is not None and not self.evaluation.done:
             self.evaluation.execute()
+        return trained_s - start_s
 
 
-def run_job(job: Job) -> None:
+def run_job(job: Job) -> float:
     """Executes a job in a worker process; the last line of its output states an error.
+
+    Returns:
+        CPU time of the training in seconds.
 
     Raises:
         AspEnvError: the run or the data are bad.
     """
     try:
-        job.execute()
+        return job.execute()
     except AspEnvError as error:
         sys.stdout.flush()
         sys.stderr.write(f"asp-env: {' '.join(str(error).split())}\n")

@@ -71,6 +71,16 @@ class Key(NamedTuple):
         )
 
 
+class Training(NamedTuple):
+    """The training of one line and seed, with the runs that it starts from."""
+
+    epochs: int
+    """Prediction epochs."""
+    pretraining_epochs: int
+    cpu_s: float | None
+    """CPU time in seconds, with the opening of the data; None if it is not known."""
+
+
 class SeedMean(NamedTuple):
     """One metric of a line, averaged over seeds."""
 
@@ -126,6 +136,8 @@ class Findings:
     """Errors by line and seed."""
     features: Mapping[Key, Sequence[Mapping[str, float]]] = field(default_factory=dict)
     """`FEATURES` of the best epoch of each seed, by line; empty without predicted features."""
+    training: Mapping[Key, Sequence[Training]] = field(default_factory=dict)
+    """The training of each seed, by line."""
 
     def __post_init__(self) -> None:
         first: dict[tuple[str, float], str] = {}
@@ -215,6 +227,22 @@ def excludes_zero(estimate: Estimate) -> bool:
     """Whether the interval of an estimate lies on one side of zero."""
     low, high = estimate.low, estimate.high
     return low is not None and high is not None and (low > 0 or high < 0)
+
+
+def trained(run: Path, cpu_s: float | None) -> Training:
+    """The training of a finished run, without the run that it starts from.
+
+    Args:
+        run: folder of the run.
+        cpu_s: CPU time of its training in seconds, if it is known.
+    """
+    provenance = json.loads((run / "config.json").read_text())["provenance"]
+    config = provenance["config"]
+    return Training(
+        epochs=provenance.get("trained_epochs", config["epochs"]),
+        pretraining_epochs=config["pretraining_epochs"],
+        cpu_s=cpu_s,
+    )
 
 
 def best_features(run: Path) -> dict[str, float]:

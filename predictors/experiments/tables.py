@@ -34,6 +34,7 @@ from predictors.experiments.results import (
     Key,
     SeedMean,
     Sums,
+    Training,
     best_features,
     excludes_zero,
 )
@@ -236,6 +237,42 @@ def ablation_table(findings: Findings, column: Key, choice: Choice) -> Table:
     return table
 
 
+def training_table(
+    findings: Findings, sites: Sequence[str], columns: Sequence[Key], budget: str
+) -> Table:
+    """Epochs and CPU time of the training, by view and predictor, site and horizon.
+
+    Args:
+        findings: results of the cells.
+        sites: names of all sites.
+        columns: one key of each site and horizon that is shown.
+        budget: what the number of epochs follows from, in words.
+    """
+    table = _table(
+        f"training, budget: {budget}\n"
+        "prediction epochs + epochs of pre-training; mean CPU time of a seed"
+    )
+    table.caption = "with the runs for 3 s that runs for longer horizons start from"
+    _add_columns(table, sites, columns)
+    lines = _lines(findings, columns, lambda key: key in findings.training)
+    for view, members in _by_view(lines).items():
+        _section(table, view)
+        for line in members:
+            runs = [findings.training.get(_key(line, column), ()) for column in columns]
+            table.add_row(_name(line), *(_training(each) for each in runs))
+    return table
+
+
+def _training(runs: Sequence[Training]) -> str:
+    if not runs:
+        return ""
+    epochs = sorted({each.epochs for each in runs})
+    text = str(epochs[0]) if len(epochs) == 1 else f"{epochs[0]} to {epochs[-1]}"
+    text += f" + {runs[0].pretraining_epochs}" if runs[0].pretraining_epochs else ""
+    times_s = [each.cpu_s for each in runs if each.cpu_s is not None]
+    return f"{text}; {sum(times_s) / len(times_s):.0f} s" if times_s else text
+
+
 def _table(title: str) -> Table:
     return Table(title=title, box=box.SIMPLE_HEAD, show_edge=False, padding=(0, 1, 0, 0))
 
@@ -343,14 +380,21 @@ pre {{ font-family: ui-monospace, Menlo, Consolas, monospace; line-height: 1.25;
 """
 
 
-def read_findings(jobs: Mapping[Cell, EvaluationJob]) -> Findings:
+def read_findings(
+    jobs: Mapping[Cell, EvaluationJob], training: Mapping[Cell, Training] = MappingProxyType({})
+) -> Findings:
     """Reads the results of the cells whose jobs are done.
+
+    Args:
+        jobs: the evaluations of the cells.
+        training: the training of the cells.
 
     Raises:
         AspEnvError: cells of one site and horizon were evaluated on different snippets.
     """
     sums: dict[Key, dict[int, Sums]] = {}
     features: dict[Key, list[dict[str, float]]] = {}
+    trainings: dict[Key, list[Training]] = {}
     for cell, job in jobs.items():
         if not job.done:
             continue
@@ -361,10 +405,14 @@ def read_findings(jobs: Mapping[Cell, EvaluationJob]) -> Findings:
                 sums.setdefault(Key.of(cell, chaining), {})[seed] = Sums.of(Errors.load(path))
         if job.run:
             features.setdefault(Key.of(cell), []).append(best_features(Path(job.run)))
-    return Findings(sums=sums, features=features)
+        if cell in training:
+            trainings.setdefault(Key.of(cell), []).append(training[cell])
+    return Findings(sums=sums, features=features, training=trainings)
 
 
-def tables(findings: Findings, sites: Sequence[Site], width: int) -> list[Table]:
+def tables(
+    findings: Findings, sites: Sequence[Site], width: int, *, budget: str = "epochs"
+) -> list[Table]:
     """All tables that have results.
 
     Args:
@@ -372,6 +420,7 @@ def tables(findings: Findings, sites: Sequence[Site], width: int) -> list[Table]
         sites: all sites.
         width: width in characters. If a table with all columns is wider, there is one for each
             site.
+        budget: what the number of epochs follows from, in words.
     """
     by_column = {(key.site, key.horizon_s): key for key in findings.sums}
     names = [site.name for site in sites]
@@ -392,11 +441,13 @@ def tables(findings: Findings, sites: Sequence[Site], width: int) -> list[Table]
         if any(key.variant and key.view and _same_column(key, column) for key in findings.sums):
             moving = (choice for choice in CHOICES if choice.subset == "moving")
             shown += [ablation_table(findings, column, choice) for choice in moving]
+    if findings.training:
+        shown += [training_table(findings, names, group, budget) for group in filter(None, groups)]
     return shown
 
 
 def rows(findings: Findings, sites: Mapping[str, Site], recipe: str) -> list[Row]:
-    """Lines of `metrics.csv`: means, deviations over seeds, differences, feature statistics.
+    """Lines of `metrics.csv`: means, deviations over seeds, differences, features, epochs.
 
     Args:
         findings: results of the cells.
@@ -425,6 +476,13 @@ def rows(findings: Findings, sites: Mapping[str, Site], recipe: str) -> list[Row
         for name, values in _features_by_name(findings, key).items():
             value = sum(values) / len(values)
             lines.append(Row(**common, metric=name, value=value, n=len(values)))
+        if runs := findings.training.get(key):
+            for name, epochs in (
+                ("prediction epochs", [each.epochs for each in runs]),
+                ("epochs of pre-training", [each.pretraining_epochs for each in runs]),
+            ):
+                value = sum(epochs) / len(runs)
+                lines.append(Row(**common, metric=name, value=value, n=len(runs)))
     return lines
 
 

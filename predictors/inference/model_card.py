@@ -155,6 +155,7 @@ def _recipe(provenance: dict[str, Any]) -> dict[str, object]:
         **{field: value for field, value in sorted(training.items()) if field not in elsewhere},
         "initial weights": provenance.get("start"),
         "processes": provenance.get("processes"),
+        "trained prediction epochs": provenance.get("trained_epochs"),
         "best epoch": provenance.get("best_epoch"),
         "selected by": None
         if best is None

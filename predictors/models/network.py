@@ -21,7 +21,12 @@ from asp_env.geometry import from_frame, wrap_angle
 from asp_env.views.vectors import VectorShape
 from predictors.models.batch import Batch, Labels
 from predictors.models.chaining import Chaining
-from predictors.models.losses import Assignment, Classification, mode_terms
+from predictors.models.losses import (
+    DEFAULT_ASSIGNMENT,
+    Assignment,
+    Classification,
+    mode_terms,
+)
 
 MOTION_SCALE = (10.0, 3.0, 0.5)
 """Divisors of speed (m/s), acceleration (m/s²) and yaw rate (rad/s) at the input of a network.
@@ -42,7 +47,7 @@ class TrainingProgress(NamedTuple):
     """How far the training has come, for losses that depend on it."""
 
     share: float = 1.0
-    """Share of all optimiser steps: 0 at the first one, 1 at the end."""
+    """Share of the steps of the prediction epochs: 0 in pre-training, 1 at the end."""
     pretraining: bool = False
     """Whether only the features are learned (the first epochs of `ssp-asp`)."""
 
@@ -54,6 +59,15 @@ class Features(NamedTuple):
     """Features encoded from the inputs at that time."""
     predicted: Float[Tensor, "n z"]
     """Features predicted from the inputs at the present tick."""
+
+
+class Validation(NamedTuple):
+    """What the validation of a batch computes besides the modes."""
+
+    terms: dict[str, Tensor]
+    """The terms of the loss by name; `loss` is their weighted sum."""
+    features: Features | None = None
+    """None if the network predicts no features."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -83,7 +97,7 @@ class NetworkConfig:
     """Number of features z that the encoder returns."""
     modes: int = 3
     """Number of modes M; SSP-ASP predicts M in each segment."""
-    assignment: Assignment = "angle-random"
+    assignment: Assignment = DEFAULT_ASSIGNMENT
     """How the best mode of a label is chosen."""
     classification: Classification = "cross-entropy"
     """The classification term of the loss."""
@@ -242,10 +256,19 @@ class AbstractNetwork(nn.Module, ABC):
         """The terms of the loss in training by name; `loss` is their weighted sum."""
         return self.loss(self(batch), labels, progress)
 
-    def features(self, batch: Batch, labels: Labels) -> Features | None:
-        """Features at the end of the first segment; None if the network predicts no features."""
-        del batch, labels
-        return None
+    def validate(
+        self, modes: Modes, batch: Batch, labels: Labels, progress: TrainingProgress
+    ) -> Validation:
+        """The loss of a forecast with the terms and weights of the training, and the features.
+
+        Args:
+            modes: The forecast, which is made without the labels.
+            batch: Inputs.
+            labels: Labels.
+            progress: How far the training has come; its `share` is 1.
+        """
+        del batch
+        return Validation(self.loss(modes, labels, progress))
 
     def after_step(self) -> None:
         """Called after every step of the optimiser."""

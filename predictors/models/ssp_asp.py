@@ -6,14 +6,17 @@ z, ẑ and the past actions to the actions of that segment (equation 18), as a G
 readings of `predictors.models.heads` (`decoder`). In training the observation
 at the end of the segment is encoded too (equation 16); the action reconstructor ξ maps both encoded
 features to the past actions (equation 13), and γ runs on the encoded and on the predicted features.
-A forecast has only the predicted ones, so validation uses those. The loss is L_SSP (equation 20).
-Longer horizons chain segments, see `predictors.models.chaining`.
+A forecast has only the predicted ones, so validation uses those. The loss is L_SSP (equation 20);
+its terms have the weights w1 (reconstruction of the past actions), w2 (mismatch of the features),
+w3 (regression) and w4 (classification), in validation as in training. Longer horizons chain
+segments, see `predictors.models.chaining`.
 
-Choices that the paper leaves open: the future observation is rendered in the target's pose at the
-end of the segment; features pass a LayerNorm before ψ and γ; a linear layer follows ψ, since
-features are unbounded; the loss is the mean over both branches and over the segments; a later
-segment is predicted from what is available at inference, the predicted features and the actions of
-the matched mode.
+Choices that the paper leaves open: the actions of w1 are normalised, in units of the action range
+(99.9th percentiles of the training data), so that acceleration and steering count alike; the future
+observation is rendered in the target's pose at the end of the segment; features pass a LayerNorm
+before ψ and γ; a linear layer follows ψ, since features are unbounded; the loss is the mean over
+both branches and over the segments; a later segment is predicted from what is available at
+inference, the predicted features and the actions of the matched mode.
 
 In the paper the past and the segments have the same length ("the same T-step time interval for all
 the past and future values", section IV-D), 3 s. Here `segment_s` may differ from the history: γ and
@@ -62,6 +65,7 @@ from predictors.models.network import (
     NetworkConfig,
     NetworkShape,
     TrainingProgress,
+    Validation,
     rollout_from,
     rollout_from_now,
     start_states,
@@ -293,25 +297,27 @@ class SSPASPNetwork(AbstractNetwork):
         encoded, targets = self._encode_all(batch, labels)
         with torch.autocast(batch.actions.device.type, enabled=False):
             segments = list(self._terms(batch, labels, progress, encoded, targets))
-        terms = {name: torch.stack([s[name] for s in segments]).mean() for name in segments[0]}
-        weights = {
-            "actions": self._options.action_weight,
-            "features": self._options.feature_weight,
-            "regression": self._options.regression_weight,
-            "classification": self._options.classification_weight,
-        }
-        total = torch.stack([weights[name] * value for name, value in terms.items()]).sum()
-        return {"loss": total, **terms}
+        return self._weighted(_means(segments))
 
-    def features(self, batch: Batch, labels: Labels) -> Features | None:
-        """Encoded and predicted features at the end of the first segment."""
-        z = self.encode(batch)
-        inputs = SegmentInput(
-            z, self.scaled_actions(batch.actions), start_states(batch), batch.length_m
-        )
-        with torch.autocast(z.device.type, enabled=False):
-            predicted = self.predict_features(inputs)
-        return Features(self.encode(labels.later[0]), predicted)
+    def validate(
+        self, modes: Modes, batch: Batch, labels: Labels, progress: TrainingProgress
+    ) -> Validation:
+        """L_SSP (equation 20) of a forecast, and the features at the end of the first segment.
+
+        The terms of w1 and w2 are those of the training, along the recorded actions; those of w3
+        and w4 are of the modes of the forecast and missing in pre-training.
+        """
+        encoded, targets = self._encode_all(batch, labels)
+        of_features = progress._replace(pretraining=True)
+        with torch.autocast(batch.actions.device.type, enabled=False):
+            terms = _means(list(self._terms(batch, labels, of_features, encoded, targets)))
+            past = self.scaled_actions(batch.actions)
+            inputs = SegmentInput(encoded[0], past, start_states(batch), batch.length_m)
+            features = Features(encoded[1], self.predict_features(inputs))
+        if not progress.pretraining:
+            of_modes = self.loss(modes, labels, progress)
+            terms |= {name: of_modes[name] for name in ("regression", "classification")}
+        return Validation(self._weighted(terms), features)
 
     def after_step(self) -> None:
         """Updates the second encoder, if there is one: averages weights, copies buffers."""
@@ -323,6 +329,17 @@ class SSPASPNetwork(AbstractNetwork):
                 follower.lerp_(leader, 1 - self._options.ema)
             for follower, leader in zip(followers.buffers(), leaders.buffers(), strict=True):
                 follower.copy_(leader)
+
+    def _weighted(self, terms: dict[str, Tensor]) -> dict[str, Tensor]:
+        """The terms, and `loss`, their sum with the weights w1 to w4."""
+        weights = {
+            "actions": self._options.action_weight,
+            "features": self._options.feature_weight,
+            "regression": self._options.regression_weight,
+            "classification": self._options.classification_weight,
+        }
+        total = torch.stack([weights[name] * value for name, value in terms.items()]).sum()
+        return {"loss": total, **terms}
 
     def _segment(self, inputs: SegmentInput) -> Chains:
         """One segment as in a forecast, on predicted features."""
@@ -483,3 +500,8 @@ class SSPASPNetwork(AbstractNetwork):
 
     def _normalised(self, z: Float[Tensor, "n z"]) -> Float[Tensor, "n z"]:
         return functional.layer_norm(z, z.shape[1:]) if self._options.normalise else z
+
+
+def _means(segments: Sequence[dict[str, Tensor]]) -> dict[str, Tensor]:
+    """The mean of each term over the segments."""
+    return {name: torch.stack([each[name] for each in segments]).mean() for name in segments[0]}

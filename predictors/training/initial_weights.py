@@ -45,9 +45,12 @@ class InitialWeights:
                 step.
         """
         if path.is_file():
-            digest = hashlib.sha256(path.read_bytes()).hexdigest()
             return cls(
-                path=path, weights_hash=digest, action_range=None, weights=None, trained_on=None
+                path=path,
+                weights_hash=file_hash(path),
+                action_range=None,
+                weights=None,
+                trained_on=None,
             )
         config = read_config(path)
         if config["predictor"] != spec.name:
@@ -73,10 +76,9 @@ class InitialWeights:
             raise CheckpointError(
                 f"{path} does not name its normaliser and its training data: train again"
             ) from error
-        digest = hashlib.sha256((path / WEIGHTS).read_bytes()).hexdigest()
         return cls(
             path=path,
-            weights_hash=digest,
+            weights_hash=file_hash(path / WEIGHTS),
             action_range=scale,
             weights=weights,
             trained_on=trained_on,
@@ -120,3 +122,8 @@ def _is_view(config: Any, view: SceneView) -> bool:
         return view_from_config(config) == view
     except (AspEnvError, AttributeError, TypeError, ValueError):
         return False
+
+
+def file_hash(path: Path) -> str:
+    """The SHA-256 of a file of weights."""
+    return hashlib.sha256(path.read_bytes()).hexdigest()

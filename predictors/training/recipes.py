@@ -22,8 +22,16 @@ from predictors.models.mtp import MTPConfig
 from predictors.models.network import NetworkConfig
 from predictors.models.ssp_asp import SSPASPConfig
 
+Budget = Literal["epochs", "cpu", "converged"]
+"""What the prediction epochs of a run follow from: its recipe, equal CPU time, or convergence."""
+
 SEGMENT_S = 3.0
 """Length of the segments that `ssp-asp` chains by default, seconds: the paper's shorter horizon."""
+
+SHORT_SEGMENT_SHARE = 0.5
+"""Share of the budget of a run for 3 s that a run for one shorter segment has; the rest is that of
+the run for 3 s, which starts from it. Chosen by hand: both learn the same, over fewer or more
+ticks."""
 
 CHAINED = frozenset({"ssp-asp"})
 """Predictors whose runs for longer horizons start from the weights of a run for one segment, as in
@@ -61,9 +69,17 @@ class TrainingConfig:
     standing_share: float = 1.0
     """Largest share of standing targets in the training snippets."""
     epochs: int = 10
-    """Epochs after the pre-training."""
+    """Prediction epochs: those after the pre-training; their largest number with `patience`."""
     pretraining_epochs: int = 0
-    """Epochs before, in which `ssp-asp` learns its features only."""
+    """Epochs before the prediction epochs, in which `ssp-asp` learns its features only."""
+    budget: Budget = "epochs"
+    """What the number of prediction epochs follows from, see `predictors.training.budgets`."""
+    patience: int | None = None
+    """Prediction epochs without a lower validation error after which the training ends; None for
+    all epochs."""
+    progress_epochs: int | None = None
+    """Prediction epochs after which the annealing of modes and the scheduled continuation of
+    segments are complete; None for all."""
     snippets_per_epoch: int | None = None
     """Largest number of snippets in an epoch, which bounds the time of a run on much data; None for
     all."""
@@ -86,6 +102,8 @@ class TrainingConfig:
         """
         for field in (
             "epochs",
+            "patience",
+            "progress_epochs",
             "batch_size",
             "snippets_per_epoch",
             "max_snippets",
@@ -98,6 +116,11 @@ class TrainingConfig:
         if self.pretraining_epochs < 0:
             raise AspEnvError(
                 f"training: pretraining_epochs is {self.pretraining_epochs}, expected 0 or more"
+            )
+        if self.patience is not None and self.schedule != "plateau":
+            raise AspEnvError(
+                f"training: patience is {self.patience} with the schedule {self.schedule}, which "
+                "ends after a given number of steps: expected the schedule plateau"
             )
         if not 0 < self.standing_share <= 1:
             raise AspEnvError(
@@ -116,7 +139,7 @@ class TrainingConfig:
 
     @property
     def all_epochs(self) -> int:
-        """Number of epochs, pre-training included."""
+        """Number of epochs of the run: pre-training and prediction epochs."""
         return self.pretraining_epochs + self.epochs
 
 
@@ -179,13 +202,14 @@ def ssp_asp_paper(view: str, horizon_s: float, segment_s: float = SEGMENT_S) -> 
     """
     segment_ticks(segment_s, horizon_s=horizon_s, dt_s=DEFAULT_DT_S)
     config = _paper("ssp-asp", SSPASPConfig(segment_s=segment_s), view, horizon_s)
-    return _pretrained(config, horizon_s, 3, of=config.epochs + 3)
+    return _with_pretraining(config, horizon_s, 3)
 
 
 def ssp_asp_cpu(view: str, horizon_s: float, segment_s: float = SEGMENT_S) -> TrainingConfig:
     """`asp-env train ssp-asp DATA`: SSP-ASP at small size, see `_small`, by Heun's method.
 
-    Pre-training takes two of the eight epochs, so that the time is that of the other predictors.
+    Two epochs of pre-training come before the eight prediction epochs, as in the paper, where they
+    are additional.
 
     Raises:
         AspEnvError: The horizon is not a whole number of segments, or a segment not one of ticks.
@@ -193,7 +217,7 @@ def ssp_asp_cpu(view: str, horizon_s: float, segment_s: float = SEGMENT_S) -> Tr
     segment_ticks(segment_s, horizon_s=horizon_s, dt_s=DEFAULT_DT_S)
     network = SSPASPConfig(segment_s=segment_s, gru_width=128, integrator="heun")
     config = _small("ssp-asp", "cpu", network, view, horizon_s)
-    return _pretrained(config, horizon_s, 2, of=config.epochs)
+    return _with_pretraining(config, horizon_s, 2)
 
 
 def ssp_asp_ours(view: str, horizon_s: float, segment_s: float = SEGMENT_S) -> TrainingConfig:
@@ -305,8 +329,8 @@ def _small(
     """Small size, for minutes on two cores; the numbers are chosen by hand.
 
     Rasters have a quarter of the resolution, the encoder is small, and the schedule is
-    `one-cycle`. A longer horizon takes as many epochs again: after those for 3 s if segments are
-    chained, else at once.
+    `one-cycle`. A longer horizon takes as many prediction epochs again: after those for 3 s if
+    segments are chained, else at once.
     """
     at_once = horizon_s > SEGMENT_S and predictor not in CHAINED
     vectors = view.startswith("vectors")
@@ -332,10 +356,8 @@ def _small(
     )
 
 
-def _pretrained(
-    config: TrainingConfig, horizon_s: float, epochs: int, *, of: int
-) -> TrainingConfig:
-    """Makes some of all epochs pre-training, unless the run starts from one that had it."""
+def _with_pretraining(config: TrainingConfig, horizon_s: float, epochs: int) -> TrainingConfig:
+    """Adds epochs of pre-training, unless the run starts from one that had them."""
     if horizon_s > config.first_stage_s:
         return config
-    return dataclasses.replace(config, pretraining_epochs=epochs, epochs=of - epochs)
+    return dataclasses.replace(config, pretraining_epochs=epochs)

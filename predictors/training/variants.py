@@ -1,8 +1,8 @@
 """Variants of recipes, for ablations: named changes of a configuration.
 
-A variant has as many training steps in total as its recipe, including those of the run that it
-starts from, so that a difference is not one of training time. The exceptions are `long`, and
-`staged` of the recipe `paper`.
+A variant has as many prediction epochs in total as its recipe, including those of the run that it
+starts from. The exceptions are `long`, and `staged` of the recipe `paper`. Pre-training is
+additional: `no-pretraining` omits it, and `long` does not repeat it.
 """
 
 import dataclasses
@@ -11,9 +11,17 @@ from dataclasses import dataclass
 from types import MappingProxyType
 from typing import Any
 
-from asp_env.errors import unknown_name
+from asp_env.errors import AspEnvError, unknown_name
 from asp_env.views import VIEWS
-from predictors.training.recipes import CHAINED, SEGMENT_S, TrainingConfig, recipe
+from predictors.models.losses import Assignment
+from predictors.training.recipes import (
+    CHAINED,
+    SEGMENT_S,
+    SHORT_SEGMENT_SHARE,
+    Budget,
+    TrainingConfig,
+    recipe,
+)
 
 Change = Callable[[TrainingConfig], TrainingConfig]
 
@@ -65,9 +73,10 @@ def connected_head(config: TrainingConfig) -> TrainingConfig:
 def segments(segment_s: float, horizons_s: tuple[float, ...]) -> Variant:
     """A variant with segments of another length.
 
-    Its runs have as many epochs in total as those of the recipe, for every horizon. With segments
-    shorter than 3 s the pre-training and half of the epochs for 3 s are those of the run for one
-    segment, which longer runs start from; with longer ones there is no such run.
+    Its runs have as many prediction epochs in total as those of the recipe, for every horizon. With
+    segments shorter than 3 s half of those for 3 s (`SHORT_SEGMENT_SHARE`) are those of the run for
+    one segment, which longer runs start from; with longer ones there is no such run. The
+    pre-training is additional and comes before the run for one segment.
 
     Args:
         segment_s: Length of a segment, seconds.
@@ -85,7 +94,7 @@ def segments(segment_s: float, horizons_s: tuple[float, ...]) -> Variant:
             ).epochs
 
         whole = epochs(SEGMENT_S)
-        shared = whole / 2 if segment_s < SEGMENT_S else 0.0
+        shared = SHORT_SEGMENT_SHARE * whole if segment_s < SEGMENT_S else 0.0
         if config.horizon_s > SEGMENT_S:
             whole += epochs(config.horizon_s)
         own = shared if config.horizon_s < SEGMENT_S else whole - shared
@@ -112,31 +121,37 @@ def causal(config: TrainingConfig) -> TrainingConfig:
 
 
 def long(config: TrainingConfig) -> TrainingConfig:
-    """Multiplies the number of epochs by three."""
-    return dataclasses.replace(
-        config, epochs=3 * config.epochs, pretraining_epochs=3 * config.pretraining_epochs
-    )
+    """Multiplies the number of prediction epochs by three."""
+    return dataclasses.replace(config, epochs=3 * config.epochs)
 
 
 def no_pretraining(config: TrainingConfig) -> TrainingConfig:
-    """Replaces pre-training by epochs of full training."""
-    return dataclasses.replace(config, pretraining_epochs=0, epochs=config.all_epochs)
+    """Omits the pre-training; the prediction epochs stay."""
+    return dataclasses.replace(config, pretraining_epochs=0)
 
 
-def all_epochs(config: TrainingConfig) -> TrainingConfig:
-    """Adds the epochs of a run for 3 s, for a run that does not start from one."""
-    first, own = _epochs(config, SEGMENT_S), _epochs(config, config.horizon_s)
-    return _scaled(config, (first + own) / own)
+def both_stages(config: TrainingConfig) -> TrainingConfig:
+    """Adds the pre-training and the epochs of the first stage, for a run that has none."""
+    first, own = _recipe(config, config.first_stage_s), _recipe(config, config.horizon_s)
+    scaled = _scaled(config, (first.epochs + own.epochs) / own.epochs)
+    return dataclasses.replace(scaled, pretraining_epochs=first.pretraining_epochs)
 
 
 def second_stage(config: TrainingConfig) -> TrainingConfig:
     """Trains as many epochs as a run for 3 s, for a run that starts from one."""
-    return _scaled(config, _epochs(config, SEGMENT_S) / _epochs(config, config.horizon_s))
+    first, own = _recipe(config, SEGMENT_S), _recipe(config, config.horizon_s)
+    return _scaled(config, first.epochs / own.epochs)
 
 
-def _epochs(config: TrainingConfig, horizon_s: float) -> int:
-    """Number of epochs of the recipe."""
-    return recipe(config.predictor, config.preset, view=config.view, horizon_s=horizon_s).all_epochs
+def _recipe(config: TrainingConfig, horizon_s: float) -> TrainingConfig:
+    """The unchanged recipe for a horizon."""
+    return recipe(
+        config.predictor,
+        config.preset,
+        view=config.view,
+        horizon_s=horizon_s,
+        segment_s=config.segment_s,
+    )
 
 
 def _scaled(config: TrainingConfig, factor: float) -> TrainingConfig:
@@ -144,11 +159,39 @@ def _scaled(config: TrainingConfig, factor: float) -> TrainingConfig:
     return dataclasses.replace(config, epochs=max(1, round(factor * config.epochs)))
 
 
+def _assigned(assignment: Assignment) -> Change:
+    """Changes how the best mode of a label is chosen.
+
+    The change raises an `AspEnvError` if the recipe chooses in this way.
+    """
+
+    def change(config: TrainingConfig) -> TrainingConfig:
+        if config.network.assignment == assignment:
+            raise AspEnvError(
+                f"the recipe {config.preset} of {config.predictor} has the assignment "
+                f"{assignment!r} without a variant: leave the variant out"
+            )
+        return _network(assignment=assignment)(config)
+
+    return change
+
+
+ASSIGNMENTS: Mapping[str, Assignment] = MappingProxyType(
+    {"nearest": "angle", "distance": "distance", "angle-random": "angle-random"}
+)
+"""The variants of the rule by which a mode learns, see `predictors.models.losses`.
+
+`nearest` is the paper's text: the mode with the lowest mean distance among those within 5° of the
+label's end, of all modes where there is none. `angle-random` is the published code of MTP, which
+draws a random mode there. `distance` ignores the angle.
+"""
+
 _COMMON = {
     "no-trail": Variant(change=no_trail),
     "causal": Variant(change=causal),
     "long": Variant(change=long),
     "annealed": Variant(change=_network(annealed=True)),
+    **{name: Variant(change=_assigned(rule)) for name, rule in ASSIGNMENTS.items()},
 }
 _ACTION_SPACE = _COMMON | {
     "euler": Variant(change=_network(integrator="euler")),
@@ -185,7 +228,7 @@ VARIANTS: Mapping[str, Mapping[str, Variant]] = MappingProxyType(
             "skip": Variant(change=_network(skip=True)),
             "no-pretraining": Variant(change=no_pretraining),
             "from-scratch": Variant(
-                change=all_epochs, horizons_s=(6.0,), warm_starts_from_3s=False
+                change=both_stages, horizons_s=(6.0,), warm_starts_from_3s=False
             ),
             "ema": Variant(change=_network(ema=0.99)),
             "stop-gradient": Variant(change=_network(stop_gradient=True)),
@@ -217,6 +260,28 @@ def variant(predictor: str, name: str) -> Variant:
     if name not in variants:
         raise unknown_name(f"variant of {predictor}", name, variants)
     return variants[name]
+
+
+def ablations(predictor: str, recipe_name: str, *, budget: Budget = "epochs") -> dict[str, Variant]:
+    """The variants that differ from a recipe under a budget.
+
+    The recipe's own assignment is not among them, nor is `long` where the budget sets the number of
+    epochs.
+
+    Args:
+        predictor: Name of the predictor.
+        recipe_name: Name of the recipe.
+        budget: What the number of epochs follows from.
+
+    Raises:
+        AspEnvError: The predictor has no such recipe.
+    """
+    own = recipe(predictor, recipe_name, view="vectors", horizon_s=SEGMENT_S).network.assignment
+    omitted = {name for name, rule in ASSIGNMENTS.items() if rule == own}
+    if budget != "epochs":
+        omitted.add("long")
+    variants = VARIANTS.get(predictor, {})
+    return {name: each for name, each in variants.items() if name not in omitted}
 
 
 def warm_starts_from_3s(predictor: str, name: str | None = None) -> bool:

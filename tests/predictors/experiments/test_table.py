@@ -1,10 +1,12 @@
 """`asp-env table`: a small table, its numbers by hand, and errors."""
 
 import csv
+import dataclasses
 import fcntl
 import io
 import json
 import math
+import re
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -22,9 +24,16 @@ from predictors.experiments.results import (
     Findings,
     Key,
     Sums,
+    Training,
     excludes_zero,
 )
-from predictors.experiments.tables import PAPER, difference_table, main_table, paper_errors
+from predictors.experiments.tables import (
+    PAPER,
+    difference_table,
+    main_table,
+    paper_errors,
+    training_table,
+)
 from tests.predictors.tiny import write_data
 
 MOST_PROBABLE = Choice("most-probable", "all")
@@ -217,16 +226,57 @@ def test_a_whole_table(table: Path) -> None:
         rows = list(csv.DictReader(file))
     predictors = {row["predictor"] for row in rows}
     assert predictors == {"constant-velocity", "constant-turn-rate", "dkm"}
-    dkm = [row for row in rows if row["predictor"] == "dkm"]
+    dkm = [row for row in rows if row["predictor"] == "dkm" and row["selection"]]
     metrics = {f"{m}{less}" for m in METRICS for less in ("", " less constant-turn-rate")}
     assert {row["metric"] for row in dkm} == metrics
     assert {row["selection"] for row in dkm} == {"most-probable", "best-of-3"}
     assert {(row["recipe"], row["view"]) for row in dkm} == {("cpu", "vectors")}
+    epochs = {row["metric"]: row["value"] for row in rows if "epochs" in row["metric"]}
+    assert {name: float(value) for name, value in epochs.items()} == {
+        "prediction epochs": 1.0,
+        "epochs of pre-training": 0.0,
+    }
+    text = (table / "table.txt").read_text()
+    assert "training, budget: prediction epochs" in text
+    assert re.search(r"DKM +1; \d+ s", text)
     assert "report.html" in content(table)
     assert "paper 0.48 / 0.86 / 2.01" in (table / "table.txt").read_text()
     manifest = json.loads((table / "manifest.json").read_text())
     assert manifest["failed"] == {}
     assert manifest["options"]["seeds"] == [0]
+
+
+def test_a_table_of_equal_cpu_time(data: str, tmp_path: Path) -> None:
+    """The epochs follow from the stored costs: 3 · 2 s for the reference, 6 s / 4 s are 2."""
+    costs = tmp_path / "costs.json"
+    epochs = {
+        "mtp:cpu/vectors/3s": {"prediction_s": 2.0},
+        "dkm:cpu/vectors/3s": {"prediction_s": 4.0},
+    }
+    costs.write_text(json.dumps({"reference": "mtp:cpu", "epochs": epochs}))
+    out = tmp_path / "table"
+    given = ["--budget", "cpu", "--cpu-reference", "mtp", "--costs", str(costs), "--epochs", "3"]
+    assert main(["table", data, "--out", str(out), *OPTIONS, *given]) == 0
+    config = json.loads(next(out.glob("runs/*/vectors/dkm/3s/seed0/config.json")).read_text())
+    assert config["provenance"]["trained_epochs"] == 2
+    text = " ".join((out / "table.txt").read_text().split())
+    assert "training, budget: CPU time of mtp:cpu" in text
+    assert re.search(r"DKM +2; \d+ s", text)
+    manifest = json.loads((out / "manifest.json").read_text())
+    assert manifest["epoch costs"]["epochs"]["dkm:cpu/vectors/3s"]["prediction_s"] == 4.0
+    assert main(["table", data, "--out", str(out), *OPTIONS, "--epochs", "3"]) == 2
+
+
+def test_the_training_of_a_line_by_hand() -> None:
+    """Epochs of several seeds are a range, CPU times a mean; unknown times are left out."""
+    column = key("dkm")
+    runs = [Training(20, 0, 100.0), Training(31, 0, 140.0)]
+    found = dataclasses.replace(findings(), training={column: runs})
+    text = printed(training_table(found, ["here"], [column], "in words"))
+    assert "training, budget: in words" in text
+    assert "20 to 31; 120 s" in text
+    found = dataclasses.replace(findings(), training={column: [Training(8, 2, None)]})
+    assert "8 + 2 " in printed(training_table(found, ["here"], [column], "in words"))
 
 
 def test_a_finished_table_is_not_repeated(data: str, table: Path) -> None:
@@ -287,6 +337,10 @@ def test_failed_cells_end_with_status_1(
         (["--horizons", "0.3"], "0.3"),
         (["--jobs", "-1"], "jobs is -1"),
         (["--epochs", "0"], "epochs is 0"),
+        (["--patience", "2"], "patience is 2 with the budget epochs"),
+        (["--budget", "cpu", "--ablations", "long"], "unknown ablation 'long'"),
+        (["--budget", "cpu", "--cpu-reference", "dkn"], "did you mean 'dkm'"),
+        (["--ablations", "nearest"], "unknown ablation 'nearest'"),
         (["--validation", "DATA"], "nothing is left to evaluate on; give --test too"),
         (["--test", "DATA", "DATA"], "--test: 2 given, expected one for each of the 1 DATA"),
         (["--test", "DATA"], "evaluate on recordings that are neither trained nor selected on"),
@@ -312,6 +366,8 @@ def test_folders_of_other_tables_are_refused(
     """A table with other options, and a folder with something else."""
     assert main(["table", data, "--out", str(table), *OPTIONS, "--epochs", "2"]) == 2
     assert "contains a table with other epochs" in capsys.readouterr().err
+    assert main(["table", data, "--out", str(table), *OPTIONS, "--budget", "converged"]) == 2
+    assert "contains a table with other budget;" in capsys.readouterr().err
     (tmp_path / "letter.txt").write_text("dear")
     assert main(["table", data, "--out", str(tmp_path), *OPTIONS]) == 2
     assert "contains something that is no table" in capsys.readouterr().err

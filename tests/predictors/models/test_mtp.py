@@ -128,8 +128,9 @@ def test_modes_do_not_collapse(seed: int, modes: int, changes: dict[str, Any]) -
     np.testing.assert_allclose(probabilities[nearest], [0.75, 0.25], atol=0.02)
 
 
-def test_modes_collapse_by_distance() -> None:
-    """By distance one mode wins both labels, with certainty: why other rules are needed."""
-    _, terms = train_on_bimodal(3, 1, assignment="distance")
+@pytest.mark.parametrize("assignment", ["angle", "distance"])
+def test_modes_collapse_without_random_choice(assignment: str) -> None:
+    """The nearest mode wins both labels, with certainty, where all inputs are equal."""
+    _, terms = train_on_bimodal(3, 1, assignment=assignment)
     assert terms["classification"] < 0.01
     assert terms["regression"] > 1
