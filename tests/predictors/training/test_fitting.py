@@ -157,7 +157,6 @@ def test_progress_bar_names_the_stage(
     shown = "".join(capsys.readouterr())
     assert "pre-training 1/1" in shown
     assert "epoch 1/1" in shown
-    assert "Epoch" not in shown
 
 
 def test_finished_run_is_refused(data: str, finished: Path) -> None:
