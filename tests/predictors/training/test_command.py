@@ -58,14 +58,14 @@ def test_segments_and_histories_of_other_lengths(
 
 
 def test_a_chain_of_three_segments_is_evaluated(data: str, tmp_path: Path) -> None:
-    """9 s from a run for 3 s, forecast and scored over the whole horizon."""
+    """6 s from a run for 2 s, forecast and scored over the whole horizon."""
     out = tmp_path / "run"
-    dataclasses.replace(command("ssp-asp", data, out), horizon=9.0).run()
-    assert (out / "3s" / "config.json").exists()
+    dataclasses.replace(command("ssp-asp", data, out), segment_s=2.0).run()
+    assert (out / "2s" / "config.json").exists()
     name = f"ssp-asp:{out}"
     result = evaluate(
         Evaluate(
-            data=data, predictors=(name,), horizon=9.0, part="all", planner="none", out=tmp_path
+            data=data, predictors=(name,), horizon=6.0, part="all", planner="none", out=tmp_path
         )
     )
     errors = [row.value for row in result.rows if row.metric == "FDE"]
