@@ -2,11 +2,13 @@
 
 from asp_env.views.chauffeurnet import ChauffeurNet
 from asp_env.views.factory import (
-    VIEWS,
-    ViewEntry,
+    ViewPlug,
+    ViewVariant,
     make_raster_view,
     make_view,
+    raster_view_names,
     view_from_config,
+    view_names,
 )
 from asp_env.views.mtp import MTP
 from asp_env.views.raster import Viewport
@@ -24,7 +26,6 @@ __all__ = [
     "AGENT_FIELDS",
     "LINE_FIELDS",
     "MTP",
-    "VIEWS",
     "BinaryView",
     "ChauffeurNet",
     "RasterView",
@@ -34,9 +35,12 @@ __all__ = [
     "VectorShape",
     "VectorView",
     "Vectors",
-    "ViewEntry",
+    "ViewPlug",
+    "ViewVariant",
     "Viewport",
     "make_raster_view",
     "make_view",
+    "raster_view_names",
     "view_from_config",
+    "view_names",
 ]

@@ -15,7 +15,7 @@ from asp_env.data.recording import DEFAULT_DT_S, ticks
 from asp_env.errors import AspEnvError, MissingExtraError, unknown_name
 from asp_env.files import atomic_file, leftovers
 from asp_env.metrics.forecast.errors import MODE_RULES
-from asp_env.views import VIEWS
+from asp_env.views import view_names
 from predictors.experiments.campaign import COST, Campaign
 from predictors.experiments.cells import (
     CAUSAL,
@@ -123,8 +123,8 @@ class Table:
         if not (self.data and self.views and self.predictors and self.horizons and self.seeds):
             raise AspEnvError("table: give DATA, views, predictors, horizons and seeds, each once")
         for view in (*self.views, self.ablation_view):
-            if view not in VIEWS:
-                raise unknown_name("view", view, VIEWS)
+            if view not in view_names():
+                raise unknown_name("view", view, view_names())
         for horizon in self.horizons:
             ticks(horizon, DEFAULT_DT_S)
         if self.jobs < 0 or (self.per_recording is not None and self.per_recording < 1):

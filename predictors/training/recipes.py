@@ -13,6 +13,7 @@ from typing import Literal
 from asp_env.data.recording import DEFAULT_DT_S
 from asp_env.data.split import Split
 from asp_env.errors import AspEnvError, unknown_name
+from asp_env.views import RasterView, make_view
 from predictors.models.dkm import DKMConfig
 from predictors.models.ffw_asp import FFWASPConfig
 from predictors.models.mtp import MTPConfig
@@ -247,7 +248,7 @@ def recipe(predictor: str, name: str, *, view: str, horizon_s: float) -> Trainin
 
 def _paper(predictor: str, network: NetworkConfig, view: str, horizon_s: float) -> TrainingConfig:
     """The paper's size and schedule: Adam at 1e-4, batches of 32, 10 epochs, `plateau`."""
-    if view.startswith("vectors"):
+    if not isinstance(make_view(view), RasterView):
         network = dataclasses.replace(network, encoder="vector")
     return TrainingConfig(
         predictor=predictor,
@@ -269,15 +270,16 @@ def _small(
     chained, else at once.
     """
     at_once = horizon_s > SEGMENT_S and predictor not in CHAINED
-    vectors = view.startswith("vectors")
-    pixels = (90, 90) if view == "mtp" else (90, 60)
+    drawn = make_view(view)
+    vectors = not isinstance(drawn, RasterView)
+    pixels = None if vectors else (drawn.shape[1] // 4, drawn.shape[2] // 4)
     network = dataclasses.replace(network, encoder="vector" if vectors else "small", features=256)
     return TrainingConfig(
         predictor=predictor,
         preset=name,
         network=network,
         view=view,
-        pixels=None if vectors else pixels,
+        pixels=pixels,
         horizon_s=horizon_s,
         standing_share=0.25,
         epochs=16 if at_once else 8,
