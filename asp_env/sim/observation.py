@@ -17,6 +17,7 @@ from numba import njit
 
 from asp_env.data.road_map import RoadMap
 from asp_env.data.scene import EGO, infer_actions
+from asp_env.data.signals import SceneSignals
 from asp_env.dynamics import MAX_STEERING_RAD
 from asp_env.errors import AspEnvError, unknown_name
 from asp_env.geometry import wrap_angle
@@ -92,6 +93,8 @@ class ObservationContext:
     map_index: Int[np.ndarray, " b"]
     """Index of each situation's map in `maps`."""
     dt_s: float
+    signals: SceneSignals | None = None
+    """Traffic signals up to now; None if no recording of the situations has any."""
 
     @property
     def history(self) -> int:
@@ -135,6 +138,7 @@ def ego_context(world: World, rows: Int[np.ndarray, " n"] | None = None) -> Obse
         maps=maps,
         map_index=map_index if every_row else map_index[rows],
         dt_s=world.dt_s,
+        signals=world.signals(rows),
     )
 
 

@@ -1,6 +1,7 @@
 """Views: scenes as arrays for a network, as rasters or as vectors."""
 
 from asp_env.views.chauffeurnet import ChauffeurNet
+from asp_env.views.draw import fill_box, fill_segment
 from asp_env.views.factory import (
     ViewPlug,
     ViewVariant,
@@ -11,7 +12,7 @@ from asp_env.views.factory import (
     view_names,
 )
 from asp_env.views.mtp import MTP
-from asp_env.views.raster import Viewport
+from asp_env.views.raster import PlacedScene, Viewport, place_targets, raster_memory
 from asp_env.views.vectors import (
     AGENT_FIELDS,
     LINE_FIELDS,
@@ -28,6 +29,7 @@ __all__ = [
     "MTP",
     "BinaryView",
     "ChauffeurNet",
+    "PlacedScene",
     "RasterView",
     "RenderInput",
     "SceneView",
@@ -38,8 +40,12 @@ __all__ = [
     "ViewPlug",
     "ViewVariant",
     "Viewport",
+    "fill_box",
+    "fill_segment",
     "make_raster_view",
     "make_view",
+    "place_targets",
+    "raster_memory",
     "raster_view_names",
     "view_from_config",
     "view_names",
