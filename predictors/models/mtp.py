@@ -66,7 +66,7 @@ class MTPNetwork(AbstractNetwork):
         with torch.autocast(z.device.type, enabled=False):
             outputs, logits = self.head(torch.cat([z, self.scaled_motion(batch)], dim=-1))
             states = states_along(outputs * POSITION_SCALE_M, self.shape.dt_s)
-        return Modes(states, logits)
+        return Modes(states, logits, features=z)
 
 
 def states_along(positions: Float[Tensor, "n m t 2"], dt_s: float) -> Float[Tensor, "n m t 4"]:
