@@ -81,6 +81,8 @@ class Table:
     """Number of epochs of each training stage instead of the recipe's."""
     max_snippets: int | None = None
     """Largest number of training snippets; they are chosen at random."""
+    parked: bool = False
+    """Train and evaluate on parked vehicles, too, as the paper's figures of all classes do."""
 
     def run(self) -> None:
         """Runs the cells that are not finished, writes the folder and prints the tables.
@@ -184,6 +186,7 @@ class Table:
             "seed": cell.seed,
             "epochs": self.epochs,
             "max_snippets": self.max_snippets,
+            "parked": self.parked,
         }
 
     def _job(self, cell: Cell, site: Site) -> Job:
@@ -207,6 +210,7 @@ class Table:
                 horizon_s=cell.horizon_s,
                 history="causal" if cell.variant == CAUSAL else "recorded",
                 per_recording=self.per_recording,
+                parked=self.parked,
                 errors=str(self.out / "errors" / cell.name),
                 chainings=CHAININGS if not cell.variant and cell.seed is not None else (),
             ),
@@ -218,7 +222,9 @@ class Table:
             site.name: {k: v for k, v in asdict(site).items() if k.endswith("_hash")}
             for site in sites
         }
-        options = {"epochs": self.epochs, "max_snippets": self.max_snippets}
+        options: dict[str, Any] = {"epochs": self.epochs, "max_snippets": self.max_snippets}
+        if self.parked:
+            options["parked"] = True
         return {"sites": hashes, "preset": self.recipe, **options}
 
     def _manifest(self, sites: Sequence[Site], campaign: Campaign) -> dict[str, Any]:
@@ -272,7 +278,8 @@ def _claimed(out: Path, fixed: dict[str, Any], *, exclusive: bool) -> Iterator[N
             with atomic_file(path) as partial:
                 partial.write_text(json.dumps(fixed, indent=1) + "\n")
         elif (plan := _read_plan(path)) != expected:
-            names = ", ".join(name for name in expected if plan.get(name) != expected[name])
+            both = sorted(set(expected) | set(plan))
+            names = ", ".join(name for name in both if plan.get(name) != expected.get(name))
             raise AspEnvError(
                 f"{out}: contains a table with other {names}; choose another --out or remove it"
             )

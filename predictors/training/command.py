@@ -46,6 +46,8 @@ class Train:
     later frames."""
     split: Literal["recording", "blocks"] = "recording"
     """What is held out: whole recordings, or blocks of time within each."""
+    parked: bool = False
+    """Train on parked vehicles, too."""
     epochs: int | None = None
     """Number of epochs instead of the recipe's; with two stages, the number for each."""
     seed: int = 0
@@ -126,6 +128,7 @@ class Train:
             seed=self.seed,
             validation=self.validation,
             history=self.history,
+            parked=self.parked,
             max_snippets=self.max_snippets,
             epochs=config.epochs if self.epochs is None else self.epochs,
             precision=config.precision if self.precision is None else self.precision,

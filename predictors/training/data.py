@@ -331,7 +331,9 @@ def _chunks(snippets: SnippetIndex) -> Iterator[SnippetIndex]:
 
 
 def _index(recordings: Recordings, config: TrainingConfig) -> SnippetIndex:
-    return index_snippets(recordings, dt_s=config.dt_s, horizon_s=config.horizon_s)
+    return index_snippets(
+        recordings, dt_s=config.dt_s, horizon_s=config.horizon_s, parked=config.parked
+    )
 
 
 def _split(

@@ -50,6 +50,8 @@ class TrainingConfig:
     history: Literal["recorded", "causal"] = "recorded"
     """Whether inputs show the histories as recorded, smoothed with later frames, or filtered
     forward."""
+    parked: bool = False
+    """Whether parked vehicles are targets, too."""
     seed: int = 0
     max_snippets: int | None = None
     """Largest number of training snippets, chosen at random; None for all."""
