@@ -31,7 +31,7 @@ class Signals:
     Signals that several lanes share are one signal with one line across these lanes.
     """
 
-    stop_lines: Float[np.ndarray, "signals 2 2"]
+    stop_lines: Float[np.ndarray, "lines 2 2"]
     """End points of each stop line, [x m, y m] in the recording's frame."""
     states: Int8[np.ndarray, "signals frames"]
     """`SignalState` of each signal at each frame of the recording."""

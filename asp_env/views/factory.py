@@ -138,7 +138,7 @@ def _find_plug(name: str) -> ViewPlug:
     return plug
 
 
-def _checked(name: str, view: SceneView) -> SceneView:
+def _checked(name: str, view: Any) -> SceneView:
     """Returns the view if it is one and has the name under which it is registered."""
     if not isinstance(view, SceneView):
         raise AspEnvError(

@@ -97,6 +97,7 @@ def test_a_delayed_predictor_shows_the_signals_of_then() -> None:
 
     class Watcher(ConstantVelocity):
         def predict(self, scene, future=None):
+            assert scene.signals is not None
             shown.append(scene.signals.states[:, 0].tolist())
             return super().predict(scene, future)
 
