@@ -8,6 +8,7 @@ from jaxtyping import Bool, Float, Int
 
 from asp_env.data.recording import Recording, frames_per_tick, ticks
 from asp_env.data.scene import Scene, infer_actions
+from asp_env.data.signals import SceneSignals, SignalState
 
 HISTORY_S = 3.0
 """Default history of snippets and scenarios."""
@@ -70,9 +71,15 @@ class Future:
 
 
 def find_snippets(
-    recording: Recording, *, dt_s: float, history: int, horizon_ticks: int, interval_ticks: int
+    recording: Recording,
+    *,
+    dt_s: float,
+    history: int,
+    horizon_ticks: int,
+    interval_ticks: int,
+    parked: bool = False,
 ) -> tuple[Int[np.ndarray, " n"], Int[np.ndarray, " n"]]:
-    """All snippets of one recording, whose targets are of a predicted class and not parked.
+    """All snippets of one recording, whose targets are of a predicted class.
 
     Args:
         recording: the recording.
@@ -80,13 +87,15 @@ def find_snippets(
         history: number of past ticks.
         horizon_ticks: number of future ticks.
         interval_ticks: snippets are at multiples of this tick.
+        parked: whether parked agents are targets, too.
 
     Returns:
         Track index and tick of each snippet, sorted by tick, then track.
     """
     stride = frames_per_tick(recording.frame_rate_hz, dt_s)
     tracks, present_ticks = [], []
-    for track in np.flatnonzero(recording.predicted):
+    targets = recording.of_predicted_class if parked else recording.predicted
+    for track in np.flatnonzero(targets):
         first = -(-int(recording.first_frames[track]) // stride) + history
         last = int(recording.last_frames[track]) // stride - horizon_ticks
         found = np.arange(-(-first // interval_ticks) * interval_ticks, last + 1, interval_ticks)
@@ -106,8 +115,17 @@ def index_snippets(
     horizon_s: float,
     history_s: float = HISTORY_S,
     interval_s: float = SNIPPET_INTERVAL_S,
+    parked: bool = False,
 ) -> SnippetIndex:
     """All snippets of all recordings, sorted by recording, tick and track.
+
+    Args:
+        recordings: the recordings.
+        dt_s: seconds per tick.
+        horizon_s: length of the future in seconds.
+        history_s: length of the past in seconds.
+        interval_s: time between consecutive snippets of a track.
+        parked: whether parked agents are targets, too.
 
     Raises:
         AspEnvError: a duration is not a whole number of ticks, or a tick not one of frames.
@@ -121,6 +139,7 @@ def index_snippets(
             history=history,
             horizon_ticks=horizon_ticks,
             interval_ticks=interval_ticks,
+            parked=parked,
         )
         for recording in recordings
     ]
@@ -263,7 +282,44 @@ def gather_scene(recordings: Sequence[Recording], index: SnippetIndex) -> Scene:
         maps=maps,
         map_index=map_index,
         dt_s=index.dt_s,
+        signals=gather_signals(
+            [recordings[int(index.recording[row])] for row in first_rows],
+            index.tick[first_rows],
+            history=index.history,
+            dt_s=index.dt_s,
+        ),
     )
+
+
+def gather_signals(
+    recordings: Sequence[Recording], tick: Int[np.ndarray, " b"], *, history: int, dt_s: float
+) -> SceneSignals | None:
+    """The traffic signals of B situations, up to their present ticks.
+
+    Args:
+        recordings: the recording of each situation.
+        tick: the present tick of each situation.
+        history: number of past ticks.
+        dt_s: seconds per tick.
+
+    Returns:
+        The signals, `UNKNOWN` at ticks outside a recording; None if no recording has signals.
+    """
+    count = max((len(r.signals.states) for r in recordings if r.signals is not None), default=0)
+    if not count:
+        return None
+    stop_lines = np.zeros((len(recordings), count, 2, 2))
+    states = np.full((len(recordings), count, history + 1), SignalState.UNKNOWN, dtype=np.int8)
+    for row, (recording, now) in enumerate(zip(recordings, tick.tolist(), strict=True)):
+        if recording.signals is None:
+            continue
+        stride = frames_per_tick(recording.frame_rate_hz, dt_s)
+        frames = (now + np.arange(-history, 1)) * stride
+        known = (frames >= 0) & (frames < recording.num_frames)
+        signals = len(recording.signals.states)
+        stop_lines[row, :signals] = recording.signals.stop_lines
+        states[row, :signals, known] = recording.signals.states[:, frames[known]].T
+    return SceneSignals(stop_lines=stop_lines, states=states)
 
 
 def gather_future(recordings: Sequence[Recording], index: SnippetIndex) -> Future:

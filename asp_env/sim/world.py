@@ -15,7 +15,14 @@ from asp_env.data.recording import Recording, frames_per_tick
 from asp_env.data.road_map import RoadMap
 from asp_env.data.scenarios.scenario import Scenario
 from asp_env.data.scene import EGO, Scene, infer_actions
-from asp_env.data.snippets import Future, SnippetIndex, gather_ticks, gather_window
+from asp_env.data.signals import SceneSignals
+from asp_env.data.snippets import (
+    Future,
+    SnippetIndex,
+    gather_signals,
+    gather_ticks,
+    gather_window,
+)
 from asp_env.data.source import scheme_of
 from asp_env.dynamics import forward
 from asp_env.geometry import route_coordinates
@@ -116,6 +123,7 @@ class World(ABC):
         self.episodes = empty_episodes(num_episodes, ticks=history + 2, agents=1, points=2)
         self._maps: tuple[RoadMap, ...] = ()
         self._map_index = np.zeros(num_episodes, dtype=np.int64)
+        self._any_signals = False
         self._rows = np.arange(num_episodes)
         self._euler: Bool[np.ndarray, "b a"] | None = None
         """Mask of agents that move by Euler's method in the step that is under way."""
@@ -173,6 +181,7 @@ class World(ABC):
         used, index = np.unique(self.episodes.recording, return_inverse=True)
         self._maps = tuple(self.recordings[int(i)].road_map for i in used)
         self._map_index = index.reshape(-1)
+        self._any_signals = any(self.recordings[int(i)].signals is not None for i in used)
 
     def step(
         self,
@@ -284,6 +293,23 @@ class World(ABC):
             route_valid=episodes.route_valid.copy(),
             maps=self._maps,
             map_index=self._map_index,
+            dt_s=self.dt_s,
+            signals=self.signals(self._rows),
+        )
+
+    def signals(self, rows: Int[np.ndarray, " r"]) -> SceneSignals | None:
+        """The traffic signals up to now; None if no recording of the episodes has any.
+
+        Args:
+            rows: indices of R episodes, which are the situations of the result.
+        """
+        if not self._any_signals:
+            return None
+        episodes = self.episodes
+        return gather_signals(
+            [self.recordings[int(number)] for number in episodes.recording[rows]],
+            episodes.start_tick[rows] + episodes.elapsed[rows],
+            history=self.history,
             dt_s=self.dt_s,
         )
 

@@ -46,6 +46,8 @@ class EvaluationJob:
     """Path of the errors without its suffix."""
     data_hash: str
     """Hash of the content of the data."""
+    parked: bool = False
+    """Whether parked vehicles are targets, too."""
     chainings: tuple[str, ...] = ()
     """Rules for chaining segments that are evaluated besides the predictor's own, if it chains."""
 
@@ -54,6 +56,8 @@ class EvaluationJob:
         """Hash of everything that the errors depend on, including the finished run."""
         fields = dataclasses.asdict(self)
         content = {k: v for k, v in fields.items() if k not in ("data", "run", "errors")}
+        if not self.parked:  # as in the stamps of versions without this option
+            del content["parked"]
         text = json.dumps(content, sort_keys=True).encode()
         if self.run:
             text += (Path(self.run) / FINISHED).read_bytes()
@@ -90,6 +94,7 @@ class EvaluationJob:
             dt_s=dt_s,
             part=self.part,
             per_recording=self.per_recording,
+            parked=self.parked,
         )
         history: Any = own.metadata.get("history", self.history)
         scenes = histories(recordings, history)

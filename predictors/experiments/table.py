@@ -17,7 +17,7 @@ from asp_env.data.recording import DEFAULT_DT_S, ticks
 from asp_env.errors import AspEnvError, MissingExtraError, unknown_name
 from asp_env.files import atomic_file, leftovers
 from asp_env.metrics.forecast.errors import MODE_RULES
-from asp_env.views import VIEWS
+from asp_env.views import view_names
 from asp_env.workers import WorkerPool
 from predictors.experiments.campaign import COST, LOGS, ONE_THREAD, Campaign
 from predictors.experiments.cells import (
@@ -101,6 +101,8 @@ class Table:
     added. The default is OUT/epoch_costs.json."""
     max_snippets: int | None = None
     """Largest number of training snippets; they are chosen at random."""
+    parked: bool = False
+    """Train and evaluate on parked vehicles, too, as the paper's figures of all classes do."""
 
     def run(self) -> None:
         """Runs the cells that are not finished, writes the folder and prints the tables.
@@ -149,8 +151,8 @@ class Table:
         if not (self.data and self.views and self.predictors and self.horizons and self.seeds):
             raise AspEnvError("table: give DATA, views, predictors, horizons and seeds, each once")
         for view in (*self.views, self.ablation_view):
-            if view not in VIEWS:
-                raise unknown_name("view", view, VIEWS)
+            if view not in view_names():
+                raise unknown_name("view", view, view_names())
         for horizon in self.horizons:
             ticks(horizon, DEFAULT_DT_S)
         if self.jobs < 0 or (self.per_recording is not None and self.per_recording < 1):
@@ -223,6 +225,7 @@ class Table:
             "patience": self.patience,
             "cpu_reference": self.cpu_reference,
             "costs": self._costs if self.budget == "cpu" else self.costs,
+            "parked": self.parked,
         }
 
     def _train(self, cell: Cell, site: Site | None = None) -> Train:
@@ -314,6 +317,7 @@ class Table:
                 horizon_s=cell.horizon_s,
                 history="causal" if cell.variant == CAUSAL else "recorded",
                 per_recording=self.per_recording,
+                parked=self.parked,
                 errors=str(self.out / "errors" / cell.name),
                 chainings=CHAININGS if not cell.variant and cell.seed is not None else (),
             ),
@@ -332,6 +336,8 @@ class Table:
             options["patience"] = self.patience
         if self.budget == "cpu":
             options["cpu_reference"] = self._reference
+        if self.parked:
+            options["parked"] = True
         return {"sites": hashes, "preset": self.recipe, **options}
 
     def _manifest(self, sites: Sequence[Site], campaign: Campaign) -> dict[str, Any]:

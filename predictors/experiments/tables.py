@@ -22,13 +22,14 @@ from asp_env.evaluation.results import Row, write_manifest, write_metrics
 from asp_env.evaluation.statistics import Estimate
 from asp_env.files import atomic_file
 from predictors.experiments.cells import Cell, Site
-from predictors.experiments.errors import Errors
+from predictors.experiments.errors import VIOLATIONS, Errors
 from predictors.experiments.job import EvaluationJob, errors_path
 from predictors.experiments.results import (
     CHOICES,
     FEATURES,
     NO_SEED,
     ORACLE,
+    SUBSETS,
     Choice,
     Findings,
     Key,
@@ -197,6 +198,34 @@ def difference_table(
     return table
 
 
+def violation_table(
+    findings: Findings, sites: Sequence[str], columns: Sequence[Key], subset: str
+) -> Table:
+    """Share of the modes that cannot be driven, by view and predictor, site and horizon.
+
+    Args:
+        findings: results of the cells.
+        sites: names of all sites.
+        columns: one key of each site and horizon that is shown.
+        subset: one of `SUBSETS`.
+    """
+    table = _table(
+        f"{subset} targets, all modes, mean over seeds: share of modes that are\n"
+        "infeasible / off-road / overlap another agent, %; infeasible: [95 % interval]"
+    )
+    table.caption = (
+        "infeasible: over 10.4 m/s² or 0.3 1/m between any two states (Waymax);\n"
+        "MTP forecasts positions, the other networks actions of the bicycle model"
+    )
+    _add_columns(table, sites, columns)
+    for view, members in _by_view(_lines(findings, columns, lambda k: not k.variant)).items():
+        _section(table, view)
+        for line in members:
+            means = [findings.violations(_key(line, column), subset) for column in columns]
+            table.add_row(_name(line), *(_shares(each) for each in means))
+    return table
+
+
 def ablation_table(findings: Findings, column: Key, choice: Choice) -> Table:
     """Differences of variants to their recipes, and feature statistics.
 
@@ -337,6 +366,19 @@ def _means(means: Mapping[str, SeedMean]) -> Text:
     return text.append(f"\n{range_text.strip()}", style="dim") if range_text else text
 
 
+def _shares(means: Mapping[str, SeedMean]) -> Text:
+    """Shares in per cent, – where one does not apply."""
+    if not means:
+        return Text()
+    shown = [means.get(violation) for violation in VIOLATIONS]
+    text = Text(" / ".join("–" if m is None else f"{100 * m.estimate.value:.1f}" for m in shown))
+    first = means.get(VIOLATIONS[0])
+    if first is None or first.estimate.low is None or first.estimate.high is None:
+        return text
+    low, high = 100 * first.estimate.low, 100 * first.estimate.high
+    return text.append(f"\n[{low:.1f}, {high:.1f}]", style="dim")
+
+
 def _differences(means: Mapping[str, SeedMean], shown: Sequence[str] = SHOWN) -> Text:
     if not means:
         return Text()
@@ -437,6 +479,8 @@ def tables(
         for group in filter(None, groups):
             shown.append(main_table(findings, names, group, choice))
             shown.append(difference_table(findings, names, group, choice))
+    if any(findings.violations(key, subset) for key in findings.sums for subset in SUBSETS):
+        shown += [violation_table(findings, names, g, SUBSETS[0]) for g in groups if g]
     for column in columns:
         if any(key.variant and key.view and _same_column(key, column) for key in findings.sums):
             moving = (choice for choice in CHOICES if choice.subset == "moving")
@@ -473,6 +517,9 @@ def rows(findings: Findings, sites: Mapping[str, Site], recipe: str) -> list[Row
             lines += _rows(common, choice, findings.means(key, choice))
             for suffix, other in others:
                 lines += _rows(common, choice, findings.differences(key, other, choice), suffix)
+        for subset in SUBSETS:
+            every_mode = Choice(selection="", subset=subset)
+            lines += _rows(common, every_mode, findings.violations(key, subset))
         for name, values in _features_by_name(findings, key).items():
             value = sum(values) / len(values)
             lines.append(Row(**common, metric=name, value=value, n=len(values)))

@@ -67,7 +67,7 @@ class MTPNetwork(AbstractNetwork):
             outputs, logits = self.head(torch.cat([z, self.scaled_motion(batch)], dim=-1))
             positions = outputs * POSITION_SCALE_M
             states = states_along(positions, batch.motion[:, 0] < 0, self.shape.dt_s)
-        return Modes(states, logits)
+        return Modes(states, logits, features=z)
 
 
 def states_along(

@@ -41,6 +41,8 @@ class Modes(NamedTuple):
     logits: Float[Tensor, "n m"]
     actions: Float[Tensor, "n m t 2"] | None = None
     """[acceleration m/s², steering rad]; None from a network that predicts positions."""
+    features: Float[Tensor, "n f"] | None = None
+    """What the network encodes of the inputs: z, and for SSP-ASP the predicted ẑ behind it."""
 
 
 class TrainingProgress(NamedTuple):
@@ -148,6 +150,11 @@ class AbstractNetwork(nn.Module, ABC):
         """Ticks ahead at which the loss reads future inputs: the ends of the segments, if any."""
         return ()
 
+    @property
+    def feature_size(self) -> int:
+        """Number of features of each target in `Modes.features`."""
+        return self.config.features
+
     @abstractmethod
     def forward(self, batch: Batch) -> Modes:
         """Returns the modes of every target."""
@@ -236,6 +243,7 @@ class AbstractNetwork(nn.Module, ABC):
             actions=None if modes.actions is None else modes.actions.numpy(),
             log_probs=modes.logits.numpy(),
             valid=np.ones(len(local), dtype=bool),
+            features=None if modes.features is None else modes.features.numpy(),
         )
 
     def loss(self, modes: Modes, labels: Labels, progress: TrainingProgress) -> dict[str, Tensor]:

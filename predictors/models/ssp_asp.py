@@ -210,6 +210,11 @@ class SSPASPNetwork(AbstractNetwork):
         step = self._segment_ticks
         return tuple(range(step, self.shape.horizon + 1, step))
 
+    @property
+    def feature_size(self) -> int:
+        """Number of features of z and ẑ, the latter at the end of the first segment."""
+        return 2 * self.config.features
+
     def forward(self, batch: Batch) -> Modes:
         """Returns the modes of every target; segments are chained by beam."""
         return self.chain(batch, "beam")
@@ -240,6 +245,7 @@ class SSPASPNetwork(AbstractNetwork):
         with torch.autocast(z.device.type, enabled=False):
             past = self.scaled_actions(batch.actions)
             chains = self._segment(SegmentInput(z, past, start_states(batch), batch.length_m))
+            features = torch.cat([z, chains.z[:, 0]], dim=1)  # ẑ, equal for all modes
             chains = self._reduce(chains, chaining, batch)
             for _ in range(segments - 1):
                 chains = chains_to_extend(
@@ -247,7 +253,7 @@ class SSPASPNetwork(AbstractNetwork):
                 )
                 chains = extend(chains, self._next_segment(chains, batch))
                 chains = self._reduce(chains, chaining, batch)
-        return Modes(chains.states, chains.log_probs, chains.actions)
+        return Modes(chains.states, chains.log_probs, chains.actions, features=features)
 
     def encode(self, batch: Batch) -> Float[Tensor, "n z"]:
         """φ: the features of the observation."""

@@ -58,6 +58,8 @@ class Train:
     """What is held out: whole recordings, whole recordings of
     other times of day (daytime), or blocks of time within each
     (blocks)."""
+    parked: bool = False
+    """Train on parked vehicles, too."""
     epochs: int | None = None
     """Number of prediction epochs instead of the recipe's;
     pre-training is additional. With two stages, the number
@@ -295,6 +297,7 @@ class Train:
             seed=self.seed,
             validation=self.validation,
             history=self.history,
+            parked=self.parked,
             max_snippets=self.max_snippets,
             epochs=config.epochs if epochs is None else epochs,
             precision=config.precision if self.precision is None else self.precision,

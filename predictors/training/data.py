@@ -329,7 +329,11 @@ def _chunks(snippets: SnippetIndex) -> Iterator[SnippetIndex]:
 
 def _index(recordings: Recordings, config: TrainingConfig) -> SnippetIndex:
     return index_snippets(
-        recordings, dt_s=config.dt_s, horizon_s=config.horizon_s, history_s=config.history_s
+        recordings,
+        dt_s=config.dt_s,
+        horizon_s=config.horizon_s,
+        history_s=config.history_s,
+        parked=config.parked,
     )
 
 

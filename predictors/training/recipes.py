@@ -15,6 +15,7 @@ from asp_env.data.recording import DEFAULT_DT_S, ticks
 from asp_env.data.snippets import HISTORY_S
 from asp_env.data.split import Split
 from asp_env.errors import AspEnvError, unknown_name
+from asp_env.views import RasterView, make_view
 from predictors.models.chaining import segment_ticks
 from predictors.models.dkm import DKMConfig
 from predictors.models.ffw_asp import FFWASPConfig
@@ -62,6 +63,8 @@ class TrainingConfig:
     forward, or with recorded accelerations."""
     history_s: float = HISTORY_S
     """Length of the past that inputs show, in actions and in the view (`mtp` shows at most 2 s)."""
+    parked: bool = False
+    """Whether parked vehicles are targets, too."""
     seed: int = 0
     max_snippets: int | None = None
     """Largest number of training snippets, chosen at random; None for all."""
@@ -311,7 +314,7 @@ def recipe(
 
 def _paper(predictor: str, network: NetworkConfig, view: str, horizon_s: float) -> TrainingConfig:
     """The paper's size and schedule: Adam at 1e-4, batches of 32, 10 epochs, `plateau`."""
-    if view.startswith("vectors"):
+    if not isinstance(make_view(view), RasterView):
         network = dataclasses.replace(network, encoder="vector")
     return TrainingConfig(
         predictor=predictor,
@@ -333,15 +336,16 @@ def _small(
     segments are chained, else at once.
     """
     at_once = horizon_s > SEGMENT_S and predictor not in CHAINED
-    vectors = view.startswith("vectors")
-    pixels = (90, 90) if view == "mtp" else (90, 60)
+    drawn = make_view(view)
+    vectors = not isinstance(drawn, RasterView)
+    pixels = None if vectors else (drawn.shape[1] // 4, drawn.shape[2] // 4)
     network = dataclasses.replace(network, encoder="vector" if vectors else "small", features=256)
     return TrainingConfig(
         predictor=predictor,
         preset=name,
         network=network,
         view=view,
-        pixels=None if vectors else pixels,
+        pixels=pixels,
         horizon_s=horizon_s,
         standing_share=0.25,
         epochs=16 if at_once else 8,

@@ -12,7 +12,7 @@ from types import MappingProxyType
 from typing import Any
 
 from asp_env.errors import AspEnvError, unknown_name
-from asp_env.views import VIEWS
+from asp_env.views import view_names
 from predictors.models.losses import Assignment
 from predictors.training.recipes import (
     CHAINED,
@@ -110,8 +110,8 @@ def no_trail(config: TrainingConfig) -> TrainingConfig:
         AspEnvError: There is no such view.
     """
     view = f"{config.view}-no-trail"
-    if view not in VIEWS:
-        raise unknown_name("view", view, VIEWS)
+    if view not in view_names():
+        raise unknown_name("view", view, view_names())
     return dataclasses.replace(config, view=view)
 
 

@@ -11,7 +11,7 @@ import torch
 from asp_env import registry
 from asp_env.data.recording import Recording
 from asp_env.data.snippets import index_snippets
-from asp_env.views import make_view, with_history
+from asp_env.views import RasterView, make_view, with_history
 from predictors.inference.checkpoint import PredictorSpec, save_trained, shape_for
 from predictors.models.batch import Batch, Labels
 from predictors.models.network import AbstractNetwork, NetworkConfig, NetworkShape
@@ -29,9 +29,11 @@ SIZES = {"features": 8, "hidden": 8, "gru_width": 8, "gru_layers": 1}
 
 def pixels_of(view: str) -> tuple[int, int] | None:
     """Height and width of the rasters of a view in tests."""
-    if view.startswith("vectors"):
+    drawn = make_view(view)
+    if not isinstance(drawn, RasterView):
         return None
-    return (36, 36) if view == "mtp" else PIXELS
+    _, height, width = drawn.shape
+    return (36, 36 * width // height)
 
 
 def tiny_network(
@@ -40,7 +42,7 @@ def tiny_network(
     """The network's configuration of a recipe with `SIZES` and further changes."""
     config = recipe(predictor, preset, view=view, horizon_s=3.0).network
     small: dict[str, Any] = {n: size for n, size in SIZES.items() if getattr(config, n, 0)}
-    small["encoder"] = "vector" if view.startswith("vectors") else "small"
+    small["encoder"] = "vector" if pixels_of(view) is None else "small"
     return dataclasses.replace(config, **{**small, **changes})
 
 

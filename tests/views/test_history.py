@@ -7,12 +7,12 @@ import numpy as np
 import pytest
 
 from asp_env.errors import AspEnvError
-from asp_env.views import MTP, VIEWS, VectorView, make_view, view_from_config, with_history
+from asp_env.views import MTP, VectorView, make_view, view_from_config, view_names, with_history
 from asp_env.views.chauffeurnet import SNAPSHOT_TICKS, snapshot_ticks
 from tests.views.scenes import COARSE, make_scene, standing, traffic
 
 
-@pytest.mark.parametrize("name", VIEWS)
+@pytest.mark.parametrize("name", view_names())
 @pytest.mark.parametrize("history", [5, 10, 30])
 def test_views_with_another_history_are_stored(name: str, history: int) -> None:
     """By their configuration; `mtp` shows at most 10 ticks."""
@@ -22,7 +22,7 @@ def test_views_with_another_history_are_stored(name: str, history: int) -> None:
     assert view_from_config(json.loads(json.dumps(view.config()))) == view
 
 
-@pytest.mark.parametrize("name", VIEWS)
+@pytest.mark.parametrize("name", view_names())
 def test_configurations_without_a_history_have_the_default(name: str) -> None:
     view = make_view(name)
     older = {key: value for key, value in view.config().items() if key != "history"}

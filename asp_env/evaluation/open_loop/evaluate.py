@@ -89,6 +89,8 @@ class Evaluate:
     (causal); or as recorded, with the accelerations of the
     files in past actions (accelerations). The ground truth is
     always as recorded."""
+    parked: bool = False
+    """Count parked vehicles as targets, too."""
     best_by: ModeRule = "fde"
     """How the best of 3 modes is chosen: lowest final error,
     lowest mean error, or the rule of the paper."""
@@ -153,6 +155,7 @@ def evaluate(config: Evaluate) -> OpenLoopResult:
         dt_s=config.dt,
         horizon_s=config.horizon,
         history_s=max(HISTORY_S, *(predictor.history * config.dt for predictor in loaded)),
+        parked=config.parked,
     )
     index = snippets_within(index, allowed)
     predictors = dict(zip(names, loaded, strict=True))
@@ -185,6 +188,7 @@ def evaluate(config: Evaluate) -> OpenLoopResult:
             "dt_s": config.dt,
             "part": part,
             "history": config.history,
+            "parked": config.parked,
             "recordings": len(np.unique(index.recording)),
             "snippets": len(index),
             "moving snippets": int(moving.sum()),

@@ -4,6 +4,7 @@ import csv
 import dataclasses
 import fcntl
 import io
+import itertools
 import json
 import math
 import re
@@ -17,7 +18,7 @@ from rich.console import Console
 from asp_env.cli import main
 from asp_env.errors import AspEnvError
 from asp_env.evaluation import statistics
-from predictors.experiments.errors import METRICS, Errors, stamp_of
+from predictors.experiments.errors import METRICS, VIOLATIONS, Errors, stamp_of
 from predictors.experiments.results import (
     NO_SEED,
     Choice,
@@ -33,6 +34,7 @@ from predictors.experiments.tables import (
     main_table,
     paper_errors,
     training_table,
+    violation_table,
 )
 from tests.predictors.tiny import write_data
 
@@ -45,6 +47,8 @@ def errors(fde: Sequence[float], *, shift: int = 0) -> Errors:
     """Errors of four snippets: three of one recording, the third of which stands, one of another.
 
     MAE, MSE and ADE are 0.1, 0.2 and 0.3 times FDE; the errors of the best mode are half as large.
+    A tenth of FDE is the share of infeasible modes and, of the first snippet alone, that of modes
+    off the road; no snippet shows whether modes overlap.
     """
     most_probable = np.array(fde) * np.array([0.1, 0.2, 0.3, 1.0])[:, None]
     return Errors(
@@ -54,6 +58,8 @@ def errors(fde: Sequence[float], *, shift: int = 0) -> Errors:
         track=np.array([1, 2, 3, 1]),
         tick=np.array([15, 15, 15, 15 + shift]),
         stamp="s",
+        violations=np.tile(np.array(fde, dtype=np.float32) / 10, (3, 1)),
+        violations_valid=np.array([[True] * 4, [True] + [False] * 3, [False] * 4]),
     )
 
 
@@ -122,6 +128,41 @@ def test_differences_are_over_common_seeds() -> None:
     rate = findings().differences(key("dkm"), physical, MOST_PROBABLE)["FDE"]
     assert rate.estimate.value == pytest.approx(-0.5)
     assert not excludes_zero(rate.estimate)
+
+
+def test_violations_by_hand() -> None:
+    """DKM: (0.1, 0.3, 0.2, 0.4) and (0.3, 0.5, 0.2, 0.8), so 0.25 and 0.45: 0.35 ± 0.2/√2."""
+    found = findings().violations(key("dkm"), "all")
+    assert list(found) == ["infeasible", "off-road"]
+    assert found["infeasible"].estimate.value == pytest.approx(0.35)
+    assert found["infeasible"].estimate.n == 4
+    assert found["infeasible"].spread == pytest.approx(0.2 / math.sqrt(2))
+    assert found["off-road"].estimate.value == pytest.approx(0.2)
+    assert found["off-road"].estimate.n == 1
+    moving = findings().violations(key("dkm"), "moving")["infeasible"].estimate
+    assert (moving.value, moving.n) == (pytest.approx(0.4), 3)
+    assert findings().violations(key("mtp"), "all") == {}
+
+
+def test_the_table_of_violations_shows_per_cent() -> None:
+    text = printed(violation_table(findings(), ["here"], [key("dkm")], "all"))
+    assert "35.0 / 20.0 / –" in text
+    assert "[26.7, 60.0]" in text
+
+
+def test_errors_of_earlier_versions_have_no_violations(tmp_path: Path) -> None:
+    """They are read as before, and their line shows none."""
+    old, path = errors([1, 2, 3, 4]), tmp_path / "errors.npz"
+    np.savez_compressed(
+        path,
+        **{
+            name: getattr(old, name)
+            for name in ("values", "moving", "recording", "track", "tick", "stamp")
+        },
+    )
+    sums = Sums.of(Errors.load(path))
+    np.testing.assert_array_equal(sums.errors, Sums.of(old).errors)
+    assert Findings(sums={key("dkm"): {0: sums}}).violations(key("dkm"), "all") == {}
 
 
 def test_references() -> None:
@@ -228,8 +269,12 @@ def test_a_whole_table(table: Path) -> None:
     assert predictors == {"constant-velocity", "constant-turn-rate", "dkm"}
     dkm = [row for row in rows if row["predictor"] == "dkm" and row["selection"]]
     metrics = {f"{m}{less}" for m in METRICS for less in ("", " less constant-turn-rate")}
-    assert {row["metric"] for row in dkm} == metrics
-    assert {row["selection"] for row in dkm} == {"most-probable", "best-of-3"}
+    of_modes = [row for row in dkm if row["selection"]]
+    assert {row["metric"] for row in of_modes} == metrics
+    assert {row["selection"] for row in of_modes} == {"most-probable", "best-of-3"}
+    rates = {(r["metric"], r["subset"]) for r in dkm if not r["selection"]}
+    assert rates == set(itertools.product(VIOLATIONS, ("moving", "all")))
+    assert "infeasible / off-road / overlap" in (table / "table.txt").read_text()
     assert {(row["recipe"], row["view"]) for row in dkm} == {("cpu", "vectors")}
     epochs = {row["metric"]: row["value"] for row in rows if "epochs" in row["metric"]}
     assert {name: float(value) for name, value in epochs.items()} == {
@@ -244,6 +289,7 @@ def test_a_whole_table(table: Path) -> None:
     manifest = json.loads((table / "manifest.json").read_text())
     assert manifest["failed"] == {}
     assert manifest["options"]["seeds"] == [0]
+    assert manifest["options"]["parked"] is False
 
 
 def test_a_table_of_equal_cpu_time(data: str, tmp_path: Path) -> None:
@@ -368,6 +414,8 @@ def test_folders_of_other_tables_are_refused(
     assert "contains a table with other epochs" in capsys.readouterr().err
     assert main(["table", data, "--out", str(table), *OPTIONS, "--budget", "converged"]) == 2
     assert "contains a table with other budget;" in capsys.readouterr().err
+    assert main(["table", data, "--out", str(table), *OPTIONS, "--parked"]) == 2
+    assert "contains a table with other parked" in capsys.readouterr().err
     (tmp_path / "letter.txt").write_text("dear")
     assert main(["table", data, "--out", str(tmp_path), *OPTIONS]) == 2
     assert "contains something that is no table" in capsys.readouterr().err
