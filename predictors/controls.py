@@ -21,6 +21,7 @@ from asp_env.data.snippets import Future
 from asp_env.data.split import TrainedOn
 from asp_env.errors import AspEnvError
 from asp_env.geometry import between_states, from_frame, states_to_frame, wrap_angle
+from predictors.counter_random import mixed, nearly_normal
 from predictors.physical import Oracle, one_mode, refuse_argument, with_inferred_actions
 
 FAR_M = 1000.0
@@ -39,10 +40,6 @@ DRAWN_EVERY_S = 2.4
 """Time between independent draws of `noisy-oracle`. Chosen by hand: the errors along of constant
 velocity after 3 s correlate by 0.9, 0.5 and 0.1 with those of forecasts 0.6 s, 1.8 s and 3.0 s
 later (`sample:intersection`); those of `noisy-oracle` correlate by 0.9, 0.5 and 0.1."""
-
-_GAMMA = np.uint64(0x9E3779B97F4A7C15)
-_SHIFTS = tuple(np.uint64(bits) for bits in (30, 27, 31))
-_FACTORS = (np.uint64(0xBF58476D1CE4E5B9), np.uint64(0x94D049BB133111EB))
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -326,7 +323,7 @@ def persistent_noise(
         Two independent values for each id.
     """
     every = max(1, round(DRAWN_EVERY_S / dt_s))
-    streams = _mixed(ids.astype(np.int64).view(np.uint64))
+    streams = mixed(ids.astype(np.int64).view(np.uint64))
     shifted = tick + (streams % np.uint64(every)).astype(np.int64)
     number = shifted // every
     share = ((shifted - number * every) / every)[:, None]
@@ -338,19 +335,8 @@ def persistent_noise(
 def _draws(
     streams: UInt64[np.ndarray, " t"], number: Int[np.ndarray, " t"]
 ) -> Float[np.ndarray, "t 2"]:
-    """Two nearly normal draws: sums of four uniform 16-bit numbers, of mean 0 and variance 1."""
-    counter = 2 * number.astype(np.int64)[:, None] + np.array([1, 2])
-    bits = _mixed(streams[:, None] + counter.view(np.uint64) * _GAMMA)
-    total = sum((bits >> np.uint64(shift)) & np.uint64(0xFFFF) for shift in (0, 16, 32, 48))
-    return (np.asarray(total, dtype=np.float64) / 2**16 - 2 + 2 / 2**16) * math.sqrt(3)
-
-
-def _mixed(bits: UInt64[np.ndarray, "*t"]) -> UInt64[np.ndarray, "*t"]:
-    """The output function of SplitMix64 (Steele, Lea and Flood 2014), a hash of 64 bits."""
-    bits = bits + _GAMMA
-    for shift, factor in zip(_SHIFTS[:2], _FACTORS, strict=True):
-        bits = (bits ^ (bits >> shift)) * factor
-    return bits ^ (bits >> _SHIFTS[2])
+    """Two nearly normal draws of each stream."""
+    return nearly_normal(streams[:, None], 2 * number[:, None] + np.array([1, 2]))
 
 
 def _next_in_circle(

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from enum import IntEnum
 
 import numpy as np
-from jaxtyping import Float, Int8
+from jaxtyping import Float, Int, Int8
 
 from asp_env.errors import DataError
 
@@ -68,6 +68,10 @@ class SceneSignals:
     def situation(self, index: int) -> "SceneSignals":
         """The signals of one of the situations, which becomes situation 0."""
         rows = slice(index, index + 1)
+        return SceneSignals(stop_lines=self.stop_lines[rows], states=self.states[rows])
+
+    def of_situations(self, rows: Int[np.ndarray, " n"]) -> "SceneSignals":
+        """The signals of situations in another order; a situation may occur several times."""
         return SceneSignals(stop_lines=self.stop_lines[rows], states=self.states[rows])
 
     def before(self, ticks: int) -> "SceneSignals":

@@ -126,4 +126,5 @@ class FFWASPNetwork(AbstractNetwork):
                 outputs, logits = self.head(torch.cat([*read, *static], dim=-1))
             actions = self.bounded_actions(outputs)
             states = rollout_from_now(actions, batch, self.shape.dt_s, self._integrator)
-        return Modes(states, logits, actions, features=z)
+            standing = self.standing_logit(z, batch)
+        return Modes(states, logits, actions, features=z, standing=standing)

@@ -11,7 +11,7 @@ from types import MappingProxyType
 from typing import Literal
 
 import torch
-from jaxtyping import Float, Int
+from jaxtyping import Bool, Float, Int
 from torch import Tensor
 from torch.nn import functional
 
@@ -38,6 +38,10 @@ RULES: Mapping[Assignment, ModeRule] = MappingProxyType(
 
 HUBER_M = 1.0
 """Cut-off h of the Huber loss (equation 9 of Janjoš et al. 2021)."""
+
+STANDS_M = 0.5
+"""A target that stays within this distance stands. Chosen by hand: above the errors of trackers at
+standstill, below the motion of a vehicle that starts."""
 
 ANNEAL_FROM_M = 8.0
 """Temperature at the start of annealing. Chosen by hand: far modes still get a gradient."""
@@ -106,6 +110,7 @@ def mode_terms(
     assignment: Assignment,
     classification: Classification,
     share: float | None,
+    learned: Bool[Tensor, " n"] | None = None,
 ) -> dict[str, Tensor]:
     """The terms `regression` and `classification` of the loss.
 
@@ -116,10 +121,16 @@ def mode_terms(
         assignment: How the best mode is chosen.
         classification: The classification term.
         share: Share of the training that is over, for annealing; None trains the best mode alone.
+        learned: Targets that the modes learn from; None for all.
 
     Returns:
-        Scalars, means over the targets.
+        Scalars, means over these targets; zero if there are none.
     """
+    if learned is not None:
+        if not learned.any():
+            zero = 0.0 * (positions.sum() + logits.sum())
+            return {"regression": zero, "classification": zero}
+        positions, logits, label = positions[learned], logits[learned], label[learned]
     if assignment == "angle-random":
         best = best_or_random_mode(positions.detach(), label)
     else:
@@ -200,6 +211,25 @@ def classification_loss(
         probability = logits.softmax(dim=1).gather(1, best[:, None])
         return -probability.mean()
     return functional.cross_entropy(logits, best)
+
+
+def stands(label: Float[Tensor, "n t _"]) -> Bool[Tensor, " n"]:
+    """Whether a target stands: it is never more than 0.5 m from where it is now.
+
+    Args:
+        label: Recorded positions, or states that begin with them, in the targets' frames.
+    """
+    return (torch.linalg.vector_norm(label[..., :2], dim=-1) <= STANDS_M).all(dim=1)
+
+
+def standing_loss(logit: Float[Tensor, " n"], label: Float[Tensor, "n t _"]) -> Float[Tensor, ""]:
+    """Cross-entropy of the probability of standing.
+
+    Args:
+        logit: Logit of that probability.
+        label: As in `stands`.
+    """
+    return functional.binary_cross_entropy_with_logits(logit, stands(label).to(logit.dtype))
 
 
 def into_frame(

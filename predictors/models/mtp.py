@@ -67,7 +67,8 @@ class MTPNetwork(AbstractNetwork):
             outputs, logits = self.head(torch.cat([z, self.scaled_motion(batch)], dim=-1))
             positions = outputs * POSITION_SCALE_M
             states = states_along(positions, batch.motion[:, 0] < 0, self.shape.dt_s)
-        return Modes(states, logits, features=z)
+            standing = self.standing_logit(z, batch)
+        return Modes(states, logits, features=z, standing=standing)
 
 
 def states_along(

@@ -11,10 +11,11 @@ import numpy as np
 import torch
 from jaxtyping import Float
 from torch import Tensor, nn
+from torch.nn import functional
 
 from asp_env.data.predictor import Forecast, make_forecast
 from asp_env.data.scene import Scene
-from asp_env.dynamics import clip_actions, rollout
+from asp_env.dynamics import MAX_ACCELERATION_MPS2, clip_actions, rollout
 from asp_env.dynamics.bicycle import Integrator
 from asp_env.errors import AspEnvError
 from asp_env.geometry import from_frame, wrap_angle
@@ -26,7 +27,18 @@ from predictors.models.losses import (
     Assignment,
     Classification,
     mode_terms,
+    standing_loss,
+    stands,
 )
+
+STANDING_HIDDEN = 64
+"""Width of the hidden layer before the logit of standing. Chosen by hand."""
+
+SLOW_MPS = 1.0
+"""Above this speed a target is not standing; the subset `moving` has the same limit."""
+
+FAST_LOGIT = -12.0
+"""Logit of standing of a target that is faster: a probability of 6e-6. Chosen by hand."""
 
 MOTION_SCALE = (10.0, 3.0, 0.5)
 """Divisors of speed (m/s), acceleration (m/s²) and yaw rate (rad/s) at the input of a network.
@@ -43,6 +55,8 @@ class Modes(NamedTuple):
     """[acceleration m/s², steering rad]; None from a network that predicts positions."""
     features: Float[Tensor, "n f"] | None = None
     """What the network encodes of the inputs: z, and for SSP-ASP the predicted ẑ behind it."""
+    standing: Float[Tensor, " n"] | None = None
+    """Logit of the probability that a target stands; None from a network without that mode."""
 
 
 class TrainingProgress(NamedTuple):
@@ -106,6 +120,13 @@ class NetworkConfig:
     annealed: bool = False
     """Whether all modes learn from every label at first, weighted by their distance (softmin), and
     only the best one at the end."""
+    standing: bool = False
+    """Whether forecasts have a further mode, in which the target stands, with a probability that
+    is learned and calibrated apart. The other modes then learn from no label that stands."""
+    shrunk: bool = False
+    """Whether forecast accelerations are multiplied by a factor, fitted after the training on the
+    validation data. It is below 1 if these are of other traffic, in which vehicles accelerate and
+    brake at other places than the training data show."""
 
     def __post_init__(self) -> None:
         """Checks the sizes.
@@ -132,6 +153,9 @@ class AbstractNetwork(nn.Module, ABC):
     The names of modules and buffers are keys of the files of weights.
     """
 
+    acceleration_scale: Tensor | None
+    """Scalar factor on forecast accelerations, fitted after the training; None without the option
+    `shrunk`."""
     merging_temperature: Tensor | None
     """Scalar divisor of the log-probabilities of chains before they are merged, fitted after the
     training; None for a network that merges none."""
@@ -144,6 +168,16 @@ class AbstractNetwork(nn.Module, ABC):
         self.register_buffer("action_range", torch.tensor(shape.action_range), persistent=False)
         self.register_buffer("motion_scale", torch.tensor(MOTION_SCALE), persistent=False)
         self.register_buffer("merging_temperature", None)
+        self.standing_head: nn.Module | None = None
+        self.register_buffer("standing_calibration", None)
+        # As `merging_temperature` of SSP-ASP, a weight: it belongs to what was trained.
+        self.register_buffer("acceleration_scale", torch.ones(()) if config.shrunk else None)
+        if config.standing:
+            inputs = config.features + len(MOTION_SCALE) + 2 * shape.history
+            self.standing_head = nn.Sequential(
+                nn.Linear(inputs, STANDING_HIDDEN), nn.ReLU(), nn.Linear(STANDING_HIDDEN, 1)
+            )
+            self.register_buffer("standing_calibration", torch.tensor([1.0, 0.0]))
 
     @property
     def later_ticks(self) -> tuple[int, ...]:
@@ -208,7 +242,54 @@ class AbstractNetwork(nn.Module, ABC):
         divisor: float | Tensor = temperature
         if chaining == "full" and self.merging_temperature is not None:
             divisor = self.merging_temperature
-        return modes._replace(logits=(modes.logits / divisor).log_softmax(dim=-1))
+        modes = modes._replace(logits=(modes.logits / divisor).log_softmax(dim=-1))
+        return self.with_standing(batch, modes)
+
+    def standing_logit(self, z: Float[Tensor, "n z"], batch: Batch) -> Float[Tensor, " n"] | None:
+        """The logit of standing, from features, motion and past actions.
+
+        Args:
+            z: Features with a bounded scale.
+            batch: Inputs.
+
+        Returns:
+            Logits, not calibrated; `FAST_LOGIT` over 1 m/s; None without the option `standing`.
+        """
+        if self.standing_head is None:
+            return None
+        past = self.scaled_actions(batch.actions).flatten(1)
+        inputs = torch.cat([z, self.scaled_motion(batch), past], dim=-1)
+        logit = self.standing_head(inputs)[:, 0]
+        slow = batch.motion[:, 0].abs() <= SLOW_MPS
+        return torch.where(slow, logit, torch.full_like(logit, FAST_LOGIT))
+
+    def with_standing(self, batch: Batch, modes: Modes) -> Modes:
+        """Appends the mode in which the target stands, or stops as fast as it can.
+
+        Args:
+            batch: Inputs.
+            modes: Modes with log-probabilities in place of logits.
+
+        Returns:
+            The modes, unchanged if they have no logit of standing.
+        """
+        if modes.standing is None:
+            return modes
+        slope, shift = self.get_buffer("standing_calibration")
+        fast = modes.standing <= FAST_LOGIT
+        logit = torch.where(fast, modes.standing, slope * modes.standing + shift)[:, None]
+        stops = stopping_actions(batch, modes.states.shape[2], self.shape.dt_s)[:, None]
+        states = rollout_from_now(stops, batch, self.shape.dt_s, "heun")
+        log_probs = torch.cat(
+            [modes.logits + functional.logsigmoid(-logit), functional.logsigmoid(logit)], dim=1
+        )
+        actions = None if modes.actions is None else torch.cat([modes.actions, stops], dim=1)
+        return modes._replace(
+            states=torch.cat([modes.states, states], dim=1),
+            logits=log_probs,
+            actions=actions,
+            standing=None,
+        )
 
     @torch.inference_mode()
     def forecast(
@@ -255,8 +336,11 @@ class AbstractNetwork(nn.Module, ABC):
             assignment=self.config.assignment,
             classification=self.config.classification,
             share=progress.share if self.config.annealed else None,
+            learned=None if modes.standing is None else ~stands(labels.states),
         )
-        return {"loss": terms["regression"] + terms["classification"], **terms}
+        if modes.standing is not None:
+            terms["standing"] = standing_loss(modes.standing, labels.states)
+        return {"loss": torch.stack(list(terms.values())).sum(), **terms}
 
     def training_loss(
         self, batch: Batch, labels: Labels, progress: TrainingProgress
@@ -290,8 +374,31 @@ class AbstractNetwork(nn.Module, ABC):
         return (batch.motion / self.get_buffer("motion_scale")).clamp(-3, 3)
 
     def bounded_actions(self, outputs: Float[Tensor, "n m t 2"]) -> Float[Tensor, "n m t 2"]:
-        """Actions of unbounded outputs: tanh times the action range, within the limits."""
-        return clip_actions(outputs.tanh() * self.get_buffer("action_range"))
+        """Actions of unbounded outputs: tanh times the action range, within the limits.
+
+        Accelerations are multiplied by the fitted factor, if there is one.
+        """
+        actions = outputs.tanh() * self.get_buffer("action_range")
+        if self.acceleration_scale is not None:
+            actions = actions * torch.stack(
+                [self.acceleration_scale, torch.ones_like(self.acceleration_scale)]
+            )
+        return clip_actions(actions)
+
+
+def stopping_actions(batch: Batch, ticks: int, dt_s: float) -> Float[Tensor, "n t 2"]:
+    """Actions that stop the targets as fast as the limit of accelerations permits, and no more.
+
+    Args:
+        batch: Inputs.
+        ticks: Number of ticks.
+        dt_s: Time step.
+    """
+    speed = batch.motion[:, :1]
+    steps = torch.arange(ticks + 1, device=speed.device)
+    remaining = (speed.abs() - MAX_ACCELERATION_MPS2 * dt_s * steps).clamp(min=0) * speed.sign()
+    accelerations = torch.diff(remaining, dim=1) / dt_s
+    return torch.stack([accelerations, torch.zeros_like(accelerations)], dim=-1)
 
 
 def start_states(batch: Batch) -> Float[Tensor, "n 4"]:

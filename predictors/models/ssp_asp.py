@@ -57,7 +57,14 @@ from predictors.models.chaining import (
 )
 from predictors.models.encoders import make_encoder
 from predictors.models.heads import ConnectedHead, Decoder, RecurrentReader, UnrolledDecoder
-from predictors.models.losses import HUBER_M, best_mode, into_frame, mode_terms
+from predictors.models.losses import (
+    HUBER_M,
+    best_mode,
+    into_frame,
+    mode_terms,
+    standing_loss,
+    stands,
+)
 from predictors.models.network import (
     AbstractNetwork,
     Features,
@@ -253,7 +260,10 @@ class SSPASPNetwork(AbstractNetwork):
                 )
                 chains = extend(chains, self._next_segment(chains, batch))
                 chains = self._reduce(chains, chaining, batch)
-        return Modes(chains.states, chains.log_probs, chains.actions, features=features)
+            standing = self.standing_logit(self.norm(z), batch)
+        return Modes(
+            chains.states, chains.log_probs, chains.actions, features=features, standing=standing
+        )
 
     def encode(self, batch: Batch) -> Float[Tensor, "n z"]:
         """φ: the features of the observation."""
@@ -303,7 +313,11 @@ class SSPASPNetwork(AbstractNetwork):
         encoded, targets = self._encode_all(batch, labels)
         with torch.autocast(batch.actions.device.type, enabled=False):
             segments = list(self._terms(batch, labels, progress, encoded, targets))
-        return self._weighted(_means(segments))
+            standing = self.standing_logit(self.norm(encoded[0]), batch)
+        terms = _means(segments)
+        if standing is not None and not progress.pretraining:
+            terms["standing"] = standing_loss(standing, labels.states)
+        return self._weighted(terms)
 
     def validate(
         self, modes: Modes, batch: Batch, labels: Labels, progress: TrainingProgress
@@ -311,7 +325,7 @@ class SSPASPNetwork(AbstractNetwork):
         """L_SSP (equation 20) of a forecast, and the features at the end of the first segment.
 
         The terms of w1 and w2 are those of the training, along the recorded actions; those of w3
-        and w4 are of the modes of the forecast and missing in pre-training.
+        and w4, and that of the standing mode, are of the forecast and missing in pre-training.
         """
         encoded, targets = self._encode_all(batch, labels)
         of_features = progress._replace(pretraining=True)
@@ -322,7 +336,7 @@ class SSPASPNetwork(AbstractNetwork):
             features = Features(encoded[1], self.predict_features(inputs))
         if not progress.pretraining:
             of_modes = self.loss(modes, labels, progress)
-            terms |= {name: of_modes[name] for name in ("regression", "classification")}
+            terms |= {name: value for name, value in of_modes.items() if name != "loss"}
         return Validation(self._weighted(terms), features)
 
     def after_step(self) -> None:
@@ -337,12 +351,13 @@ class SSPASPNetwork(AbstractNetwork):
                 follower.copy_(leader)
 
     def _weighted(self, terms: dict[str, Tensor]) -> dict[str, Tensor]:
-        """The terms, and `loss`, their sum with the weights w1 to w4."""
+        """The terms, and `loss`, their sum with the weights w1 to w4 (standing mode: 1)."""
         weights = {
             "actions": self._options.action_weight,
             "features": self._options.feature_weight,
             "regression": self._options.regression_weight,
             "classification": self._options.classification_weight,
+            "standing": 1.0,
         }
         total = torch.stack([weights[name] * value for name, value in terms.items()]).sum()
         return {"loss": total, **terms}
@@ -487,6 +502,7 @@ class SSPASPNetwork(AbstractNetwork):
             assignment=self.config.assignment,
             classification=self.config.classification,
             share=progress.share if self.config.annealed else None,
+            learned=~stands(labels.states).repeat(len(branches)) if self.config.standing else None,
         )
         continued = best_mode(positions.detach(), truth, self.config.assignment)
         rows = torch.arange(len(continued), device=continued.device)

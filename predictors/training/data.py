@@ -17,7 +17,9 @@ from asp_env.dynamics import MAX_ACCELERATION_MPS2, MAX_STEERING_RAD, inverse
 from asp_env.errors import AspEnvError
 from asp_env.metrics.forecast.errors import moving
 from asp_env.views import SceneView
+from predictors.training.augmentation import Augmentation
 from predictors.training.data_loading import (
+    BatchRequest,
     BatchSource,
     BatchWorkers,
     Sample,
@@ -56,6 +58,8 @@ class Batches:
         batch_size: int,
         later_ticks: Sequence[int] = (),
         histories: Sequence[Recording] | None = None,
+        augmentation: Augmentation | None = None,
+        seed: int = 0,
     ) -> None:
         """Makes an unsharded sequence that loads in a thread.
 
@@ -66,13 +70,18 @@ class Batches:
             batch_size: Snippets of a batch; the last one may be smaller.
             later_ticks: Ticks ahead at which labels hold future inputs.
             histories: The same recordings as the inputs show them; None for the recordings.
+            augmentation: Ranges of the augmentation; None for none.
+            seed: Seed of the augmentation.
         """
         self.snippets = snippets
+        self._visited = 0
         self.source = BatchSource(
             recordings=recordings,
             histories=recordings if histories is None else histories,
             view=view,
             later_ticks=tuple(later_ticks),
+            augmentation=augmentation,
+            seed=seed,
         )
         self._workers: tuple[BatchWorkers, int] | None = None
         self._batch_size = batch_size
@@ -85,10 +94,15 @@ class Batches:
         other._workers = workers, source
         return other
 
-    def reordered(self, rows: Int[np.ndarray, " m"]) -> "Batches":
-        """Batches of the snippets at some rows, in their order."""
+    def reordered(self, rows: Int[np.ndarray, " m"], *, visited: int = 0) -> "Batches":
+        """Batches of the snippets at some rows, in their order.
+
+        Args:
+            rows: Rows of the snippets.
+            visited: Number of snippets that the run visits before.
+        """
         other = copy.copy(self)
-        other.snippets = self.snippets.select(rows)
+        other.snippets, other._visited = self.snippets.select(rows), visited
         return other
 
     def shard(self, rank: int, num_shards: int) -> "Batches":
@@ -119,7 +133,8 @@ class Batches:
         return -(-len(self.snippets) // self._batch_size)
 
     def __iter__(self) -> Iterator[Sample]:
-        batches = (self.snippets.select(self.shard_rows(batch)) for batch in range(len(self)))
+        every = (self.shard_rows(batch) for batch in range(len(self)))
+        batches = (BatchRequest(self.snippets.select(rows), self._visited + rows) for rows in every)
         if self._workers is None:
             return load_by_thread(self.source, batches)
         return load_by_workers(*self._workers, batches)
@@ -150,6 +165,8 @@ class DatasetSplit:
             batch_size=size,
             later_ticks=later_ticks,
             histories=histories(self.recordings, config.history),
+            augmentation=config.augmentation,
+            seed=config.seed,
         )
 
 

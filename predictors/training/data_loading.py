@@ -12,15 +12,26 @@ from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import partial
 from itertools import islice
-from typing import final
+from typing import NamedTuple, final
 
+import numpy as np
 import torch
+from jaxtyping import Int
 
 from asp_env.data.recording import Recording
 from asp_env.data.snippets import SnippetIndex, gather_future, gather_scene
 from asp_env.views import SceneView
 from asp_env.workers import WorkerPool
 from predictors.models.batch import Batch, Labels, make_batch, make_labels
+from predictors.training.augmentation import (
+    Augmentation,
+    measured_again,
+    off_the_map,
+    one_situation_each,
+    reshaped,
+    reshaped_labels,
+    sample_keys,
+)
 
 PREFETCH = 4
 """Batches that each thread or process loads in advance. Chosen by hand: it smooths the differences
@@ -41,9 +52,15 @@ class BatchSource:
     view: SceneView
     later_ticks: tuple[int, ...] = ()
     """Ticks ahead at which labels hold future inputs."""
+    augmentation: Augmentation | None = None
+    seed: int = 0
+    """Seed of the augmentation."""
 
-    def load(self, snippets: SnippetIndex) -> Sample:
+    def load(self, request: "BatchRequest") -> Sample:
         """Makes one batch of all the snippets."""
+        if self.augmentation is not None:
+            return self._augmented(request, self.augmentation)
+        snippets = request.snippets
         scene = gather_scene(self.histories, snippets)
         later = tuple(
             make_batch(
@@ -53,6 +70,31 @@ class BatchSource:
         )
         labels = make_labels(scene, gather_future(self.recordings, snippets), later)
         return make_batch(scene, self.view, snippets.history), labels
+
+    def _augmented(self, request: "BatchRequest", ranges: Augmentation) -> Sample:
+        snippets, keys = request.snippets, sample_keys(self.seed, request.visits)
+        recorded = one_situation_each(gather_scene(self.histories, snippets))
+        about = recorded.target_states[:, :2].astype(np.float64)
+        batches = []
+        for part, ticks in enumerate((0, *self.later_ticks)):
+            scene = recorded
+            if ticks:
+                scene = one_situation_each(gather_scene(self.histories, snippets.shifted(ticks)))
+            scene = measured_again(scene, keys, ranges, part=part)
+            if not ticks:
+                labels = make_labels(scene, gather_future(self.recordings, snippets))
+            scene = off_the_map(scene, about, keys, ranges)
+            batches.append(reshaped(make_batch(scene, self.view, snippets.history), keys, ranges))
+        states = reshaped_labels(labels.states, keys, ranges)
+        return batches[0], Labels(states=states, later=tuple(batches[1:]))
+
+
+class BatchRequest(NamedTuple):
+    """The snippets of a batch."""
+
+    snippets: SnippetIndex
+    visits: Int[np.ndarray, " n"]
+    """Number of snippets that the run visits before each; augmentation depends on it."""
 
 
 @final
@@ -66,9 +108,9 @@ class BatchWorkers:
             partial(_load, tuple(sources)), processes, initializer=_use_one_thread
         )
 
-    def submit(self, source: int, snippets: SnippetIndex) -> Future[Sample]:
-        """Starts to make a batch of the snippets from the source of that index."""
-        return self._pool.submit((source, snippets))
+    def submit(self, source: int, request: BatchRequest) -> Future[Sample]:
+        """Starts to make a batch from the source of that index."""
+        return self._pool.submit((source, request))
 
     def close(self) -> None:
         """Cancels the batches that are not begun, and ends the processes."""
@@ -88,7 +130,7 @@ def batch_workers(sources: Sequence[BatchSource], processes: int) -> Iterator[Ba
         workers.close()
 
 
-def load_by_thread(source: BatchSource, batches: Iterable[SnippetIndex]) -> Iterator[Sample]:
+def load_by_thread(source: BatchSource, batches: Iterable[BatchRequest]) -> Iterator[Sample]:
     """Makes batches in order, in a thread.
 
     Args:
@@ -100,7 +142,7 @@ def load_by_thread(source: BatchSource, batches: Iterable[SnippetIndex]) -> Iter
 
 
 def load_by_workers(
-    workers: BatchWorkers, source: int, batches: Iterable[SnippetIndex]
+    workers: BatchWorkers, source: int, batches: Iterable[BatchRequest]
 ) -> Iterator[Sample]:
     """Makes batches in order, in processes.
 
@@ -113,8 +155,8 @@ def load_by_workers(
 
 
 def _in_order(
-    batches: Iterable[SnippetIndex],
-    submit: Callable[[SnippetIndex], Future[Sample]],
+    batches: Iterable[BatchRequest],
+    submit: Callable[[BatchRequest], Future[Sample]],
     prefetch: int,
 ) -> Iterator[Sample]:
     remaining = iter(batches)
@@ -129,6 +171,6 @@ def _use_one_thread() -> None:
     torch.set_num_threads(1)
 
 
-def _load(sources: tuple[BatchSource, ...], request: tuple[int, SnippetIndex]) -> Sample:
-    source, snippets = request
-    return sources[source].load(snippets)
+def _load(sources: tuple[BatchSource, ...], request: tuple[int, BatchRequest]) -> Sample:
+    source, batch = request
+    return sources[source].load(batch)

@@ -107,7 +107,8 @@ class TrainingModule(pl.LightningModule):
             epoch=self.current_epoch,
             seed=self.config.seed,
         )
-        self._epoch_batches = self._training.reordered(rows).shard(
+        visited = self.current_epoch * self._per_epoch
+        self._epoch_batches = self._training.reordered(rows, visited=visited).shard(
             self.trainer.global_rank, self.trainer.world_size
         )
         self._sums.clear()
@@ -231,8 +232,10 @@ class TrainingModule(pl.LightningModule):
         valid = np.ones(truth.shape[:2], dtype=bool)
         now = np.zeros((len(truth), 4), dtype=np.float32)
         now[:, 3] = batch.motion[:, 0].cpu().numpy()
+        modes = modes._replace(logits=modes.logits.float().log_softmax(dim=-1))
+        modes = self.network.with_standing(batch, modes)
         positions = modes.states[..., :2].float().cpu().numpy()
-        log_probs = modes.logits.float().log_softmax(dim=-1).cpu().numpy()
+        log_probs = modes.logits.cpu().numpy()
         values = {
             "loss": np.full(len(truth), float(terms["loss"])),
             "moving": moving(now, truth, valid),

@@ -22,6 +22,7 @@ from predictors.models.ffw_asp import FFWASPConfig
 from predictors.models.mtp import MTPConfig
 from predictors.models.network import NetworkConfig
 from predictors.models.ssp_asp import SSPASPConfig
+from predictors.training.augmentation import Augmentation
 
 Budget = Literal["epochs", "cpu", "converged"]
 """What the prediction epochs of a run follow from: its recipe, equal CPU time, or convergence."""
@@ -96,6 +97,8 @@ class TrainingConfig:
     """Precision of the encoder; the rest of the network is always float32."""
     threads: int | None = None
     """Threads of torch within one operation; None for its default."""
+    augmentation: Augmentation | None = None
+    """Random changes of the samples, in training and in validation; None for none."""
 
     def __post_init__(self) -> None:
         """Checks the numbers.
@@ -124,6 +127,11 @@ class TrainingConfig:
             raise AspEnvError(
                 f"training: patience is {self.patience} with the schedule {self.schedule}, which "
                 "ends after a given number of steps: expected the schedule plateau"
+            )
+        if self.augmentation is not None and self.history == "accelerations":
+            raise AspEnvError(
+                "training: augmentation infers past actions from changed states, the history "
+                "accelerations takes them from the files: expected another history or recipe"
             )
         if not 0 < self.standing_share <= 1:
             raise AspEnvError(
@@ -194,6 +202,17 @@ def ffw_asp_ours(view: str, horizon_s: float) -> TrainingConfig:
     )
 
 
+def ffw_asp_robust(view: str, horizon_s: float) -> TrainingConfig:
+    """`asp-env train ffw-asp DATA --recipe robust`: `ours` for traffic that it is not trained on.
+
+    See `_robust`.
+
+    Raises:
+        AspEnvError: The view renders rasters.
+    """
+    return _robust(ffw_asp_ours(view, horizon_s))
+
+
 def ssp_asp_paper(view: str, horizon_s: float, segment_s: float = SEGMENT_S) -> TrainingConfig:
     """`asp-env train ssp-asp DATA --recipe paper`: the paper's SSP-ASP.
 
@@ -255,6 +274,18 @@ def ssp_asp_ours(view: str, horizon_s: float, segment_s: float = SEGMENT_S) -> T
     return _small("ssp-asp", "ours", network, view, horizon_s)
 
 
+def ssp_asp_robust(view: str, horizon_s: float, segment_s: float = SEGMENT_S) -> TrainingConfig:
+    """`asp-env train ssp-asp DATA --recipe robust`: `ours` for traffic that it is not trained on.
+
+    See `_robust`.
+
+    Raises:
+        AspEnvError: The view renders rasters, the horizon is not a whole number of segments, or a
+            segment not one of ticks.
+    """
+    return _robust(ssp_asp_ours(view, horizon_s, segment_s))
+
+
 Recipe = Callable[..., TrainingConfig]
 """Makes a configuration of a view and a horizon in seconds and, for the predictors of `CHAINED`,
 the length of a segment in seconds."""
@@ -263,8 +294,18 @@ RECIPES: Mapping[str, Mapping[str, Recipe]] = MappingProxyType(
     {
         "mtp": {"cpu": mtp_cpu, "paper": mtp_paper},
         "dkm": {"cpu": dkm_cpu, "paper": dkm_paper},
-        "ffw-asp": {"cpu": ffw_asp_cpu, "paper": ffw_asp_paper, "ours": ffw_asp_ours},
-        "ssp-asp": {"cpu": ssp_asp_cpu, "paper": ssp_asp_paper, "ours": ssp_asp_ours},
+        "ffw-asp": {
+            "cpu": ffw_asp_cpu,
+            "paper": ffw_asp_paper,
+            "ours": ffw_asp_ours,
+            "robust": ffw_asp_robust,
+        },
+        "ssp-asp": {
+            "cpu": ssp_asp_cpu,
+            "paper": ssp_asp_paper,
+            "ours": ssp_asp_ours,
+            "robust": ssp_asp_robust,
+        },
     }
 )
 """Recipes by predictor and name."""
@@ -357,6 +398,29 @@ def _small(
         schedule="one-cycle",
         precision="32-true" if vectors else "bf16-mixed",
         threads=1,
+    )
+
+
+def _robust(config: TrainingConfig) -> TrainingConfig:
+    """Augmented samples, a standing mode with more standing targets, and shrunk accelerations.
+
+    Give validation data of other traffic than the training data: the epoch, the probabilities and
+    the factor of the accelerations are chosen on them.
+
+    Raises:
+        AspEnvError: The view renders rasters.
+    """
+    if config.network.encoder != "vector":
+        raise AspEnvError(
+            f"recipe robust augments vectors, the view {config.view} renders rasters: give "
+            "--view vectors"
+        )
+    return dataclasses.replace(
+        config,
+        preset="robust",
+        network=dataclasses.replace(config.network, standing=True, shrunk=True),
+        standing_share=0.5,
+        augmentation=Augmentation(),
     )
 
 

@@ -86,6 +86,9 @@ def test_situation_and_causal_histories_have_the_signals() -> None:
     assert signals is not None
     np.testing.assert_array_equal(signals.states, scene.signals.states[[situation]])
     assert {int(state) for state in scene.signals.states[:, 0, -1]} == {1, 3}
+    twice = scene.signals.of_situations(np.array([situation, 0, situation]))
+    np.testing.assert_array_equal(twice.states[[0, 2]], signals.states.repeat(2, axis=0))
+    np.testing.assert_array_equal(twice.stop_lines[1], scene.signals.stop_lines[0])
 
 
 def test_a_delayed_predictor_shows_the_signals_of_then() -> None:

@@ -7,7 +7,12 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from predictors.inference.calibration import LIMITS, cross_entropy, fit_temperature
+from predictors.inference.calibration import (
+    LIMITS,
+    cross_entropy,
+    fit_logistic,
+    fit_temperature,
+)
 
 
 def samples(scale: float, count: int = 20_000) -> tuple[np.ndarray, np.ndarray]:
@@ -46,3 +51,20 @@ def test_degenerate_logits() -> None:
     logits = np.array([[3.0, 0.0]] * 4)
     assert LIMITS[0] <= fit_temperature(logits, np.zeros(4, dtype=np.int64)) < 0.1
     assert fit_temperature(logits, np.ones(4, dtype=np.int64)) == pytest.approx(20, rel=1e-3)
+
+
+@pytest.mark.parametrize(("slope", "shift"), [(1.0, 0.0), (0.5, 1.0), (2.0, -1.0)])
+def test_logistic_fit_finds_the_slope_and_the_shift(slope: float, shift: float) -> None:
+    """Outcomes drawn with the probabilities of slope · logit + shift."""
+    rng = np.random.default_rng(1)
+    logits = rng.normal(0, 2, 20_000)
+    outcomes = rng.random(20_000) < 1 / (1 + np.exp(-(slope * logits + shift)))
+    assert fit_logistic(logits, outcomes) == pytest.approx((slope, shift), abs=0.06)
+
+
+def test_logistic_fit_of_few_samples_stays_near_the_identity() -> None:
+    """Without samples it is the identity; separable outcomes do not let it diverge."""
+    assert fit_logistic(np.zeros(0), np.zeros(0, dtype=bool)) == (1.0, 0.0)
+    slope, shift = fit_logistic(np.array([-4.0, 5.0]), np.array([False, True]))
+    assert 1.0 <= slope < 1.2
+    assert abs(shift) < 0.1

@@ -15,6 +15,7 @@ from predictors.delayed import _scene_before
 from predictors.inference.onnx_file import input_names, inputs_of, write_onnx
 from predictors.inference.trained import TrainedPredictor
 from predictors.models.batch import make_batch
+from predictors.models.network import TrainingProgress
 from predictors.models.ssp_asp import SSPASPNetwork
 from predictors.training.recipes import RECIPES
 from tests.builders import make_recording
@@ -60,7 +61,7 @@ def test_features_are_those_that_the_network_encodes(run: str) -> None:
             _, labels = draw_samples(
                 range(len(batch.motion)), view="vectors", later_ticks=network.later_ticks[:1]
             )
-            features = network.features(batch, labels)
+            _, features = network.validate(network(batch), batch, labels, TrainingProgress())
             assert features is not None
             expected = torch.cat([network.encode(batch), features.predicted], dim=1)
         else:

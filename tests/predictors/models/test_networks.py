@@ -18,6 +18,8 @@ from predictors.models.network import AbstractNetwork, Modes, TrainingProgress, 
 from tests.builders import Drive, make_recording
 from tests.predictors.tiny import draw_samples, make_network, tiny_network, tiny_shape
 
+TRAINABLE = ("mtp", "dkm", "ffw-asp", "ssp-asp")
+
 OPTIONS: dict[str, tuple[str, dict[str, Any]]] = {
     "mtp": ("mtp", {}),
     "dkm": ("dkm", {}),
@@ -47,6 +49,7 @@ OPTIONS: dict[str, tuple[str, dict[str, Any]]] = {
     "ssp-asp scheduled": ("ssp-asp", {"scheduled": True}),
     "ssp-asp annealed": ("ssp-asp", {"annealed": True}),
     "ssp-asp under Euler": ("ssp-asp", {"integrator": "euler"}),
+    **{f"{each} standing": (each, {"standing": True}) for each in TRAINABLE},
 }
 
 

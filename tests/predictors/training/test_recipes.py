@@ -9,6 +9,7 @@ from asp_env.errors import AspEnvError
 from predictors.models.ffw_asp import FFWASPConfig
 from predictors.models.losses import DEFAULT_ASSIGNMENT
 from predictors.models.ssp_asp import SSPASPConfig
+from predictors.training.augmentation import Augmentation
 from predictors.training.recipes import RECIPES, TrainingConfig, recipe
 from tests.predictors.tiny import tiny_config
 
@@ -59,8 +60,15 @@ CASES = [(predictor, name) for predictor, names in RECIPES.items() for name in n
 
 @pytest.mark.parametrize(("predictor", "name"), CASES)
 def test_every_recipe_is_for_every_view(predictor: str, name: str) -> None:
-    """The encoder fits the view; small rasters have 90x60 pixels, or 90x90 in the square view."""
+    """The encoder fits the view; small rasters have 90x60 pixels, or 90x90 in the square view.
+
+    The recipe `robust` refuses rasters, which it cannot augment.
+    """
     for view, pixels in (("chauffeurnet", (90, 60)), ("mtp", (90, 90)), ("vectors", None)):
+        if name == "robust" and view != "vectors":
+            with pytest.raises(AspEnvError, match="give --view vectors"):
+                recipe(predictor, name, view=view, horizon_s=3.0)
+            continue
         config = recipe(predictor, name, view=view, horizon_s=3.0)
         assert (config.predictor, config.preset, config.view) == (predictor, name, view)
         if name == "paper":
@@ -82,15 +90,15 @@ def test_pretraining_is_additional(name: str, epochs: int, pretraining: int) -> 
 
 @pytest.mark.parametrize(("predictor", "name"), CASES)
 def test_the_rule_for_the_best_mode_is_one_constant(predictor: str, name: str) -> None:
-    """Every recipe has it but `ours`, which was chosen with `distance`."""
+    """Every recipe has it but `ours`, which was chosen with `distance`, and `robust`."""
     network = recipe(predictor, name, view="vectors", horizon_s=3.0).network
-    assert network.assignment == ("distance" if name == "ours" else DEFAULT_ASSIGNMENT)
+    assert network.assignment == ("distance" if name in ("ours", "robust") else DEFAULT_ASSIGNMENT)
 
 
 def test_small_runs_for_6_s_have_equal_prediction_epochs() -> None:
     """16 epochs each: SSP-ASP has 8 for 3 s and 8 for 6 s, the others have 16 at once."""
     small = [case for case in CASES if case[1] != "paper"]
-    assert len(small) == 6
+    assert len(small) == 8
     for predictor, name in small:
         short, long = (
             recipe(predictor, name, view="vectors", horizon_s=horizon_s).epochs
@@ -103,7 +111,7 @@ def test_unknown_names_list_the_known_ones() -> None:
     """The error suggests the nearest name and lists all."""
     with pytest.raises(AspEnvError, match="did you mean 'ffw-asp'"):
         recipe("ffw", "cpu", view="chauffeurnet", horizon_s=3.0)
-    with pytest.raises(AspEnvError, match="known are cpu, ours, paper"):
+    with pytest.raises(AspEnvError, match="known are cpu, ours, paper, robust"):
         recipe("ffw-asp", "gpu", view="chauffeurnet", horizon_s=3.0)
 
 
@@ -126,6 +134,8 @@ def test_numbers_out_of_range_are_refused() -> None:
         tiny_config(patience=2)
     with pytest.raises(AspEnvError, match=r"standing_share is 1\.5"):
         tiny_config(standing_share=1.5)
+    with pytest.raises(AspEnvError, match="augmentation infers past actions from changed states"):
+        tiny_config(augmentation=Augmentation(), history="accelerations")
     with pytest.raises(AspEnvError, match="pretraining_epochs is -1"):
         tiny_config(pretraining_epochs=-1)
     assert isinstance(tiny_config(), TrainingConfig)

@@ -88,9 +88,9 @@ def test_every_recipe_has_the_other_rules_for_the_best_mode(
         assert (name in offered) == (rule != own)
         if rule == own:
             with pytest.raises(AspEnvError, match=f"has the assignment '{rule}' without a variant"):
-                both(predictor, name, recipe_name=recipe_name)
+                both(predictor, name, recipe_name=recipe_name, view="vectors")
         else:
-            network = both(predictor, name, recipe_name=recipe_name)[1].network
+            network = both(predictor, name, recipe_name=recipe_name, view="vectors")[1].network
             assert network.assignment == rule
 
 
