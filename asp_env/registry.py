@@ -12,6 +12,7 @@ The groups are:
 - `asp_env.drivers`: move the agents other than the ego;
 - `asp_env.sources`: data by `scheme:argument`, such as `synthetic:intersection`;
 - `asp_env.worlds`: simulate the data of a source that are not replayed, such as `highway:`;
+- `asp_env.views`: render scenes for networks;
 - `asp_env.commands`: sub-commands of `asp-env`.
 """
 
@@ -21,7 +22,7 @@ from typing import Any, Literal
 
 from asp_env.errors import AspEnvError, unknown_name
 
-Group = Literal["predictors", "planners", "drivers", "sources", "worlds", "commands"]
+Group = Literal["predictors", "planners", "drivers", "sources", "worlds", "views", "commands"]
 
 
 @cache
@@ -42,15 +43,30 @@ def find(group: Group, name: str) -> Any:
         name: the registered name.
 
     Raises:
-        AspEnvError: the name is unknown (the message lists all names), or a package is missing.
+        AspEnvError: the name is unknown (the message lists all names), a package is missing, or
+            the object cannot be imported.
     """
-    plugs = _plugs(group)
+    plugs, kind = _plugs(group), group.rstrip("s")
     if name not in plugs:
-        raise unknown_name(group.rstrip("s"), name, plugs)
+        raise unknown_name(kind, name, plugs)
     try:
         return plugs[name].load()
-    except ModuleNotFoundError as error:
+    except AspEnvError:
+        raise
+    except Exception as error:  # a module of another package may raise anything
+        missing = error.name if isinstance(error, ModuleNotFoundError) else None
+        if missing is not None and not _is_within(plugs[name].module, missing):
+            raise AspEnvError(
+                f"{kind} {name!r} needs the package {missing!r}, which is not "
+                "installed: pip install 'asp-env[all]'"
+            ) from error
+        reason = " ".join(f"{type(error).__name__}: {error}".split())
         raise AspEnvError(
-            f"{group.rstrip('s')} {name!r} needs the package {error.name!r}, which is not "
-            "installed: pip install 'asp-env[all]'"
+            f"{kind} {name!r} cannot be imported from its entry point {plugs[name].value} "
+            f"({reason}): repair the package that registers it, or uninstall it"
         ) from error
+
+
+def _is_within(module: str, package: str) -> bool:
+    """Whether a module is a package, or is in it."""
+    return f"{module}.".startswith(f"{package}.")

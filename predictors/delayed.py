@@ -10,6 +10,7 @@ from jaxtyping import Float
 from asp_env.data.predictor import (
     Forecast,
     Predictor,
+    feature_size,
     load_predictor,
     make_forecast,
     needs_simulation,
@@ -61,6 +62,11 @@ class Delayed:
     def history(self) -> int:
         """Past ticks that the other predictor needed, D ticks ago."""
         return self.inner.history + self.ticks
+
+    @property
+    def feature_size(self) -> int:
+        """That of the other predictor, whose features are those of then."""
+        return feature_size(self.inner)
 
     @property
     def trained_on(self) -> TrainedOn | None:
@@ -129,6 +135,7 @@ class Delayed:
             actions=actions[:, :, first:end] if then.actions_valid.any() else None,
             log_probs=then.log_probs,
             valid=then.valid & since_then.all(axis=1),
+            features=then.features,
         )
         return dataclasses.replace(forecast, fallback=then.fallback)
 
@@ -146,6 +153,7 @@ def _scene_before(scene: Scene, ticks: int) -> Scene:
         classes=np.where(seen, scene.classes, 0).astype(scene.classes.dtype),
         ids=np.where(seen, scene.ids, -1),
         tick=scene.tick - ticks,
+        signals=None if scene.signals is None else scene.signals.before(ticks),
     )
 
 

@@ -6,7 +6,13 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from asp_env.data.predictor import Forecast, Predictor, load_predictor, needs_simulation
+from asp_env.data.predictor import (
+    Forecast,
+    Predictor,
+    feature_size,
+    load_predictor,
+    needs_simulation,
+)
 from asp_env.data.scene import Scene
 from asp_env.data.snippets import Future
 from asp_env.data.split import TrainedOn
@@ -57,6 +63,11 @@ class MostProbable:
     def trained_on(self) -> TrainedOn | None:
         """Training data of the other predictor."""
         return self.inner.trained_on
+
+    @property
+    def feature_size(self) -> int:
+        """That of the other predictor."""
+        return feature_size(self.inner)
 
     @property
     def metadata(self) -> Mapping[str, str]:

@@ -45,6 +45,8 @@ class Lanelet:
     """Centre line; None for the middle between the sides."""
     speed_limit_mps: float | None = None
     """Written in whole km/h; None for no limit."""
+    one_way: bool = True
+    """Whether a road may be driven in its own direction only; other lanelets have both."""
 
     @property
     def left_line(self) -> Polyline:
@@ -165,7 +167,7 @@ def write_map(
             "type": "lanelet",
             "subtype": lanelet.subtype,
             "location": "urban",
-            "one_way": "yes" if lanelet.subtype == "road" else "no",
+            "one_way": "yes" if lanelet.subtype == "road" and lanelet.one_way else "no",
         }
         if lanelet.speed_limit_mps is not None:
             tags["speed_limit"] = f"{lanelet.speed_limit_mps * 3.6:.0f} km/h"

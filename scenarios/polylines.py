@@ -37,7 +37,11 @@ def clothoid_like(
 ) -> Polyline:
     """A line from the origin with points 2 m apart: straight, then of growing curvature."""
     at = np.arange(0.0, length_m + 1e-9, 2.0)
-    bend = np.clip((at - straight_m) / 20.0, 0.0, 1.0) * curvature_per_m
+    return bent(heading_rad, np.clip((at - straight_m) / 20.0, 0.0, 1.0) * curvature_per_m)
+
+
+def bent(heading_rad: float, bend: Float[np.ndarray, " n"]) -> Polyline:
+    """A line from the origin with points 2 m apart, of the given curvature at each of them, 1/m."""
     heading = heading_rad + np.concatenate([[0.0], np.cumsum(0.5 * (bend[1:] + bend[:-1]) * 2.0)])
     middle = 0.5 * (heading[1:] + heading[:-1])
     steps = 2.0 * np.stack([np.cos(middle), np.sin(middle)], axis=1)

@@ -63,7 +63,9 @@ class Synthesize:
             highway-env has a single location.
         traffic: `normal`, or `dense`: vehicles follow each other after 3 to 6 s on the main road,
             more of them turn left across oncoming traffic, drivers differ in whether they yield,
-            and vehicles leave two-lane roundabouts from both lanes. Sites of SUMO only.
+            and vehicles leave two-lane roundabouts from both lanes; or `varied`: geometry, limits,
+            classes, drivers, maps and trackers are drawn from wide ranges for each location. Sites
+            of SUMO only.
         jobs: Number of processes; the bytes do not depend on it.
     """
 

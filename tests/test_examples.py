@@ -14,6 +14,7 @@ from asp_env.data.classes import AgentClass
 from examples import (
     held_out,
     own_predictor,
+    own_view,
     picture,
     step_the_environment,
     traffic_that_reacts,
@@ -72,6 +73,13 @@ def test_every_episode_of_random_actions_has_a_named_ending() -> None:
 
 def test_the_planner_drives_with_an_own_predictor() -> None:
     assert own_predictor.main() > 0.2
+
+
+def test_the_view_renders_the_sample() -> None:
+    """Fifteen channels at full resolution for each target."""
+    targets, *shape = own_view.main()
+    assert targets > 0
+    assert shape == [15, 360, 240]
 
 
 def test_only_replayed_traffic_hits_a_braking_car(tmp_path: Path) -> None:

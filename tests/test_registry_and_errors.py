@@ -1,6 +1,8 @@
 """Registered plugs, and error messages."""
 
+import sys
 from importlib.metadata import EntryPoint
+from pathlib import Path
 
 import pytest
 
@@ -71,6 +73,7 @@ def test_find_returns_the_object_of_the_entry_point() -> None:
         ("predictors", "predictor"),
         ("planners", "planner"),
         ("sources", "source"),
+        ("views", "view"),
         ("commands", "command"),
     ],
 )
@@ -83,11 +86,46 @@ def test_misspelled_name(group: registry.Group, kind: str) -> None:
     assert all(name in line for name in registry.names(group))
 
 
-def test_plug_whose_package_is_missing(monkeypatch: pytest.MonkeyPatch) -> None:
-    plug = EntryPoint(name="far", value="no_such_package.module:Far", group="asp_env.planners")
+def register(monkeypatch: pytest.MonkeyPatch, value: str) -> None:
+    """Registers the planner `far` alone."""
+    plug = EntryPoint(name="far", value=value, group="asp_env.planners")
     monkeypatch.setattr(registry, "_plugs", lambda group: {"far": plug} if group else {})
+
+
+def test_plug_that_needs_a_missing_package(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    (tmp_path / "far_planner.py").write_text("import no_such_package.module\n")
+    monkeypatch.syspath_prepend(tmp_path)
+    register(monkeypatch, "far_planner:Far")
     with pytest.raises(AspEnvError) as caught:
         registry.find("planners", "far")
     line = one_line(caught.value)
     assert line.startswith("planner 'far' needs the package 'no_such_package', which is not")
     assert "pip install" in line
+
+
+@pytest.mark.parametrize(
+    ("code", "reason"),
+    [
+        (None, "ModuleNotFoundError: No module named 'broken_planner'"),
+        ("", "AttributeError: module 'broken_planner' has no attribute 'Far'"),
+        ("Far = 1 / 0", "ZeroDivisionError: division by zero"),
+        ("raise ValueError('one\\ntwo')", "ValueError: one two"),
+        ("Far = (", "SyntaxError: '(' was never closed"),
+    ],
+)
+def test_plug_that_cannot_be_imported(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path, code: str | None, reason: str
+) -> None:
+    """One line names the plug, its entry point and the reason."""
+    if code is not None:
+        (tmp_path / "broken_planner.py").write_text(code)
+    monkeypatch.syspath_prepend(tmp_path)
+    monkeypatch.delitem(sys.modules, "broken_planner", raising=False)
+    register(monkeypatch, "broken_planner:Far")
+    with pytest.raises(AspEnvError) as caught:
+        registry.find("planners", "far")
+    line = one_line(caught.value)
+    assert line.startswith(
+        "planner 'far' cannot be imported from its entry point broken_planner:Far"
+    )
+    assert reason in line

@@ -43,6 +43,8 @@ class Forecast:
     """Share of constant velocity in each target's forecast, within [0, 1], NaN for a target that
     the predictor does not forecast; None from a predictor that has no guard against scenes outside
     of what it learned."""
+    features: Float[np.ndarray, "t features"] | None = None
+    """What a trained network encodes of each target, for other networks; None without a network."""
 
     @property
     def probabilities(self) -> Float[np.ndarray, "t m"]:
@@ -120,6 +122,21 @@ class InteractivePredictor(Predictor, Protocol):
         ...
 
 
+@runtime_checkable
+class FeaturePredictor(Predictor, Protocol):
+    """A predictor whose forecasts have `features`."""
+
+    @property
+    def feature_size(self) -> int:
+        """Number of features of each target; 0 if the forecasts have none."""
+        ...
+
+
+def feature_size(predictor: Predictor) -> int:
+    """Number of features of each target in a predictor's forecasts; 0 if they have none."""
+    return predictor.feature_size if isinstance(predictor, FeaturePredictor) else 0
+
+
 def needs_simulation(predictor: Predictor) -> bool:
     """Whether a predictor is to be given a simulated future."""
     return isinstance(predictor, InteractivePredictor) and predictor.needs_simulation
@@ -190,6 +207,7 @@ def make_forecast(
     actions: Float[np.ndarray, "t m steps 2"] | None,
     log_probs: Float[np.ndarray, "t m"],
     valid: Bool[np.ndarray, " t"],
+    features: Float[np.ndarray, "t features"] | None = None,
 ) -> Forecast:
     """A forecast of the scene's targets, with zeros where not valid.
 
@@ -199,6 +217,7 @@ def make_forecast(
         actions: [acceleration m/s², steering rad], or None for a predictor without actions.
         log_probs: natural logarithms of the modes' probabilities.
         valid: which targets the predictor forecasts.
+        features: what a network encodes of each target, or None.
     """
     at = (scene.targets[:, 0], scene.targets[:, 1])
     mask = valid[:, None, None, None]
@@ -215,6 +234,9 @@ def make_forecast(
         tick=scene.tick[scene.targets[:, 0]],
         valid=valid,
         dt_s=scene.dt_s,
+        features=None
+        if features is None
+        else np.where(valid[:, None], features, 0).astype(np.float32),
     )
 
 

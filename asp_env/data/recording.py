@@ -11,6 +11,7 @@ from jaxtyping import Bool, Float, Int
 
 from asp_env.data.classes import PREDICTED
 from asp_env.data.road_map import RoadMap
+from asp_env.data.signals import Signals
 from asp_env.errors import AspEnvError, DataError
 
 DEFAULT_DT_S = 0.2
@@ -95,14 +96,25 @@ class Recording:
     """[x m, y m, heading rad, speed m/s signed along the heading]."""
     road_map: RoadMap
     background: Background | None = None
+    signals: Signals | None = None
+    """Traffic signals; None if the files contain none."""
     repairs: tuple[str, ...] = ()
     """One line for each fault of the files that the reader repaired."""
+    start_hour: float | None = None
+    """Time of day of the first frame, hours after midnight; None where the files give none."""
+    weekday: str | None = None
+    """Day of the recording as the files name it; None where they do not."""
+    accelerations: Float[np.ndarray, " rows"] | None = None
+    """Recorded accelerations along the direction of motion, m/s², signed as the speed: its rate of
+    change according to the files. None where the files have none."""
+    shows_accelerations: bool = False
+    """Whether scenes show `accelerations` in past actions instead of changes of speed."""
 
     def __post_init__(self) -> None:
         """Checks that the columns of the track table have matching lengths.
 
         Raises:
-            DataError: they do not match.
+            DataError: they do not match, or the signals are of another number of frames.
         """
         tracks = len(self.track_ids)
         if not (
@@ -111,6 +123,11 @@ class Recording:
             and self.starts[-1] == len(self.states)
         ):
             raise DataError(f"recording {self.name}: the track table's columns differ in length")
+        if self.signals is not None and self.signals.states.shape[1] != self.num_frames:
+            raise DataError(
+                f"recording {self.name}: signals with {self.signals.states.shape[1]} frames, "
+                f"expected {self.num_frames}"
+            )
 
     def __deepcopy__(self, memo: dict[int, Any]) -> "Recording":
         """Returns the same object, since recordings are immutable."""
@@ -151,9 +168,14 @@ class Recording:
         return np.array(parked, dtype=bool)
 
     @cached_property
+    def of_predicted_class(self) -> Bool[np.ndarray, " tracks"]:
+        """Mask of tracks of a predicted class, parked agents included."""
+        return np.isin(self.classes, [int(kind) for kind in PREDICTED])
+
+    @cached_property
     def predicted(self) -> Bool[np.ndarray, " tracks"]:
         """Mask of tracks that may be predicted or driven: of a predicted class, and not parked."""
-        return np.isin(self.classes, [int(kind) for kind in PREDICTED]) & ~self.parked
+        return self.of_predicted_class & ~self.parked
 
     @cached_property
     def extent_m(self) -> tuple[float, float, float, float]:

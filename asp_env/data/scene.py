@@ -8,6 +8,7 @@ from jaxtyping import Bool, Float, Int
 
 from asp_env.data.classes import PREDICTED
 from asp_env.data.road_map import RoadMap
+from asp_env.data.signals import SceneSignals
 from asp_env.dynamics import inverse
 from asp_env.errors import AspEnvError
 
@@ -25,7 +26,8 @@ class Scene:
     states: Float[np.ndarray, "b a ticks 4"]
     """[x m, y m, heading rad, speed m/s] at n past ticks and, last, now."""
     actions: Float[np.ndarray, "b a ticks-1 2"]
-    """[acceleration m/s², steering rad] between consecutive states, inferred from them."""
+    """[acceleration m/s², steering rad] between consecutive states, inferred from them; with the
+    accelerations of the files for `histories(…, "accelerations")`."""
     valid: Bool[np.ndarray, "b a ticks"]
     """Whether the agent is present at each tick."""
     sizes: Float[np.ndarray, "b a 2"]
@@ -47,6 +49,8 @@ class Scene:
     """Index into `maps` of each situation."""
     dt_s: float
     """Seconds per tick."""
+    signals: SceneSignals | None = None
+    """Traffic signals up to now; None if no recording of the scene has any."""
 
     def with_targets(self, targets: Int[np.ndarray, "t 2"]) -> "Scene":
         """The same scene with other targets."""
@@ -54,12 +58,13 @@ class Scene:
 
     def situation(self, index: int) -> "Scene":
         """A scene of one of the situations, which becomes situation 0."""
-        shared = ("targets", "maps", "dt_s")
+        shared = ("targets", "maps", "dt_s", "signals")
         names = [field.name for field in dataclasses.fields(self) if field.name not in shared]
         targets = self.targets[self.targets[:, 0] == index]
         targets[:, 0] = 0
         own = {name: getattr(self, name)[index : index + 1] for name in names}
-        return dataclasses.replace(self, targets=targets, **own)
+        signals = None if self.signals is None else self.signals.situation(index)
+        return dataclasses.replace(self, targets=targets, signals=signals, **own)
 
     @property
     def history(self) -> int:

@@ -8,6 +8,7 @@ from jaxtyping import Bool, Float, Int
 
 from asp_env.data.recording import Recording, frames_per_tick, ticks
 from asp_env.data.scene import Scene, infer_actions
+from asp_env.data.signals import SceneSignals, SignalState
 
 HISTORY_S = 3.0
 """Default history of snippets and scenarios."""
@@ -70,9 +71,15 @@ class Future:
 
 
 def find_snippets(
-    recording: Recording, *, dt_s: float, history: int, horizon_ticks: int, interval_ticks: int
+    recording: Recording,
+    *,
+    dt_s: float,
+    history: int,
+    horizon_ticks: int,
+    interval_ticks: int,
+    parked: bool = False,
 ) -> tuple[Int[np.ndarray, " n"], Int[np.ndarray, " n"]]:
-    """All snippets of one recording, whose targets are of a predicted class and not parked.
+    """All snippets of one recording, whose targets are of a predicted class.
 
     Args:
         recording: the recording.
@@ -80,13 +87,15 @@ def find_snippets(
         history: number of past ticks.
         horizon_ticks: number of future ticks.
         interval_ticks: snippets are at multiples of this tick.
+        parked: whether parked agents are targets, too.
 
     Returns:
         Track index and tick of each snippet, sorted by tick, then track.
     """
     stride = frames_per_tick(recording.frame_rate_hz, dt_s)
     tracks, present_ticks = [], []
-    for track in np.flatnonzero(recording.predicted):
+    targets = recording.of_predicted_class if parked else recording.predicted
+    for track in np.flatnonzero(targets):
         first = -(-int(recording.first_frames[track]) // stride) + history
         last = int(recording.last_frames[track]) // stride - horizon_ticks
         found = np.arange(-(-first // interval_ticks) * interval_ticks, last + 1, interval_ticks)
@@ -106,8 +115,17 @@ def index_snippets(
     horizon_s: float,
     history_s: float = HISTORY_S,
     interval_s: float = SNIPPET_INTERVAL_S,
+    parked: bool = False,
 ) -> SnippetIndex:
     """All snippets of all recordings, sorted by recording, tick and track.
+
+    Args:
+        recordings: the recordings.
+        dt_s: seconds per tick.
+        horizon_s: length of the future in seconds.
+        history_s: length of the past in seconds.
+        interval_s: time between consecutive snippets of a track.
+        parked: whether parked agents are targets, too.
 
     Raises:
         AspEnvError: a duration is not a whole number of ticks, or a tick not one of frames.
@@ -121,6 +139,7 @@ def index_snippets(
             history=history,
             horizon_ticks=horizon_ticks,
             interval_ticks=interval_ticks,
+            parked=parked,
         )
         for recording in recordings
     ]
@@ -165,11 +184,48 @@ def gather_window(
     return states, valid
 
 
+def gather_accelerations(
+    recording: Recording,
+    tracks: Int[np.ndarray, " a"],
+    *,
+    first_tick: int,
+    num_ticks: int,
+    stride: int,
+) -> Float[np.ndarray, "a k"]:
+    """Recorded accelerations of some tracks between consecutive ticks, m/s².
+
+    Each is the mean over the frames from one tick to the next, both of which count half, so that it
+    is the change of speed that the files state for this time.
+
+    Args:
+        recording: the recording, whose `accelerations` are known.
+        tracks: indices of the tracks.
+        first_tick: the first of the ticks.
+        num_ticks: number of ticks, k + 1.
+        stride: frames per tick.
+
+    Returns:
+        The accelerations, zero where the track is absent at either tick.
+    """
+    assert recording.accelerations is not None
+    frames = first_tick * stride + np.arange((num_ticks - 1) * stride + 1)
+    first = recording.first_frames[tracks].astype(np.int64)[:, None]
+    present = (frames >= first) & (frames <= recording.last_frames[tracks][:, None])
+    rows = np.where(present, recording.starts[tracks][:, None] + frames - first, 0)
+    values = recording.accelerations[rows]
+    halves = 0.5 * (values[:, :-1] + values[:, 1:])
+    means = halves.reshape(len(tracks), num_ticks - 1, stride).mean(axis=-1)
+    both = present[:, :-1:stride] & present[:, stride::stride]
+    return np.where(both, means, 0).astype(np.float32)
+
+
 def gather_scene(recordings: Sequence[Recording], index: SnippetIndex) -> Scene:
     """The scene of some snippets: one situation per distinct tick of a recording.
 
     Slot 0 of a situation is its first target in the order of `index`; the other agents follow by
     first frame, then id. The ego's route is empty, since here its path is what is to be forecast.
+    Past actions are inferred from the states; their accelerations are the recorded ones where
+    `Recording.shows_accelerations`.
 
     Returns:
         A scene whose targets are in the order of `index`.
@@ -200,10 +256,21 @@ def gather_scene(recordings: Sequence[Recording], index: SnippetIndex) -> Scene:
         ids[number, :count] = recording.track_ids[tracks]
         rows = np.flatnonzero(situation == number)
         slots[rows] = (index.track[rows][:, None] == tracks[None]).argmax(axis=1)
+    actions = infer_actions(states, valid, sizes[..., 0], index.dt_s)
+    for number, (row, tracks) in enumerate(zip(first_rows, agents, strict=True)):
+        recording = recordings[int(index.recording[row])]
+        if recording.shows_accelerations:
+            actions[number, : len(tracks), :, 0] = gather_accelerations(
+                recording,
+                tracks,
+                first_tick=int(index.tick[row]) - index.history,
+                num_ticks=index.history + 1,
+                stride=frames_per_tick(recording.frame_rate_hz, index.dt_s),
+            )
     maps, map_index = _maps([recordings[int(index.recording[row])] for row in first_rows])
     return Scene(
         states=states,
-        actions=infer_actions(states, valid, sizes[..., 0], index.dt_s),
+        actions=actions,
         valid=valid,
         sizes=sizes,
         classes=classes,
@@ -215,7 +282,44 @@ def gather_scene(recordings: Sequence[Recording], index: SnippetIndex) -> Scene:
         maps=maps,
         map_index=map_index,
         dt_s=index.dt_s,
+        signals=gather_signals(
+            [recordings[int(index.recording[row])] for row in first_rows],
+            index.tick[first_rows],
+            history=index.history,
+            dt_s=index.dt_s,
+        ),
     )
+
+
+def gather_signals(
+    recordings: Sequence[Recording], tick: Int[np.ndarray, " b"], *, history: int, dt_s: float
+) -> SceneSignals | None:
+    """The traffic signals of B situations, up to their present ticks.
+
+    Args:
+        recordings: the recording of each situation.
+        tick: the present tick of each situation.
+        history: number of past ticks.
+        dt_s: seconds per tick.
+
+    Returns:
+        The signals, `UNKNOWN` at ticks outside a recording; None if no recording has signals.
+    """
+    count = max((len(r.signals.states) for r in recordings if r.signals is not None), default=0)
+    if not count:
+        return None
+    stop_lines = np.zeros((len(recordings), count, 2, 2))
+    states = np.full((len(recordings), count, history + 1), SignalState.UNKNOWN, dtype=np.int8)
+    for row, (recording, now) in enumerate(zip(recordings, tick.tolist(), strict=True)):
+        if recording.signals is None:
+            continue
+        stride = frames_per_tick(recording.frame_rate_hz, dt_s)
+        frames = (now + np.arange(-history, 1)) * stride
+        known = (frames >= 0) & (frames < recording.num_frames)
+        signals = len(recording.signals.states)
+        stop_lines[row, :signals] = recording.signals.stop_lines
+        states[row, :signals, known] = recording.signals.states[:, frames[known]].T
+    return SceneSignals(stop_lines=stop_lines, states=states)
 
 
 def gather_future(recordings: Sequence[Recording], index: SnippetIndex) -> Future:

@@ -1,6 +1,6 @@
-"""Splits of data into training, validation and test, by whole recordings or by blocks of time.
+"""Splits of data into training, validation and test, by recordings or by blocks of time.
 
-Both splits are pure functions of counts and times, so that the same data are split in the same way
+All splits are pure functions of counts and times, so that the same data are split in the same way
 everywhere. `TrainedOn` records the split with a predictor, so that it is evaluated on other data.
 """
 
@@ -16,8 +16,9 @@ from asp_env.data.snippets import SnippetIndex, index_snippets
 from asp_env.data.source import Recordings
 from asp_env.errors import AspEnvError
 
-Split = Literal["recording", "blocks"]
-"""Whether whole recordings or blocks of time within each recording are assigned to parts."""
+Split = Literal["recording", "daytime", "blocks"]
+"""Whether whole recordings, whole recordings by their time of day, or blocks of time within each
+recording are assigned to parts."""
 
 Part = Literal["train", "validation", "test", "none"]
 """`none` is left out: without snippets, or too close in time to another part."""
@@ -30,6 +31,13 @@ HELD_OUT_SHARE = 0.1
 
 SPLIT_HORIZON_S = 3.0
 """Horizon of the snippets by whose number recordings are assigned to parts."""
+
+MIN_RECORDINGS = 3
+"""A location with fewer recordings is used for training: each part needs one."""
+
+POOLED_BELOW = 10
+"""Locations with fewer recordings are split together. Ten is the smallest number of equal
+recordings that can be split 8:1:1; with three, each part would get a third."""
 
 _NUM_ORDERS = 1_000
 
@@ -67,17 +75,25 @@ def snippet_parts(
     Recordings are assigned by their number of snippets with a horizon of 3 s, for every horizon
     of `index`, so that a run for 6 s that continues from one for 3 s uses the same recordings.
 
+    Args:
+        recordings: the recordings.
+        index: their snippets.
+        split: the kind of split.
+
     Returns:
         The `Part` of each snippet, as strings, and the record for the trained predictor.
 
     Raises:
-        AspEnvError: no recording remains for the test part.
+        AspEnvError: no recording remains for the test part, or a recording has no start time.
     """
-    if split == "recording":
+    if split != "blocks":
         counted = index_snippets(recordings, dt_s=index.dt_s, horizon_s=SPLIT_HORIZON_S)
         counts = np.bincount(counted.recording, minlength=len(recordings))
-        locations = [recording.location for recording in recordings]
-        recording_parts = np.array(split_by_recording(counts, locations))
+        if split == "recording":
+            locations = [recording.location for recording in recordings]
+            recording_parts = np.array(split_by_recording(counts, locations))
+        else:
+            recording_parts = np.array(split_by_daytime(counts, start_hours(recordings)))
         parts = recording_parts[index.recording]
     else:
         recording_parts = np.full(len(recordings), "blocks")
@@ -100,6 +116,12 @@ def split_by_recording(
     closest to a tenth of the snippets (test), and the following ones too (validation). Recordings
     without snippets are left out. A location with fewer than three others is used for training.
 
+    Locations with three to nine recordings are split together, 8:1:1 by the number of their
+    snippets in total, so that not every one has recordings in every part. In each order one
+    recording of every such location comes first, then a second one of each, and so on; at most the
+    first two of each are held out, so that every location is trained on. A single such location is
+    split as above.
+
     Args:
         counts: number of snippets of each recording.
         locations: location of each recording.
@@ -111,21 +133,82 @@ def split_by_recording(
     Raises:
         AspEnvError: no recording remains for the test part.
     """
+    place = np.unique(np.array(locations, dtype=str), return_inverse=True)[1].reshape(-1)
+    sizes = np.bincount(place[counts > 0], minlength=1)
+    pooled = (sizes >= MIN_RECORDINGS) & (sizes < POOLED_BELOW)
+    group = np.where(pooled[place], -1, place)  # -1 is that of all pooled locations
     parts: list[Part] = ["none"] * len(counts)
-    by_location: list[list[Part]] = []
-    for location in sorted(set(locations)):
-        at_location = np.array([place == location for place in locations], dtype=bool)
-        members = np.flatnonzero(at_location & (counts > 0))
-        by_location.append(_assign_parts(counts[members], np.random.default_rng(seed)))
-        for member, part in zip(members, by_location[-1], strict=True):
+    for number in np.unique(group).tolist():
+        members = np.flatnonzero((group == number) & (counts > 0))
+        rng = np.random.default_rng(seed)
+        for member, part in zip(
+            members, _assign_parts(counts[members], place[members], rng), strict=True
+        ):
             parts[member] = part
     if "test" not in parts:
-        most = max((location_parts.count("train") for location_parts in by_location), default=0)
+        most = int(sizes.max())
         raise AspEnvError(
             f"no recording is left to test on: at most {most} recordings of one location hold "
             "snippets, a split by recording needs three; use --split blocks"
         )
     return tuple(parts)
+
+
+def split_by_daytime(
+    counts: Int[np.ndarray, " recordings"], hours: Sequence[float], *, seed: int = 42
+) -> tuple[Part, ...]:
+    """Assigns whole recordings to parts by time of day, 8:1:1 by number of snippets.
+
+    All recordings that start within the same hour of the clock belong to the same part, whatever
+    their day and location, so that test and validation are of other times of day than training
+    (section V-B of Janjoš et al. 2021). Hours take the place of the recordings of one location in
+    `split_by_recording`. Recordings without snippets are left out.
+
+    Args:
+        counts: number of snippets of each recording.
+        hours: hours after midnight at which each recording starts.
+        seed: of the random orders of hours.
+
+    Returns:
+        The part of each recording.
+
+    Raises:
+        AspEnvError: recordings with snippets start within fewer than three hours of the clock.
+    """
+    hour = np.floor(np.array(hours, dtype=np.float64)).astype(np.int64)
+    found = np.unique(hour[counts > 0])
+    if len(found) < MIN_RECORDINGS:
+        names = ", ".join(f"{each}:00" for each in found.tolist()) or "none"
+        raise AspEnvError(
+            f"recordings with snippets start within {len(found)} hours of the clock ({names}), a "
+            "split by time of day needs three; use --split recording or --split blocks"
+        )
+    totals = np.array([counts[hour == each].sum() for each in found])
+    alone = np.zeros(len(found), dtype=np.int64)
+    assigned = _assign_parts(totals, alone, np.random.default_rng(seed))
+    part_of = dict(zip(found.tolist(), assigned, strict=True))
+    return tuple(
+        part_of[each] if count else "none"
+        for each, count in zip(hour.tolist(), counts.tolist(), strict=True)
+    )
+
+
+def start_hours(recordings: Recordings) -> list[float]:
+    """Hours after midnight at which recordings start.
+
+    Raises:
+        AspEnvError: a recording has no start time.
+    """
+    hours = []
+    for recording in recordings:
+        if recording.start_hour is None:
+            raise AspEnvError(
+                f"recording {recording.name}: its files give no start time, which a split by time "
+                "of day needs; expected startTime in XX_recordingMeta.csv as in inD, in hours: "
+                "use --split recording or --split blocks"
+            )
+        hours.append(recording.start_hour)
+    return hours
 
 
 def split_blocks(
@@ -234,17 +317,29 @@ def part_of_ticks(length: int) -> Shaped[np.ndarray, " ticks"]:
     return split_blocks(np.zeros_like(tick), tick, tick, lengths=np.array([length]))
 
 
-def _assign_parts(counts: Int[np.ndarray, " members"], rng: np.random.Generator) -> list[Part]:
-    """Parts of the recordings of one location; `split_by_recording` describes the search."""
-    if len(counts) < 3:
+def _assign_parts(
+    counts: Int[np.ndarray, " members"],
+    places: Int[np.ndarray, " members"],
+    rng: np.random.Generator,
+) -> list[Part]:
+    """Parts of the recordings of some locations; `split_by_recording` describes the search."""
+    if len(counts) < MIN_RECORDINGS:
         return ["train"] * len(counts)
     orders = rng.permuted(np.tile(np.arange(len(counts)), (_NUM_ORDERS, 1)), axis=1)
+    may_be_held_out = len(counts) - 1
+    if (places != places[0]).any():
+        may_be_held_out = 2 * len(np.unique(places))  # so that each location has one to train on
+        turn = np.zeros(orders.shape, dtype=np.int64)  # the how-manieth of its location in an order
+        for location in np.unique(places):
+            own = places[orders] == location
+            turn[own] = (np.cumsum(own, axis=1) - 1)[own]
+        orders = np.take_along_axis(orders, np.argsort(turn, axis=1, kind="stable"), axis=1)
     total = np.cumsum(counts[orders], axis=1) / counts.sum()
     rows, place = np.arange(_NUM_ORDERS), np.arange(len(counts))
-    last_test = np.abs(total[:, :-2] - HELD_OUT_SHARE).argmin(axis=1)
+    last_test = np.abs(total[:, : may_be_held_out - 1] - HELD_OUT_SHARE).argmin(axis=1)
     test_share = total[rows, last_test]
     validation_share = total - test_share[:, None]
-    may_end = (place > last_test[:, None]) & (place < len(counts) - 1)
+    may_end = (place > last_test[:, None]) & (place < may_be_held_out)
     error = np.where(may_end, np.abs(validation_share - HELD_OUT_SHARE), np.inf)
     last_validation = error.argmin(axis=1)
     total_error = np.abs(test_share - HELD_OUT_SHARE) + error[rows, last_validation]

@@ -51,7 +51,9 @@ def forward(
         lengths_m: vehicle lengths, positive, broadcast against the states.
         dt_s: duration of the step.
         integrator: `heun` or `euler`.
-        reverse: whether the speed may become negative; otherwise braking ends at speed 0.
+        reverse: whether any speed may become negative; otherwise braking ends at speed 0, and a
+            vehicle that drives backwards already goes on at its speed, brakes to 0 or drives on
+            forwards, but gains no speed backwards.
 
     Returns:
         States after the step, with headings in [-π, π).
@@ -73,8 +75,8 @@ def rollout(
     """Advances states by several steps, without a loop over them.
 
     The result equals repeated calls of `forward` up to rounding: the model is sequential only in
-    cumulative sums (speed, then heading, then position) and in the running minimum that prevents
-    negative speeds.
+    cumulative sums (speed, then heading, then position) and in the running minimum that ends
+    braking at speed 0.
 
     Args:
         states: present states.
@@ -97,9 +99,11 @@ def _integrate(
     rear_m = (AXLE_SHARE_OF_LENGTH * lengths_m)[..., None]
     slip = xp.arctan(0.5 * xp.tan(actions[..., 1]))
     speed_0 = states[..., 3:4]
-    speed_after = speed_0 + _running_sum(actions[..., 0] * dt_s)
-    if not reverse:
-        speed_after = speed_after - _lowest_below_zero(speed_after)
+    gained = actions[..., 0] * dt_s
+    if reverse:
+        speed_after = speed_0 + _running_sum(gained)
+    else:
+        speed_after = _speeds_without_reversal(speed_0, gained)
     speed_before = _before(speed_0, speed_after)
 
     turn = xp.sin(slip) / rear_m * dt_s  # heading change per unit of speed
@@ -120,6 +124,29 @@ def _integrate(
     x = states[..., 0:1] + _running_sum(velocity_x * share_s)
     y = states[..., 1:2] + _running_sum(velocity_y * share_s)
     return xp.stack([x, y, wrap_angle(heading_after), speed_after], axis=-1)
+
+
+def _speeds_without_reversal(speed_0: Any, gained: Any) -> Any:
+    """Speeds after each step if braking ends at 0 and no vehicle gains speed backwards.
+
+    While a vehicle drives backwards only its positive gains count: v' = v + max(gain, 0). Once its
+    speed is 0 or more, v' = max(v + gain, 0), which over all steps is the running sum less its
+    running minimum below 0.
+
+    Args:
+        speed_0: (*batch, 1) speeds before the first step.
+        gained: (*batch, steps) gains of speed of each step.
+    """
+    xp = namespace(speed_0)
+    zero = xp.zeros_like(gained)
+    # Tensors take the general way always: a branch on values would stop the device and the export.
+    if xp is np and not (speed_0 < 0).any():
+        speed_after = speed_0 + _running_sum(gained)
+        return speed_after - _lowest_below_zero(speed_after)
+    brakes_only = xp.where(gained > 0, gained, zero)
+    backwards = _before(speed_0, speed_0 + _running_sum(brakes_only)) < 0
+    speed_after = speed_0 + _running_sum(xp.where(backwards, brakes_only, gained))
+    return speed_after - _lowest_below_zero(xp.where(backwards, zero, speed_after))
 
 
 def _before(first: Any, after: Any) -> Any:

@@ -231,7 +231,7 @@ def idm_acceleration(speed, desired, gap, leader_speed, law):
         law: (6,) parameters, `IDM.as_row`.
     """
     if desired <= 0.0:
-        return -law[1]
+        return law[1] if speed < 0.0 else -law[1]
     free = 1.0 - (speed / max(desired, 0.1)) ** 4
     interaction = 0.0
     if gap < np.inf:

@@ -161,6 +161,9 @@ class JointPolicyDriver:
         """Returns the control of all agents but the ego in each row."""
         control = self._traffic.control(world)
         in_row_0, is_agent = self._slots >= 0, self._agent_index >= 0
+        euler = None
+        if control.euler is not None:
+            euler = ~is_agent & control.euler[0, self._slots] & in_row_0
         return Control(
             actions=np.where(
                 is_agent[..., None],
@@ -169,6 +172,7 @@ class JointPolicyDriver:
             ),
             controlled=is_agent | (control.controlled[0, self._slots] & in_row_0),
             leaving=~is_agent & control.leaving[0, self._slots] & in_row_0,
+            euler=euler,
         )
 
     def slots_of(self, agents: Bool[np.ndarray, " b"]) -> Bool[np.ndarray, "b a"]:

@@ -67,7 +67,7 @@ class ReplayEnv(gymnasium.Env[dict[str, Any], Any]):
 
     | index | action | -1 | 1 | unit |
     |---|---|---|---|---|
-    | 0 | acceleration; braking ends at speed 0 | -5 | 5 | m/s² |
+    | 0 | acceleration; braking ends at speed 0, no speed is gained backwards | -5 | 5 | m/s² |
     | 1 | steering, left positive | -π/4 | π/4 | rad |
 
     ## Observation Space

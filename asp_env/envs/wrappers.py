@@ -11,7 +11,13 @@ from gymnasium.vector import VectorEnv, VectorObservationWrapper
 from gymnasium.vector.utils import batch_space
 from jaxtyping import Int
 
-from asp_env.data.predictor import Predictor, fill_missing, load_predictor, needs_simulation
+from asp_env.data.predictor import (
+    Predictor,
+    feature_size,
+    fill_missing,
+    load_predictor,
+    needs_simulation,
+)
 from asp_env.data.recording import ticks
 from asp_env.data.scene import EGO, Scene
 from asp_env.data.snippets import Future
@@ -25,8 +31,8 @@ hand."""
 FORECAST_TIMES_S = (1.0, 2.0, 3.0)
 """Default times ahead of the forecast positions."""
 
-FORECAST_KEYS = ("forecast", "forecast_probabilities", "forecast_valid")
-"""Keys that `PredictionFeatures` adds to the observation."""
+MAX_FEATURE = 100.0
+"""Features are clipped to this size. Chosen by hand: normalised features stay below 30."""
 
 
 class FlatParts(gymnasium.ObservationWrapper[dict[str, Any], Any, dict[str, Any]]):
@@ -74,9 +80,12 @@ the left in the present frame of the ego |
     | `forecast_probabilities` | `Box(0, 1, (agents · modes,))` | probabilities of the modes, in \
 descending order |
     | `forecast_valid` | `Box(0, 1, (agents,))` | 1 where there is an agent |
+    | `forecast_features` | `Box(±100, (agents · features,))` | with `features=True`: what the \
+predictor's network encodes of each agent, `Forecast.features` |
 
     All entries are flat float32 arrays. The nearest agent comes first; entries without an agent or
-    a mode are zero. Agents without a forecast get constant velocity, as for planners. For a
+    a mode are zero. Agents without a forecast get constant velocity, as for planners, and features
+    of zero. For a
     privileged predictor the keys start with `oracle_`. The predictor is called once in every
     `reset` and `step`.
     """
@@ -90,6 +99,7 @@ descending order |
         modes: int = 3,
         at_s: Sequence[float] = FORECAST_TIMES_S,
         privileged: bool = False,
+        features: bool = False,
     ) -> None:
         """Wraps an environment.
 
@@ -101,12 +111,19 @@ descending order |
             modes: number of most probable modes.
             at_s: times ahead of the positions in seconds, whole ticks.
             privileged: allows a predictor that uses the recorded future.
+            features: adds the features of the predictor's network, which must be a trained one.
 
         Raises:
             AspEnvError: the environment, the predictor or an argument is invalid.
         """
         RecordConstructorArgs.__init__(
-            self, predictor=predictor, agents=agents, modes=modes, at_s=at_s, privileged=privileged
+            self,
+            predictor=predictor,
+            agents=agents,
+            modes=modes,
+            at_s=at_s,
+            privileged=privileged,
+            features=features,
         )
         super().__init__(env)
         self._forecasts = ForecastObservations(
@@ -116,6 +133,7 @@ descending order |
             at_s=at_s,
             dt_s=_scene_provider(env.unwrapped).dt_s,
             privileged=privileged,
+            features=features,
         )
         self.observation_space = _extend(env.observation_space, self._forecasts.spaces)
 
@@ -137,6 +155,7 @@ class VectorPredictionFeatures(VectorObservationWrapper):
         modes: int = 3,
         at_s: Sequence[float] = FORECAST_TIMES_S,
         privileged: bool = False,
+        features: bool = False,
     ) -> None:
         """Wraps a `ReplayVectorEnv`, possibly in wrappers.
 
@@ -147,6 +166,7 @@ class VectorPredictionFeatures(VectorObservationWrapper):
             modes: number of most probable modes.
             at_s: times ahead of the positions in seconds, whole ticks.
             privileged: allows a predictor that uses the recorded future.
+            features: adds the features of the predictor's network, which must be a trained one.
 
         Raises:
             AspEnvError: the environment, the predictor or an argument is invalid.
@@ -159,6 +179,7 @@ class VectorPredictionFeatures(VectorObservationWrapper):
             at_s=at_s,
             dt_s=_scene_provider(env.unwrapped).dt_s,
             privileged=privileged,
+            features=features,
         )
         self.single_observation_space = _extend(
             env.single_observation_space, self._forecasts.spaces
@@ -197,6 +218,7 @@ class ForecastObservations:
         at_s: Sequence[float],
         dt_s: float,
         privileged: bool,
+        features: bool,
     ) -> None:
         """Loads the predictor and defines the spaces.
 
@@ -207,6 +229,7 @@ class ForecastObservations:
             at_s: times ahead of the positions in seconds, whole ticks.
             dt_s: length of a tick of the environment in seconds.
             privileged: allows a predictor that uses the recorded future.
+            features: adds the features of the predictor's network, which must be a trained one.
 
         Raises:
             AspEnvError: an argument is out of range, or the predictor is invalid.
@@ -223,13 +246,23 @@ class ForecastObservations:
         self._shape = agents, modes, len(ticks_ahead)
         self._steps = ticks_ahead - 1
         prefix = "oracle_" if predictor.privileged else ""
-        self._keys = tuple(prefix + key for key in FORECAST_KEYS)
-        sizes = (agents * modes * len(ticks_ahead) * 2, agents * modes, agents)
-        lows = (-MAX_POSITION_M, 0.0, 0.0)
-        highs = (MAX_POSITION_M, 1.0, 1.0)
+        self._feature_size = feature_size(predictor) if features else 0
+        if features and not self._feature_size:
+            raise AspEnvError(
+                f"predictor {predictor.name} has no features, only trained ones do: take one, such "
+                "as ssp-asp:pretrained, or omit features=True"
+            )
+        bounds = {
+            "forecast": (-MAX_POSITION_M, MAX_POSITION_M, agents * modes * len(ticks_ahead) * 2),
+            "forecast_probabilities": (0.0, 1.0, agents * modes),
+            "forecast_valid": (0.0, 1.0, agents),
+        }
+        if features:
+            size = agents * self._feature_size
+            bounds["forecast_features"] = (-MAX_FEATURE, MAX_FEATURE, size)
         self.spaces: dict[str, spaces.Space[Any]] = {
-            key: spaces.Box(low, high, (size,), dtype=np.float32)
-            for key, low, high, size in zip(self._keys, lows, highs, sizes, strict=True)
+            prefix + key: spaces.Box(low, high, (size,), dtype=np.float32)
+            for key, (low, high, size) in bounds.items()
         }
 
     def observe(self, env: SceneProvider) -> dict[str, np.ndarray]:
@@ -242,6 +275,7 @@ class ForecastObservations:
         positions = np.zeros((count, *self._shape, 2), dtype=np.float32)
         probabilities = np.zeros((count, agents, modes), dtype=np.float32)
         valid = np.zeros((count, agents), dtype=np.float32)
+        features = np.zeros((count, agents, self._feature_size), dtype=np.float32)
         if len(targets):
             predictor = self.predictor
             future = env.recorded_future(scene, predictor.horizon) if predictor.privileged else None
@@ -255,13 +289,17 @@ class ForecastObservations:
             positions[situation, rank, :num_modes] = to_frame(points, egos)
             probabilities[situation, rank, :num_modes] = forecast.probabilities[rows, order]
             valid[situation, rank] = 1.0
-        values = (
+            if self._feature_size and forecast.features is not None:
+                features[situation, rank] = forecast.features
+        values = [
             np.clip(positions, -MAX_POSITION_M, MAX_POSITION_M),
             np.clip(probabilities, 0, 1),
             valid,
-        )
+        ]
+        if self._feature_size:
+            values.append(np.clip(features, -MAX_FEATURE, MAX_FEATURE))
         return {
-            key: value.reshape(count, -1) for key, value in zip(self._keys, values, strict=True)
+            key: value.reshape(count, -1) for key, value in zip(self.spaces, values, strict=True)
         }
 
 

@@ -2,7 +2,7 @@
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Annotated
+from typing import Annotated, Literal
 
 import numpy as np
 import tyro
@@ -16,10 +16,10 @@ from asp_env.data.recording import DEFAULT_DT_S, Recording, frames_per_tick, tic
 from asp_env.data.road_map import RoadMap
 from asp_env.data.scenarios.scenario import ScenarioSet, find_scenarios
 from asp_env.data.scenarios.tags import COLUMNS, TAGS
-from asp_env.data.scene import infer_actions
 from asp_env.data.snippets import HISTORY_S, SNIPPET_INTERVAL_S, find_snippets
 from asp_env.data.source import Recordings, open_data
-from asp_env.dynamics import rollout
+from asp_env.dynamics import inverse, rollout
+from asp_env.dynamics.bicycle import Integrator
 from asp_env.errors import DataError
 from asp_env.metrics.drivable import CELL_M, drivable_field
 from asp_env.metrics.forecast.errors import moving
@@ -41,12 +41,14 @@ def drift_m(
     *,
     dt_s: float,
     horizon: int,
+    integrator: Integrator = "heun",
 ) -> tuple[Float[np.ndarray, " n"], Bool[np.ndarray, " n"]]:
     """Drift of inferred actions: distance between a track and the rollout of its own actions.
 
-    The actions are inferred from the recorded states and rolled out with Heun's method from the
-    recorded state at the given tick. The drift is the distance of the positions at the end. It is
-    a lower bound of the error of any predictor that forecasts actions.
+    The actions are inferred from the recorded headings and speeds by the inverse bicycle model and
+    rolled out from the recorded state at the given tick. The drift is the distance of the positions
+    at the end: the error of a forecast of exactly these actions. It is no bound for predictors that
+    are trained on positions, as the networks are, since other actions may lead nearer.
 
     Args:
         recording: the recording.
@@ -55,6 +57,7 @@ def drift_m(
             `horizon` more ticks.
         dt_s: duration of a tick in seconds.
         horizon: number of ticks.
+        integrator: method of the inverse model and of the rollout.
 
     Returns:
         The drift of each track in metres, and a mask of the tracks that move: over 1 m/s at the
@@ -70,8 +73,12 @@ def drift_m(
         states = recording.states[rows].astype(np.float64)
         lengths_m = recording.sizes[track, 0].astype(np.float64)
         known = np.ones(rows.shape, dtype=bool)
-        actions = infer_actions(states, known, lengths_m, dt_s)
-        rolled_out = rollout(states[:, 0], actions, lengths_m, dt_s, reverse=True)
+        actions = inverse(
+            states[:, :-1], states[:, 1:], lengths_m[:, None], dt_s, integrator=integrator
+        )
+        rolled_out = rollout(
+            states[:, 0], actions, lengths_m, dt_s, integrator=integrator, reverse=True
+        )
         metres.append(np.hypot(*(rolled_out[:, -1, :2] - states[:, -1, :2]).T))
         moves.append(moving(states[:, 0], states[:, 1:, :2], known[:, 1:]))
     return np.concatenate(metres), np.concatenate(moves)
@@ -82,6 +89,9 @@ class Drifts:
     """Drift of all snippets of a recording, by horizon in seconds."""
 
     metres: Mapping[float, Float[np.ndarray, " _"]]
+    """By Heun's method."""
+    euler_metres: Mapping[float, Float[np.ndarray, " _"]]
+    """By Euler's method, the paper's."""
     moving: Mapping[float, Bool[np.ndarray, " _"]]
     """Mask of the snippets whose target moves."""
 
@@ -165,7 +175,7 @@ class Inspect:
 
 
 def _drifts(recording: Recording, dt_s: float) -> Drifts:
-    metres, moves = {}, {}
+    metres, euler_metres, moves = {}, {}, {}
     for horizon_s in HORIZONS_S:
         horizon = ticks(horizon_s, dt_s)
         index = find_snippets(
@@ -176,7 +186,10 @@ def _drifts(recording: Recording, dt_s: float) -> Drifts:
             interval_ticks=ticks(SNIPPET_INTERVAL_S, dt_s),
         )
         metres[horizon_s], moves[horizon_s] = drift_m(recording, *index, dt_s=dt_s, horizon=horizon)
-    return Drifts(metres=metres, moving=moves)
+        euler_metres[horizon_s], _ = drift_m(
+            recording, *index, dt_s=dt_s, horizon=horizon, integrator="euler"
+        )
+    return Drifts(metres=metres, euler_metres=euler_metres, moving=moves)
 
 
 def _on_road(recording: Recording) -> float:
@@ -197,6 +210,7 @@ def _recording_table(data: str, summaries: list[RecordingSummary]) -> Table:
     )
     for name in ("name", "location"):
         table.add_column(name)
+    table.add_column("start")
     for name in ("Hz", "duration s", "rows", "tracks"):
         table.add_column(name, justify="right")
     table.add_column("classes", overflow="fold")
@@ -208,6 +222,7 @@ def _recording_table(data: str, summaries: list[RecordingSummary]) -> Table:
         table.add_row(
             recording.name,
             recording.location,
+            _start(recording),
             f"{recording.frame_rate_hz:g}",
             f"{recording.duration_s:.1f}",
             f"{len(recording.states):,}",
@@ -228,6 +243,7 @@ def _recording_table(data: str, summaries: list[RecordingSummary]) -> Table:
             f"all {len(summaries)}",
             "",
             "",
+            "",
             f"{sum(each.recording.duration_s for each in summaries):.1f}",
             f"{sum(len(each.recording.states) for each in summaries):,}",
             str(sum(len(each.recording) for each in summaries)),
@@ -238,6 +254,15 @@ def _recording_table(data: str, summaries: list[RecordingSummary]) -> Table:
             "",
         )
     return table
+
+
+def _start(recording: Recording) -> str:
+    """Day and time of day at which the recording starts, as far as the files give them."""
+    parts = [] if recording.weekday is None else [recording.weekday]
+    if recording.start_hour is not None:
+        minutes = round(60 * recording.start_hour)
+        parts.append(f"{minutes // 60}:{minutes % 60:02d}")
+    return " ".join(parts) or "-"
 
 
 def _class_counts(recording: Recording) -> str:
@@ -264,25 +289,36 @@ def _map_table(maps: list[RoadMap]) -> Table:
 
 
 def _drift_table(summaries: list[RecordingSummary], dt_s: float) -> Table:
-    title = f"Drift of inferred actions (Heun, {dt_s:g} s) in metres: median / 90 % / 99 %"
-    table = Table(title=title, title_justify="left")
+    table = Table(
+        title=f"Drift of inferred actions ({dt_s:g} s) in metres: median / 90 % / 99 %",
+        title_justify="left",
+        caption="distance between tracks and the rollout of the actions inferred from them; no "
+        "bound for networks, which are trained on positions",
+        caption_justify="left",
+    )
     table.add_column("name")
+    table.add_column("method")
     for horizon_s in HORIZONS_S:
         for name in (f"n {horizon_s:g} s", "all", "n moving", "moving"):
             table.add_column(name, justify="right")
     with_snippets = [each for each in summaries if len(each.drifts.metres[HORIZONS_S[0]])]
     for each in with_snippets:
-        table.add_row(each.recording.name, *_drift_cells([each.drifts]))
+        _add_drift_rows(table, each.recording.name, [each.drifts])
     if len(with_snippets) != 1:
         table.add_section()
-        table.add_row("all", *_drift_cells([each.drifts for each in summaries]))
+        _add_drift_rows(table, "all", [each.drifts for each in summaries])
     return table
 
 
-def _drift_cells(drifts: list[Drifts]) -> list[str]:
+def _add_drift_rows(table: Table, name: str, drifts: list[Drifts]) -> None:
+    table.add_row(name, "Heun", *_drift_cells(drifts, "metres"))
+    table.add_row("", "Euler", *_drift_cells(drifts, "euler_metres"))
+
+
+def _drift_cells(drifts: list[Drifts], method: Literal["metres", "euler_metres"]) -> list[str]:
     cells = []
     for horizon_s in HORIZONS_S:
-        metres = np.concatenate([each.metres[horizon_s] for each in drifts])
+        metres = np.concatenate([getattr(each, method)[horizon_s] for each in drifts])
         moves = np.concatenate([each.moving[horizon_s] for each in drifts])
         for values in (metres, metres[moves]):
             cells += [f"{len(values):,}", _percentiles(values)]

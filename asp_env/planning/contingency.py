@@ -392,13 +392,14 @@ def _advance(
         most = MAX_JERK_MPS3 * dt_s
         acceleration = min(max(acceleration, before - most), before + most)
     acceleration = min(max(acceleration, -MAX_ACCELERATION_MPS2), MAX_ACCELERATION_MPS2)
-    acceleration = max(acceleration, min(-speed / dt_s, 0.0))
+    # to standstill at most; an ego that drives backwards brakes first
+    acceleration = max(acceleration, min(-speed / dt_s, MAX_ACCELERATION_MPS2))
     share = min(((k + 1) * dt_s + 0.4) / LATERAL_S, 1.0)
     share = share * share * share * (10.0 + share * (6.0 * share - 15.0))
     offset = offset_0 + share * (offset_1 - offset_0)
     steering = pursuit_steering(x, y, heading, speed, length, route, count, arc, offset)
     slip = math.atan(0.5 * math.tan(steering))
-    after = max(speed + acceleration * dt_s, 0.0)
+    after = max(speed + acceleration * dt_s, min(speed, 0.0))
     turn = math.sin(slip) / (AXLE_SHARE_OF_LENGTH * length) * dt_s
     course = heading + slip
     end = course + speed * turn

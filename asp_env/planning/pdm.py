@@ -375,8 +375,9 @@ def _act(
                 change = JERK_MPS3 * dt_s
                 acceleration = min(max(wanted, before[b, c] - change), before[b, c] + change)
                 acceleration = min(max(acceleration, -MAX_ACCELERATION_MPS2), law[0])
-            # not beyond standstill, so that comfort rates what really happens
-            actions[b, c, 0] = max(acceleration, min(-speed / dt_s, 0.0))
+            # to standstill at most, so that comfort rates what really happens; an ego that drives
+            # backwards brakes first
+            actions[b, c, 0] = max(acceleration, min(-speed / dt_s, MAX_ACCELERATION_MPS2))
             step = OFFSET_RATE_MPS * PURSUIT_S
             aim = min(max(profiles[c, 1], offset - step), offset + step)
             actions[b, c, 1] = pursuit_steering(

@@ -227,8 +227,9 @@ def _act(states, arcs, offsets, lengths, profiles, dt_s, routes, actions):
             excess = (routes.speed_limits[b, index] - speed) / dt_s
             acceleration = min(profiles[c, 0], max(excess, -BRAKING_FOR_LIMIT_MPS2))
             acceleration = max(acceleration, -MAX_ACCELERATION_MPS2)
-            # not beyond standstill, so that comfort rates what really happens
-            actions[b, c, 0] = max(acceleration, min(-speed / dt_s, 0.0))
+            # to standstill at most, so that comfort rates what really happens; an ego that drives
+            # backwards brakes first
+            actions[b, c, 0] = max(acceleration, min(-speed / dt_s, MAX_ACCELERATION_MPS2))
             actions[b, c, 1] = pursuit_steering(
                 x, y, heading, speed, lengths[b], route, count, arc, profiles[c, 1]
             )

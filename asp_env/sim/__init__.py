@@ -2,7 +2,6 @@
 
 from asp_env.sim.episodes import EpisodeInit, Episodes
 from asp_env.sim.observation import (
-    OBSERVATION_NAMES,
     STATE_FIELDS,
     Observation,
     ObservationComponent,
@@ -24,7 +23,6 @@ from asp_env.sim.world import (
 )
 
 __all__ = [
-    "OBSERVATION_NAMES",
     "STATE_FIELDS",
     "Ending",
     "EpisodeInit",

@@ -17,18 +17,17 @@ from numba import njit
 
 from asp_env.data.road_map import RoadMap
 from asp_env.data.scene import EGO, infer_actions
+from asp_env.data.signals import SceneSignals
 from asp_env.dynamics import MAX_STEERING_RAD
 from asp_env.errors import AspEnvError, unknown_name
 from asp_env.geometry import wrap_angle
 from asp_env.sim.episodes import last_ticks
 from asp_env.sim.world import Events, World
-from asp_env.views import VIEWS, RasterView, make_raster_view
+from asp_env.views import RasterView, make_raster_view, raster_view_names, view_names
 from asp_env.views.vectors import AGENT_FIELDS, LINE_FIELDS, VectorBounds, Vectors, VectorView
 
-PICTURE_VIEWS = tuple(name for name in VIEWS if not name.startswith("vectors"))
-"""Views that are observations of their own, besides `raster`."""
-
-OBSERVATION_NAMES = ("raster", "vectors", "actions", "state", "route", *PICTURE_VIEWS)
+COMPONENT_NAMES = ("raster", "vectors", "actions", "state", "route")
+"""Observations besides the views that render rasters, which are observations by their names."""
 
 MAX_OBSERVED_POSITION_M = 1000.0
 """Bound of coordinates in the ego's frame. Chosen by hand."""
@@ -65,6 +64,11 @@ Spaces = dict[str, spaces.Box[Any]]
 """The space of each part, for one target."""
 
 
+def observation_names() -> tuple[str, ...]:
+    """The names of all observations: `COMPONENT_NAMES` and the views that render rasters."""
+    return (*COMPONENT_NAMES, *raster_view_names())
+
+
 @dataclass(frozen=True, slots=True, kw_only=True)
 class ObservationContext:
     """B situations as seen by T targets: the fields of a `Scene` that views read, and routes.
@@ -89,6 +93,8 @@ class ObservationContext:
     map_index: Int[np.ndarray, " b"]
     """Index of each situation's map in `maps`."""
     dt_s: float
+    signals: SceneSignals | None = None
+    """Traffic signals up to now; None if no recording of the situations has any."""
 
     @property
     def history(self) -> int:
@@ -132,6 +138,7 @@ def ego_context(world: World, rows: Int[np.ndarray, " n"] | None = None) -> Obse
         maps=maps,
         map_index=map_index if every_row else map_index[rows],
         dt_s=world.dt_s,
+        signals=world.signals(rows),
     )
 
 
@@ -282,7 +289,7 @@ class Observer:
         """Creates the components.
 
         Args:
-            names: some of `OBSERVATION_NAMES`.
+            names: some of `observation_names()`.
             raster: the view of the component `raster`.
             history: past ticks of the contexts to come.
 
@@ -292,11 +299,11 @@ class Observer:
         """
         if isinstance(names, str) or not len(names):
             given = f"observations {names!r}" if names else "no observation given"
-            raise AspEnvError(f"{given}: expected some of {', '.join(OBSERVATION_NAMES)}")
+            raise AspEnvError(f"{given}: expected some of {', '.join(observation_names())}")
         self._components: list[ObservationComponent] = []
         for name in names:
-            if name not in OBSERVATION_NAMES:
-                raise unknown_name("observation", name, OBSERVATION_NAMES)
+            if name not in (*COMPONENT_NAMES, *view_names()):
+                raise unknown_name("observation", name, observation_names())
             component = _make_component(name, raster, history)
             if component.history > history:
                 raise AspEnvError(

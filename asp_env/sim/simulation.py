@@ -81,7 +81,10 @@ class Simulation:
         control = self.driver.control(self.world)
         actions, controlled = control.actions.copy(), control.controlled.copy()
         actions[:, EGO], controlled[:, EGO] = ego_actions, ego_controlled
-        self.world.step(actions, controlled, control.leaving)
+        euler = None if control.euler is None else control.euler.copy()
+        if euler is not None:
+            euler[:, EGO] = False
+        self.world.step(actions, controlled, control.leaving, euler)
 
     def step_agents(
         self, actions: Float[np.ndarray, "b a 2"], controlled: Bool[np.ndarray, "b a"]
@@ -100,6 +103,7 @@ class Simulation:
             np.where(controlled[..., None], actions, control.actions),
             controlled | by_driver,
             control.leaving & ~controlled,
+            None if control.euler is None else control.euler & by_driver,
         )
 
     def snapshot(self) -> tuple[Any, Driver]:

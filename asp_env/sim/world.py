@@ -15,7 +15,14 @@ from asp_env.data.recording import Recording, frames_per_tick
 from asp_env.data.road_map import RoadMap
 from asp_env.data.scenarios.scenario import Scenario
 from asp_env.data.scene import EGO, Scene, infer_actions
-from asp_env.data.snippets import Future, SnippetIndex, gather_ticks, gather_window
+from asp_env.data.signals import SceneSignals
+from asp_env.data.snippets import (
+    Future,
+    SnippetIndex,
+    gather_signals,
+    gather_ticks,
+    gather_window,
+)
 from asp_env.data.source import scheme_of
 from asp_env.dynamics import forward
 from asp_env.geometry import route_coordinates
@@ -116,7 +123,10 @@ class World(ABC):
         self.episodes = empty_episodes(num_episodes, ticks=history + 2, agents=1, points=2)
         self._maps: tuple[RoadMap, ...] = ()
         self._map_index = np.zeros(num_episodes, dtype=np.int64)
+        self._any_signals = False
         self._rows = np.arange(num_episodes)
+        self._euler: Bool[np.ndarray, "b a"] | None = None
+        """Mask of agents that move by Euler's method in the step that is under way."""
 
     def __len__(self) -> int:
         """The number of episodes."""
@@ -171,12 +181,14 @@ class World(ABC):
         used, index = np.unique(self.episodes.recording, return_inverse=True)
         self._maps = tuple(self.recordings[int(i)].road_map for i in used)
         self._map_index = index.reshape(-1)
+        self._any_signals = any(self.recordings[int(i)].signals is not None for i in used)
 
     def step(
         self,
         actions: Float[np.ndarray, "b a 2"],
         controlled: Bool[np.ndarray, "b a"],
         leaving: Bool[np.ndarray, "b a"] | None = None,
+        euler: Bool[np.ndarray, "b a"] | None = None,
     ) -> None:
         """Advances all episodes by one tick; an episode at the end of its scenario stays unchanged.
 
@@ -186,8 +198,10 @@ class World(ABC):
             controlled: mask of the agents that execute their action. The others are moved by the
                 world. An agent that is controlled before it appears stays absent.
             leaving: mask of the agents that leave the episode, none by default.
+            euler: mask of the controlled agents whose action is integrated by Euler's method, as
+                that of `Control`; Heun's method by default.
         """
-        episodes = self.episodes
+        episodes, self._euler = self.episodes, euler
         rows = np.flatnonzero(episodes.elapsed < episodes.length)
         now = self.now[rows]
         if leaving is not None:
@@ -213,7 +227,7 @@ class World(ABC):
     ) -> None:
         """Writes `states` and `valid` of `episodes` at tick `now + 1`.
 
-        Agents that have `departed` must not be valid.
+        Agents that have `departed` must not be valid. `_drive` moves the acting agents.
 
         Args:
             rows: indices of the R episodes that are not over.
@@ -222,6 +236,32 @@ class World(ABC):
             controlled: mask of agents that the world must not move.
             acting: mask of controlled agents that are present: they execute their action.
         """
+
+    def _drive(
+        self,
+        states: Float[np.ndarray, "n 4"],
+        actions: Float[np.ndarray, "n 2"],
+        lengths: Float[np.ndarray, " n"],
+        after_s: float,
+        rows: Int[np.ndarray, " r"],
+        acting: Bool[np.ndarray, "r a"],
+    ) -> Float[np.ndarray, "n 4"]:
+        """The states of the N acting agents some time after the present tick.
+
+        Args:
+            states: their present states, as `gather_controlled` returns them.
+            actions: their actions.
+            lengths: their lengths, m.
+            after_s: the time, at most one tick.
+            rows: as in `_move`.
+            acting: as in `_move`.
+        """
+        after = forward(states, actions, lengths, after_s)
+        if self._euler is not None and (euler := self._euler[rows][acting]).any():
+            after[euler] = forward(
+                states[euler], actions[euler], lengths[euler], after_s, integrator="euler"
+            )
+        return after
 
     def _update_contacts(self) -> None:
         episodes, now = self.episodes, self.now
@@ -253,6 +293,23 @@ class World(ABC):
             route_valid=episodes.route_valid.copy(),
             maps=self._maps,
             map_index=self._map_index,
+            dt_s=self.dt_s,
+            signals=self.signals(self._rows),
+        )
+
+    def signals(self, rows: Int[np.ndarray, " r"]) -> SceneSignals | None:
+        """The traffic signals up to now; None if no recording of the episodes has any.
+
+        Args:
+            rows: indices of R episodes, which are the situations of the result.
+        """
+        if not self._any_signals:
+            return None
+        episodes = self.episodes
+        return gather_signals(
+            [self.recordings[int(number)] for number in episodes.recording[rows]],
+            episodes.start_tick[rows] + episodes.elapsed[rows],
+            history=self.history,
             dt_s=self.dt_s,
         )
 
@@ -352,7 +409,7 @@ class ReplayWorld(World):
         acting: Bool[np.ndarray, "r a"],
     ) -> None:
         states, held, lengths = gather_controlled(self.episodes, rows, now, actions, acting)
-        next_states = forward(states, held, lengths, self.dt_s)
+        next_states = self._drive(states, held, lengths, self.dt_s, rows, acting)
         write_tick(self.episodes, rows, now, controlled, acting, next_states)
 
 

@@ -10,9 +10,16 @@ Values are 0 and 255.
 |---|---|
 | `road_boundary` | curbs and solid lines of the map, 0.3 m wide; no dashed or virtual lines |
 | `ego_box` | the ego's box now |
-| `ego_trail` | the path of the ego's centre over the last 15 ticks, 0.4 m wide |
+| `ego_trail` | the path of the ego's centre over the last ticks (`history`, 15 by default), 0.4 m \
+wide |
 | `agents_0` … `agents_8` | the boxes of all other agents at the states 0, 2, 4, 6, 8, 9, 11, 13 \
 and 15 of the last 16: oldest first, 15 is the present |
+
+The nine snapshots are 15 / 8 = 1.875 ticks apart (0.375 s at ticks of 0.2 s), "at regular
+time-intervals" as in the paper, rounded to whole ticks, halves to even. The steps between them are
+therefore 2, 2, 2, 2, 1, 2, 2 and 2 ticks: 7.5 becomes 8, and 9.375 becomes 9. With another history
+the nine states are again at equal intervals, each rounded to a tick; with fewer than nine states
+some channels are equal.
 
 The ego has channels of its own and is not among the agents. Agents of every class are drawn with
 their footprint. States that are not valid are not drawn; a target that is not valid now has an
@@ -38,10 +45,17 @@ from asp_env.views.raster import Viewport, place_targets, raster_memory
 from asp_env.views.view import RenderInput
 
 SNAPSHOT_TICKS = (0, 2, 4, 6, 8, 9, 11, 13, 15)
-"""Ticks of the history at which the other agents are drawn, as in the paper; 15 is the present."""
+"""Ticks of a history of 15 at which the other agents are drawn; 15 is the present. Nine regular
+intervals, rounded to whole ticks; the paper gives no numbers."""
 
 TRAIL_WIDTH_M = 0.4
 """Chosen by hand: two pixels at full resolution."""
+
+
+def snapshot_ticks(history: int) -> tuple[int, ...]:
+    """Ticks of a history at which the other agents are drawn; the last one is the present."""
+    return tuple(np.rint(np.linspace(0, history, len(SNAPSHOT_TICKS))).astype(int).tolist())
+
 
 NAME_BY_EGO_TRAIL = {True: "chauffeurnet", False: "chauffeurnet-no-trail"}
 """Name of the view with and without the ego trail."""
@@ -59,6 +73,8 @@ class ChauffeurNet:
     viewport: Viewport = field(default_factory=Viewport)
     ego_trail: bool = True
     """Whether the channel `ego_trail` is drawn."""
+    history: int = SNAPSHOT_TICKS[-1]
+    """Number of past ticks that are shown and that a scene must have."""
     _boundaries: MapCache[np.ndarray] = field(
         default_factory=_segment_cache, init=False, repr=False, compare=False
     )
@@ -70,12 +86,19 @@ class ChauffeurNet:
         *(f"agents_{i}" for i in range(len(SNAPSHOT_TICKS))),
     )
     """Names of the channels, whose values are 0 or 255."""
-    history: ClassVar[int] = SNAPSHOT_TICKS[-1]
-    """Number of past ticks that a scene must have."""
+
+    def __post_init__(self) -> None:
+        """Checks the number of past ticks.
+
+        Raises:
+            AspEnvError: it is not positive.
+        """
+        if self.history < 1:
+            raise AspEnvError(f"view {self.name!r}: history is {self.history}, expected 1 or more")
 
     def __reduce__(self) -> tuple[Any, ...]:
         """Copies and pickles contain the configuration, not the cached maps."""
-        return (ChauffeurNet, (self.viewport, self.ego_trail))
+        return (ChauffeurNet, (self.viewport, self.ego_trail, self.history))
 
     @property
     def name(self) -> str:
@@ -89,7 +112,8 @@ class ChauffeurNet:
 
     def config(self) -> dict[str, Any]:
         """The name and all options of the view, ready for JSON."""
-        return {"name": self.name, "ego_trail": self.ego_trail, **self.viewport.config()}
+        options = {"ego_trail": self.ego_trail, "history": self.history}
+        return {"name": self.name, **options, **self.viewport.config()}
 
     @classmethod
     def make(
@@ -108,13 +132,14 @@ class ChauffeurNet:
 
     @classmethod
     def from_config(cls, config: dict[str, Any]) -> "ChauffeurNet":
-        """The view that `config()` describes; `ego_trail` defaults to true.
+        """The view that `config()` describes; `ego_trail` defaults to true, `history` to 15.
 
         Raises:
             AspEnvError: the configuration is of another view, or a field is wrong.
         """
         fields = dict(config)
         name, ego_trail = fields.pop("name", None), fields.pop("ego_trail", True)
+        history = fields.pop("history", SNAPSHOT_TICKS[-1])
         names = NAME_BY_EGO_TRAIL.values()
         if name not in names:
             raise AspEnvError(f"configuration of the view {name!r}, expected {' or '.join(names)}")
@@ -123,7 +148,7 @@ class ChauffeurNet:
                 f"configuration of the view {name!r} with ego_trail {ego_trail!r}: "
                 f"expected {name == NAME_BY_EGO_TRAIL[True]}"
             )
-        return cls(Viewport.from_config(fields), name == NAME_BY_EGO_TRAIL[True])
+        return cls(Viewport.from_config(fields), name == NAME_BY_EGO_TRAIL[True], history)
 
     def render(
         self, scene: RenderInput, out: np.ndarray | None = None
@@ -131,7 +156,7 @@ class ChauffeurNet:
         """Renders one raster per target, in the order of `scene.targets`.
 
         Args:
-            scene: a scene with at least 15 past ticks.
+            scene: a scene with at least `history` past ticks.
             out: array to render into, (targets, 12, height, width) uint8, C-contiguous, of any
                 content; a new array is made if it is omitted.
 
@@ -149,7 +174,7 @@ class ChauffeurNet:
         """The rasters of `render` packed along rows, as by `np.packbits` but faster.
 
         Args:
-            scene: a scene with at least 15 past ticks.
+            scene: a scene with at least `history` past ticks.
 
         Returns:
             Rows of ⌈width / 8⌉ bytes; the first pixel is the highest bit of the first byte.
@@ -170,4 +195,4 @@ class ChauffeurNet:
         for index, road_map in enumerate(scene.maps):
             draw_boundaries(self._boundaries(road_map), index, placed, half_width, plane, out)
         trail = self.viewport.half_line_px(TRAIL_WIDTH_M) if self.ego_trail else 0.0
-        draw_agents(placed, SNAPSHOT_TICKS, trail, plane, out)
+        draw_agents(placed, snapshot_ticks(self.history), trail, plane, out)

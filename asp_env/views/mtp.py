@@ -21,7 +21,8 @@ Layers are painted in this order, later ones over earlier ones:
 Boxes are drawn at the last 11 states: those of the other agents tick by tick, oldest first, at each
 tick vehicles before objects before humans; then those of the target. Brightness (the largest of the
 three values, the V of HSV) increases in equal steps from 0.4 two seconds ago, at ticks of 0.2 s, to
-that of the full colour now. Overlapping boxes of other agents therefore look the same in any order,
+that of the full colour now. With a shorter history fewer of these states are drawn, each in its
+colour. Overlapping boxes of other agents therefore look the same in any order,
 and the raster depends neither on the order of slots nor on the other targets of the scene.
 
 The devkit counts bicycles among the vehicles. Here they are human: they have a rider, and some
@@ -59,7 +60,7 @@ HUMAN_RGB = (255, 153, 51)
 TARGET_RGB = (255, 0, 0)
 
 FADE_TICKS = 10
-"""Past ticks that are drawn: 2 s at ticks of 0.2 s, as in the nuScenes devkit."""
+"""Past ticks that are drawn at most: 2 s at ticks of 0.2 s, as in the nuScenes devkit."""
 
 OLDEST_VALUE = 0.4
 """Brightness (V of HSV) of the oldest boxes, as in the nuScenes devkit."""
@@ -153,6 +154,8 @@ class MTP:
     """Renders scenes as described by the module. Views with equal configurations are equal."""
 
     viewport: Viewport = _VIEWPORT
+    history: int = FADE_TICKS
+    """Number of past ticks that are shown and that a scene must have, at most 10."""
     _grounds: MapCache[_Ground] = field(
         default_factory=_ground_cache, init=False, repr=False, compare=False
     )
@@ -160,12 +163,19 @@ class MTP:
     name: ClassVar[str] = "mtp"
     channels: ClassVar[tuple[str, ...]] = ("red", "green", "blue")
     """Names of the channels, whose values are 0 to 255."""
-    history: ClassVar[int] = FADE_TICKS
-    """Number of past ticks that a scene must have."""
+
+    def __post_init__(self) -> None:
+        """Checks the number of past ticks.
+
+        Raises:
+            AspEnvError: it is not within 1 and 10.
+        """
+        if not 1 <= self.history <= FADE_TICKS:
+            raise AspEnvError(f"view 'mtp': history is {self.history}, expected 1 to {FADE_TICKS}")
 
     def __reduce__(self) -> tuple[Any, ...]:
         """Copies and pickles contain the configuration, not the cached maps."""
-        return (MTP, (self.viewport,))
+        return (MTP, (self.viewport, self.history))
 
     @property
     def shape(self) -> tuple[int, int, int]:
@@ -174,7 +184,7 @@ class MTP:
 
     def config(self) -> dict[str, Any]:
         """The name and all options of the view, ready for JSON."""
-        return {"name": self.name, **self.viewport.config()}
+        return {"name": self.name, "history": self.history, **self.viewport.config()}
 
     @classmethod
     def make(cls, pixels: tuple[int, int] | None = None) -> "MTP":
@@ -192,14 +202,16 @@ class MTP:
     def from_config(cls, config: dict[str, Any]) -> "MTP":
         """The view that `config()` describes.
 
+        At most 10 past ticks are shown if `history` is longer; its default is 10.
+
         Raises:
             AspEnvError: the configuration is of another view, or a field is wrong.
         """
         fields = dict(config)
-        name = fields.pop("name", None)
+        name, history = fields.pop("name", None), fields.pop("history", FADE_TICKS)
         if name != cls.name:
             raise AspEnvError(f"configuration of the view {name!r}, expected {cls.name!r}")
-        return cls(Viewport.from_config(fields))
+        return cls(Viewport.from_config(fields), min(history, FADE_TICKS))
 
     def render(
         self, scene: RenderInput, out: np.ndarray | None = None
@@ -207,7 +219,7 @@ class MTP:
         """Renders one raster per target, in the order of `scene.targets`.
 
         Args:
-            scene: a scene with at least 10 past ticks.
+            scene: a scene with at least `history` past ticks.
             out: array to render into, (targets, 3, height, width) uint8, C-contiguous, of any
                 content; a new array is made if it is omitted.
 
@@ -228,8 +240,9 @@ class MTP:
             draw_coloured_lines(ground.boundaries, index, placed, half_width, _BOUNDARY, out)
         # The classes of absent agents may be any number.
         classes = np.where(placed.valid.any(axis=2), scene.classes, AgentClass.CAR)
-        colours = _OLDEST[classes]
+        skipped = FADE_TICKS - self.history
+        colours = _OLDEST[classes] + skipped
         order = np.argsort(colours, axis=1, kind="stable")
-        draw_coloured_agents(placed, colours, order, _OLDEST_OF_TARGET, out)
+        draw_coloured_agents(placed, colours, order, _OLDEST_OF_TARGET + skipped, out)
         _apply_palette(_WORDS, out)
         return out

@@ -5,8 +5,8 @@ present frame of the target, x ahead and y to the left, in metres, radians (as c
 m/s.
 
 - Agents: first the target, then the agents nearest to it that are present now, nearest first, ties
-  by id, each with its states at the last 15 ticks and now. Agents that are not present now are left
-  out, and so are single ticks at which an agent was not observed.
+  by id, each with its states at the last ticks (`history`, 15 by default) and now. Agents that are
+  not present now are left out, and so are single ticks at which an agent was not observed.
 - Lines: pieces of lane centre lines, curbs, solid and dashed lines of at most 25 m, in the order of
   the map. The pieces are chosen by the distance of their middles from a point 20 m ahead of the
   target, where distances across the target's heading count 1.5-fold. This prefers an area of 72 m
@@ -23,7 +23,7 @@ called from Python: a change in another file would go unnoticed.
 
 import math
 from dataclasses import dataclass, field
-from typing import Any, ClassVar, NamedTuple, final, no_type_check
+from typing import Any, NamedTuple, final, no_type_check
 
 import numpy as np
 from jaxtyping import Bool, Float, Float32, Int, Int64
@@ -171,7 +171,7 @@ def _cut(
     return middles, np.concatenate([points_at(line, arc, arcs), along], axis=-1)
 
 
-_OPTIONS = ("agents", "lines", "own_past")
+_OPTIONS = ("agents", "lines", "own_past", "history")
 
 
 @final
@@ -185,6 +185,8 @@ class VectorView:
     """Number of pieces of lines."""
     own_past: bool = True
     """Whether the target's own states before now are shown."""
+    history: int = 15
+    """Number of past ticks that are shown and that a scene must have."""
     _pieces: MapCache[MapPieces] = field(
         default_factory=lambda: MapCache(map_pieces),
         init=False,
@@ -193,19 +195,17 @@ class VectorView:
     )
     """About 60 kB per map; batches contain many maps."""
 
-    history: ClassVar[int] = 15
-    """Number of past ticks that a scene must have."""
-
     def __post_init__(self) -> None:
         """Checks the numbers.
 
         Raises:
             AspEnvError: there would be no target, or a number is negative.
         """
-        if self.agents < 1 or self.lines < 0:
+        if self.agents < 1 or self.lines < 0 or self.history < 1:
             raise AspEnvError(
-                f"view {self.name!r} with {self.agents} agents and {self.lines} lines: give at "
-                "least 1 agent, which is the target itself, and no fewer than 0 lines"
+                f"view {self.name!r} with {self.agents} agents, {self.lines} lines and "
+                f"{self.history} past ticks: give at least 1 agent, which is the target itself, no "
+                "fewer than 0 lines and at least 1 past tick"
             )
 
     def __reduce__(self) -> tuple[Any, ...]:
@@ -276,7 +276,7 @@ class VectorView:
         """Renders agents and lines around each target, in the order of `scene.targets`.
 
         Args:
-            scene: a scene with at least 15 past ticks.
+            scene: a scene with at least `history` past ticks.
             out: arrays to write into, of any content; new arrays are made if it is omitted.
             bounds: numbers outside these bounds are clipped to them.
 

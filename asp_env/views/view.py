@@ -10,6 +10,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 
 from asp_env.data.road_map import RoadMap
+from asp_env.data.signals import SceneSignals
 
 
 @runtime_checkable
@@ -57,6 +58,11 @@ class RenderInput(Protocol):
     @property
     def map_index(self) -> Int[np.ndarray, " b"]:
         """Index into `maps` of each situation."""
+        ...
+
+    @property
+    def signals(self) -> SceneSignals | None:
+        """Traffic signals up to now; None if no recording of the scene has any."""
         ...
 
     @property

@@ -44,10 +44,17 @@ class Costs:
         """CPU time of one cell in seconds."""
         return self._cells.get(name, {}).get("cpu_s", 0.0)
 
-    def add(self, name: str, *, cpu_s: float, wall_s: float) -> None:
+    def training_cpu_s(self, name: str) -> float | None:
+        """CPU time of the training of one cell in seconds; None if it is not known."""
+        return self._cells.get(name, {}).get("training_cpu_s")
+
+    def add(self, name: str, *, cpu_s: float, wall_s: float, training_cpu_s: float) -> None:
         """Adds the cost of a process that has ended, with or without success."""
-        cell = self._cells.setdefault(name, {"cpu_s": 0.0, "wall_s": 0.0, "processes": 0})
+        unused = {"cpu_s": 0.0, "training_cpu_s": 0.0, "wall_s": 0.0, "processes": 0}
+        cell = self._cells.setdefault(name, unused)
         cell["cpu_s"] = round(cell["cpu_s"] + cpu_s, 1)
+        if "training_cpu_s" in cell:  # earlier versions did not store it
+            cell["training_cpu_s"] = round(cell["training_cpu_s"] + training_cpu_s, 1)
         cell["wall_s"] = round(cell["wall_s"] + wall_s, 1)
         cell["processes"] += 1
         content = {"total_cpu_s": round(self.total_cpu_s, 1), "cells": self._cells}
@@ -57,8 +64,10 @@ class Costs:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class _Running:
-    pool: WorkerPool[Job, None]
-    result: Future[None]
+    pool: WorkerPool[Job, float]
+    result: Future[float]
+    trains: bool
+    """Whether the run was not finished when the process started."""
     log: Path
     start_s: float
 
@@ -91,6 +100,10 @@ class Campaign:
     def failed(self) -> Mapping[Cell, str]:
         """Reasons of the failed cells."""
         return self._failed
+
+    def training_cpu_s(self, cell: Cell) -> float | None:
+        """CPU time of the training of a cell in seconds; None if it is not known."""
+        return self._costs.training_cpu_s(cell.name)
 
     def run(self, processes: int) -> None:
         """Runs the cells that are not finished.
@@ -154,8 +167,14 @@ class Campaign:
         log.parent.mkdir(parents=True, exist_ok=True)
         with log.open("ab") as file:
             pool = WorkerPool(run_job, 1, output=file, env={**os.environ, **ONE_THREAD})
-        result = pool.submit(self._jobs[cell])
-        return _Running(pool=pool, result=result, log=log, start_s=time.monotonic())
+        job = self._jobs[cell]
+        return _Running(
+            pool=pool,
+            result=pool.submit(job),
+            trains=not job.trained,
+            log=log,
+            start_s=time.monotonic(),
+        )
 
     def _collect(self) -> list[Cell]:
         """Waits until a cell has ended and returns all cells that have ended."""
@@ -175,8 +194,12 @@ class Campaign:
     def _remove(self, cell: Cell) -> None:
         """Removes a cell whose process has ended and records its cost."""
         running = self._running.pop(cell)
-        wall_s = time.monotonic() - running.start_s
-        self._costs.add(cell.name, cpu_s=running.pool.cpu_s, wall_s=wall_s)
+        wall_s, cpu_s = time.monotonic() - running.start_s, running.pool.cpu_s
+        # A process without a result has ended while it trained, if it had to.
+        training_cpu_s = cpu_s if running.trains else 0.0
+        if running.result.done() and running.result.exception() is None:
+            training_cpu_s = running.result.result()
+        self._costs.add(cell.name, cpu_s=cpu_s, wall_s=wall_s, training_cpu_s=training_cpu_s)
 
     def _stop(self) -> None:
         """Terminates the running cells; the next run of the command resumes them."""

@@ -188,7 +188,9 @@ class Ablation:
     horizons_s: tuple[float, ...]
     """Horizons that the variant is meant for."""
     warm_starts_from_3s: bool
-    """Whether a run for more than 3 s starts from the weights of a run for 3 s."""
+    """Whether a longer run starts from the weights of a run for one segment, or 3 s."""
+    segment_s: float | None = None
+    """Length of the segments that are chained, if it is not the recipe's."""
 
 
 def choose_ablations(
@@ -200,7 +202,7 @@ def choose_ablations(
 
     Args:
         names: `none`, `all`, `VARIANT` (of every predictor that has it) or `PREDICTOR:VARIANT`.
-        variants: variants by predictor and name; each has `horizons_s`.
+        variants: variants by predictor and name; each has `horizons_s` and `segment_s`.
         warm_starts_from_3s: of a predictor and a variant, whether runs for more than 3 s start
             from runs for 3 s.
 
@@ -219,6 +221,7 @@ def choose_ablations(
                 name=variant,
                 horizons_s=tuple(by_name[variant].horizons_s),
                 warm_starts_from_3s=warm_starts_from_3s(each, variant),
+                segment_s=by_name[variant].segment_s,
             )
             for each, by_name in variants.items()
             for variant in by_name
@@ -283,9 +286,10 @@ def _model_cell(site: str, view: str, model: ModelSpec, horizon_s: float, seed: 
 
 def _ablation_cell(site: str, view: str, ablation: Ablation, horizon_s: float, seed: int) -> Cell:
     start = None
-    if horizon_s > SEGMENT_S and ablation.warm_starts_from_3s:
-        if SEGMENT_S in ablation.horizons_s:
-            start = _ablation_cell(site, view, ablation, SEGMENT_S, seed)
+    first_s = SEGMENT_S if ablation.segment_s is None else ablation.segment_s
+    if horizon_s > first_s and ablation.warm_starts_from_3s:
+        if ablation.segment_s is not None or first_s in ablation.horizons_s:
+            start = _ablation_cell(site, view, ablation, first_s, seed)
         else:
             start = Cell(
                 site=site,

@@ -10,21 +10,25 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 
 from asp_env.data.predictor import Predictor
-from asp_env.data.snippets import (
-    SnippetIndex,
-    gather_future,
-    gather_present,
-    gather_scene,
-    index_snippets,
-)
+from asp_env.data.snippets import SnippetIndex, gather_scene, index_snippets
 from asp_env.data.source import Recordings
 from asp_env.data.split import snippet_parts
 from asp_env.errors import AspEnvError
-from asp_env.evaluation.open_loop.scoring import BATCH, complete_forecast
+from asp_env.evaluation.open_loop.ground_truth import gather_ground_truth
+from asp_env.evaluation.open_loop.scoring import (
+    BATCH,
+    ForecastSample,
+    complete_forecast,
+    mode_violations,
+    stays_on_road,
+)
 from asp_env.files import atomic_file
 from asp_env.metrics.forecast.errors import SELECTIONS, moving, open_loop_errors
 
 METRICS = ("MAE", "MSE", "ADE", "FDE")
+
+VIOLATIONS = ("infeasible", "off-road", "overlap")
+"""Why a mode cannot be driven, as in `mode_violations`."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -40,6 +44,11 @@ class Errors:
     tick: Int[np.ndarray, " n"]
     stamp: str
     """Hash of all that the errors depend on."""
+    violations: Float[np.ndarray, "violations n"]
+    """Share of all modes for which each of `VIOLATIONS` holds."""
+    violations_valid: Bool[np.ndarray, "violations n"]
+    """Mask of the snippets to which each of them applies; false in files of earlier versions, which
+    have no violations."""
 
     def save(self, path: Path) -> None:
         """Writes a compressed `.npz` file atomically."""
@@ -52,12 +61,16 @@ class Errors:
                 track=self.track,
                 tick=self.tick,
                 stamp=np.array(self.stamp),
+                violations=self.violations,
+                violations_valid=self.violations_valid,
             )
 
     @classmethod
     def load(cls, path: Path) -> "Errors":
         """Reads a file that `save` wrote."""
         with np.load(path, allow_pickle=False) as file:
+            has_violations = "violations" in file.files
+            nothing = np.zeros((len(VIOLATIONS), len(file["moving"])), dtype=bool)
             return cls(
                 values=file["values"],
                 moving=file["moving"],
@@ -65,6 +78,8 @@ class Errors:
                 track=file["track"],
                 tick=file["tick"],
                 stamp=str(file["stamp"]),
+                violations=file["violations"] if has_violations else nothing.astype(np.float32),
+                violations_valid=file["violations_valid"] if has_violations else nothing,
             )
 
 
@@ -85,6 +100,7 @@ def snippets_to_evaluate(
     dt_s: float,
     part: Literal["test", "all"],
     per_recording: int | None,
+    parked: bool = False,
 ) -> SnippetIndex:
     """The snippets that all predictors are evaluated on.
 
@@ -95,11 +111,12 @@ def snippets_to_evaluate(
         part: `test` of the split by recording, or `all`.
         per_recording: largest number of snippets of each recording, which are chosen at random;
             None for all.
+        parked: whether parked vehicles are targets, too.
 
     Raises:
         AspEnvError: there is no snippet, or the recordings cannot be split.
     """
-    index = index_snippets(recordings, dt_s=dt_s, horizon_s=horizon_s)
+    index = index_snippets(recordings, dt_s=dt_s, horizon_s=horizon_s, parked=parked)
     if part == "test":
         parts, _ = snippet_parts(recordings, index, "recording")
         index = index.select(parts == "test")
@@ -144,22 +161,34 @@ def compute_errors(
         name: np.zeros((len(SELECTIONS), len(METRICS), count), dtype=np.float32)
         for name in predictors
     }
+    shape = (len(VIOLATIONS), count)
+    violations = {name: np.zeros(shape, dtype=np.float32) for name in predictors}
+    applies = np.zeros(shape, dtype=bool)
     moves = np.zeros(count, dtype=bool)
     for start in range(0, count, BATCH):
         rows = slice(start, min(start + BATCH, count))
         chosen = index.select(np.arange(rows.start, rows.stop))
-        scene, future = gather_scene(scenes, chosen), gather_future(recorded, chosen)
-        now, _ = gather_present(recorded, chosen)
+        scene, known = gather_scene(scenes, chosen), gather_ground_truth(recorded, chosen)
+        future, now, on_road = known.future, known.present, stays_on_road(known)
         moves[rows] = moving(now, future.states[..., :2], future.valid)
         # Differences of positions far from the origin would lose millimetres in float32.
         origin = now[:, None, :2]
         truth = future.states[..., :2] - origin
         for name, predictor in predictors.items():
             forecast = complete_forecast(predictor, scene, future, index.horizon_ticks)
-            local = forecast.states[:, :, : index.horizon_ticks, :2] - origin[:, None]
+            sample = ForecastSample(
+                states=forecast.states[:, :, : index.horizon_ticks],
+                log_probs=forecast.log_probs,
+                now=scene.target_states,
+            )
+            local = sample.states[..., :2] - origin[:, None]
             for which, selection in enumerate(SELECTIONS):
                 errors = open_loop_errors(local, forecast.log_probs, truth, future.valid, selection)
                 values[name][which, :, rows] = [errors[metric].value for metric in METRICS]
+            of_modes = mode_violations(sample, known, on_road, dt_s=index.dt_s)
+            for number, violation in enumerate(VIOLATIONS):
+                violates, applies[number, rows] = of_modes[violation]
+                violations[name][number, rows] = violates.mean(axis=1)
     return {
         name: Errors(
             values=array,
@@ -168,6 +197,8 @@ def compute_errors(
             track=index.track.astype(np.int32),
             tick=index.tick.astype(np.int32),
             stamp=stamp,
+            violations=violations[name],
+            violations_valid=applies,
         )
         for name, array in values.items()
     }

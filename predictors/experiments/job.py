@@ -4,13 +4,14 @@ import dataclasses
 import hashlib
 import json
 import sys
+import time
 import traceback
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal
 
 from asp_env.data import cache
-from asp_env.data.causal import causal_histories
+from asp_env.data.histories import History, histories
 from asp_env.data.predictor import load_predictor
 from asp_env.data.recording import DEFAULT_DT_S, ticks
 from asp_env.data.source import open_data
@@ -36,7 +37,7 @@ class EvaluationJob:
     part: Literal["test", "all"]
     """Part of the data."""
     horizon_s: float
-    history: Literal["recorded", "causal"] = "recorded"
+    history: History = "recorded"
     """Histories that a predictor without training observes; trained ones observe what they were
     trained on."""
     per_recording: int | None = None
@@ -45,6 +46,8 @@ class EvaluationJob:
     """Path of the errors without its suffix."""
     data_hash: str
     """Hash of the content of the data."""
+    parked: bool = False
+    """Whether parked vehicles are targets, too."""
     chainings: tuple[str, ...] = ()
     """Rules for chaining segments that are evaluated besides the predictor's own, if it chains."""
 
@@ -53,6 +56,8 @@ class EvaluationJob:
         """Hash of everything that the errors depend on, including the finished run."""
         fields = dataclasses.asdict(self)
         content = {k: v for k, v in fields.items() if k not in ("data", "run", "errors")}
+        if not self.parked:  # as in the stamps of versions without this option
+            del content["parked"]
         text = json.dumps(content, sort_keys=True).encode()
         if self.run:
             text += (Path(self.run) / FINISHED).read_bytes()
@@ -89,9 +94,10 @@ class EvaluationJob:
             dt_s=dt_s,
             part=self.part,
             per_recording=self.per_recording,
+            parked=self.parked,
         )
-        causal = own.metadata.get("history", self.history) == "causal"
-        scenes = causal_histories(recordings) if causal else recordings
+        history: Any = own.metadata.get("history", self.history)
+        scenes = histories(recordings, history)
         errors = compute_errors(
             predictors, index, scenes=scenes, recorded=recordings, stamp=self.stamp
         )
@@ -152,31 +158,41 @@ class Job:
         """Whether the run is finished and its errors are computed."""
         return self.trained and (self.evaluation is None or self.evaluation.done)
 
-    def execute(self) -> None:
+    def execute(self) -> float:
         """Trains and computes the errors.
+
+        Returns:
+            CPU time of the training in seconds, with the opening of the data.
 
         Raises:
             AspEnvError: the run or the data are bad.
         """
         self.check()
+        start_s = trained_s = time.process_time()
         if self.train is not None and not self.trained:
             options = dict(self.train)
             for name in ("data", "validation"):
                 options[name] = () if options.get(name) is None else (options[name],)
-            options["out"] = Path(options["out"])
+            for name in ("out", "costs"):
+                options[name] = None if options.get(name) is None else Path(options[name])
             Train(**options).run()
+            trained_s = time.process_time()
         if self.evaluation is not None and not self.evaluation.done:
             self.evaluation.execute()
+        return trained_s - start_s
 
 
-def run_job(job: Job) -> None:
+def run_job(job: Job) -> float:
     """Executes a job in a worker process; the last line of its output states an error.
+
+    Returns:
+        CPU time of the training in seconds.
 
     Raises:
         AspEnvError: the run or the data are bad.
     """
     try:
-        job.execute()
+        return job.execute()
     except AspEnvError as error:
         sys.stdout.flush()
         sys.stderr.write(f"asp-env: {' '.join(str(error).split())}\n")

@@ -18,7 +18,7 @@ from asp_env.evaluation import statistics
 from asp_env.evaluation.statistics import Estimate
 from asp_env.metrics.forecast.errors import SELECTIONS
 from predictors.experiments.cells import CAUSAL, INPUT_VARIANTS, Cell
-from predictors.experiments.errors import METRICS, Errors
+from predictors.experiments.errors import METRICS, VIOLATIONS, Errors
 
 SUBSETS = ("moving", "all")
 REFERENCES = ("constant-turn-rate", "dkm", "ffw-asp")
@@ -71,6 +71,16 @@ class Key(NamedTuple):
         )
 
 
+class Training(NamedTuple):
+    """The training of one line and seed, with the runs that it starts from."""
+
+    epochs: int
+    """Prediction epochs."""
+    pretraining_epochs: int
+    cpu_s: float | None
+    """CPU time in seconds, with the opening of the data; None if it is not known."""
+
+
 class SeedMean(NamedTuple):
     """One metric of a line, averaged over seeds."""
 
@@ -85,6 +95,10 @@ class Sums:
 
     errors: Float[np.ndarray, "r subsets selections metrics"]
     counts: Int[np.ndarray, "r subsets"]
+    violations: Float[np.ndarray, "r subsets violations"]
+    """Shares of modes for which `VIOLATIONS` hold, summed over the snippets that they apply to."""
+    violation_counts: Int[np.ndarray, "r subsets violations"]
+    """Number of these snippets."""
     digest: str
     """Hash of the snippets."""
 
@@ -95,14 +109,26 @@ class Sums:
         recordings = int(group.max()) + 1
         sums = np.zeros((recordings, len(SUBSETS), len(SELECTIONS), len(METRICS)))
         counts = np.zeros((recordings, len(SUBSETS)), dtype=np.int64)
+        violations = np.zeros((recordings, len(SUBSETS), len(VIOLATIONS)))
+        violation_counts = np.zeros(violations.shape, dtype=np.int64)
         for number, subset in enumerate(SUBSETS):
             member = errors.moving if subset == "moving" else np.ones_like(errors.moving)
             values = np.moveaxis(errors.values, -1, 0)[member].astype(np.float64)
             np.add.at(sums[:, number], group[member], values)
             counts[:, number] = np.bincount(group[member], minlength=recordings)
+            applies = errors.violations_valid.T[member]
+            shares = np.where(applies, errors.violations.T[member], 0).astype(np.float64)
+            np.add.at(violations[:, number], group[member], shares)
+            np.add.at(violation_counts[:, number], group[member], applies)
         content = np.stack([errors.recording, errors.track, errors.tick, errors.moving])
         digest = hashlib.sha256(content.astype(np.int64).tobytes()).hexdigest()
-        return cls(errors=sums, counts=counts, digest=digest)
+        return cls(
+            errors=sums,
+            counts=counts,
+            violations=violations,
+            violation_counts=violation_counts,
+            digest=digest,
+        )
 
     def chosen(self, choice: Choice) -> Float[np.ndarray, "r metrics"]:
         """Sums of one selection and subset."""
@@ -126,6 +152,8 @@ class Findings:
     """Errors by line and seed."""
     features: Mapping[Key, Sequence[Mapping[str, float]]] = field(default_factory=dict)
     """`FEATURES` of the best epoch of each seed, by line; empty without predicted features."""
+    training: Mapping[Key, Sequence[Training]] = field(default_factory=dict)
+    """The training of each seed, by line."""
 
     def __post_init__(self) -> None:
         first: dict[tuple[str, float], str] = {}
@@ -143,6 +171,23 @@ class Findings:
         The errors of each snippet are averaged over seeds first, then over snippets.
         """
         return _seed_means(list(self.sums.get(key, {}).values()), None, choice)
+
+    def violations(self, key: Key, subset: str) -> dict[str, SeedMean]:
+        """Shares of modes for which `VIOLATIONS` hold, averaged over seeds; those that apply.
+
+        Args:
+            key: a line.
+            subset: one of `SUBSETS`.
+        """
+        seeds, column = list(self.sums.get(key, {}).values()), SUBSETS.index(subset)
+        means = {}
+        for number, name in enumerate(VIOLATIONS):
+            counts = [each.violation_counts[:, column, number] for each in seeds]
+            if not counts or not counts[0].sum():
+                continue
+            by_seed = np.stack([each.violations[:, column, number] for each in seeds])
+            means[name] = _seed_mean(by_seed, counts[0])
+        return means
 
     def differences(self, key: Key, other: Key, choice: Choice) -> dict[str, SeedMean]:
         """Paired differences of the means of two lines, over the seeds that both have.
@@ -189,32 +234,54 @@ def _seed_means(
     if not minuend or (subtrahend is not None and not subtrahend):
         return {}
     counts = minuend[0].chosen_counts(choice)
-    total = int(counts.sum())
-    if not total:
+    if not counts.sum():
         return {}
     by_seed = np.stack([each.chosen(choice) for each in minuend])
-    sums = by_seed.mean(axis=0)
     if subtrahend is not None:
         other_by_seed = np.stack([each.chosen(choice) for each in subtrahend])
-        sums = sums - other_by_seed.mean(axis=0)
         by_seed = by_seed - other_by_seed  # broadcasts a predictor without training to every seed
+    return {
+        metric: _seed_mean(by_seed[:, :, column], counts) for column, metric in enumerate(METRICS)
+    }
+
+
+def _seed_mean(by_seed: Float[np.ndarray, "seeds r"], counts: Int[np.ndarray, " r"]) -> SeedMean:
+    """The mean over snippets and seeds of values that are summed over each recording.
+
+    Args:
+        by_seed: sums of every seed and recording.
+        counts: number of snippets of each recording, at least one in total.
+    """
+    total, present = int(counts.sum()), counts > 0
+    sums = by_seed.mean(axis=0)[present]
+    estimate = statistics.ratio(sums, counts[present].astype(float), np.arange(len(sums)))
     seeds = by_seed.sum(axis=1) / total
-    present = counts > 0
-    groups = np.arange(int(present.sum()))
-    means = {}
-    for column, metric in enumerate(METRICS):
-        estimate = statistics.ratio(sums[present, column], counts[present].astype(float), groups)
-        means[metric] = SeedMean(
-            estimate=dataclasses.replace(estimate, n=total),
-            spread=float(seeds[:, column].std(ddof=1)) if len(seeds) > 1 else None,
-        )
-    return means
+    return SeedMean(
+        estimate=dataclasses.replace(estimate, n=total),
+        spread=float(seeds.std(ddof=1)) if len(seeds) > 1 else None,
+    )
 
 
 def excludes_zero(estimate: Estimate) -> bool:
     """Whether the interval of an estimate lies on one side of zero."""
     low, high = estimate.low, estimate.high
     return low is not None and high is not None and (low > 0 or high < 0)
+
+
+def trained(run: Path, cpu_s: float | None) -> Training:
+    """The training of a finished run, without the run that it starts from.
+
+    Args:
+        run: folder of the run.
+        cpu_s: CPU time of its training in seconds, if it is known.
+    """
+    provenance = json.loads((run / "config.json").read_text())["provenance"]
+    config = provenance["config"]
+    return Training(
+        epochs=provenance.get("trained_epochs", config["epochs"]),
+        pretraining_epochs=config["pretraining_epochs"],
+        cpu_s=cpu_s,
+    )
 
 
 def best_features(run: Path) -> dict[str, float]:

@@ -22,18 +22,20 @@ from asp_env.evaluation.results import Row, write_manifest, write_metrics
 from asp_env.evaluation.statistics import Estimate
 from asp_env.files import atomic_file
 from predictors.experiments.cells import Cell, Site
-from predictors.experiments.errors import Errors
+from predictors.experiments.errors import VIOLATIONS, Errors
 from predictors.experiments.job import EvaluationJob, errors_path
 from predictors.experiments.results import (
     CHOICES,
     FEATURES,
     NO_SEED,
     ORACLE,
+    SUBSETS,
     Choice,
     Findings,
     Key,
     SeedMean,
     Sums,
+    Training,
     best_features,
     excludes_zero,
 )
@@ -41,6 +43,9 @@ from predictors.experiments.results import (
 PAPER_DATA = ("inD", "rounD")
 PAPER_HORIZONS_S = (3.0, 6.0)
 CAVEAT = "other data, not comparable in size"
+PER_COORDINATE = "MAE and MSE are means over time and both coordinates, FDE is a distance"
+"""Meaning of the errors. The paper's footnotes call MSE a mean L2 distance; its numbers are of
+squares."""
 
 
 class PaperErrors(NamedTuple):
@@ -139,7 +144,7 @@ def main_table(
     table.caption = (
         f"paper: Janjoš et al. 2021 on {' and '.join(PAPER_DATA)}, mode not stated;\n{CAVEAT};\n"
         f"its SSP-ASP chains segments for 6 s by label matching, as {ORACLE} {MARK} does;\n"
-        f"{MARK} uses the recorded future"
+        f"{MARK} uses the recorded future; {PER_COORDINATE}"
     )
     _add_columns(table, sites, columns)
     lines = _lines(findings, columns, lambda key: not key.variant)
@@ -193,6 +198,34 @@ def difference_table(
     return table
 
 
+def violation_table(
+    findings: Findings, sites: Sequence[str], columns: Sequence[Key], subset: str
+) -> Table:
+    """Share of the modes that cannot be driven, by view and predictor, site and horizon.
+
+    Args:
+        findings: results of the cells.
+        sites: names of all sites.
+        columns: one key of each site and horizon that is shown.
+        subset: one of `SUBSETS`.
+    """
+    table = _table(
+        f"{subset} targets, all modes, mean over seeds: share of modes that are\n"
+        "infeasible / off-road / overlap another agent, %; infeasible: [95 % interval]"
+    )
+    table.caption = (
+        "infeasible: over 10.4 m/s² or 0.3 1/m between any two states (Waymax);\n"
+        "MTP forecasts positions, the other networks actions of the bicycle model"
+    )
+    _add_columns(table, sites, columns)
+    for view, members in _by_view(_lines(findings, columns, lambda k: not k.variant)).items():
+        _section(table, view)
+        for line in members:
+            means = [findings.violations(_key(line, column), subset) for column in columns]
+            table.add_row(_name(line), *(_shares(each) for each in means))
+    return table
+
+
 def ablation_table(findings: Findings, column: Key, choice: Choice) -> Table:
     """Differences of variants to their recipes, and feature statistics.
 
@@ -231,6 +264,42 @@ def ablation_table(findings: Findings, column: Key, choice: Choice) -> Table:
                 to_dkm = _differences(findings.differences(key, dkm, choice), ("FDE",))
             table.add_row(_name(line), to_recipe, to_dkm, *_feature_cells(findings, key))
     return table
+
+
+def training_table(
+    findings: Findings, sites: Sequence[str], columns: Sequence[Key], budget: str
+) -> Table:
+    """Epochs and CPU time of the training, by view and predictor, site and horizon.
+
+    Args:
+        findings: results of the cells.
+        sites: names of all sites.
+        columns: one key of each site and horizon that is shown.
+        budget: what the number of epochs follows from, in words.
+    """
+    table = _table(
+        f"training, budget: {budget}\n"
+        "prediction epochs + epochs of pre-training; mean CPU time of a seed"
+    )
+    table.caption = "with the runs for 3 s that runs for longer horizons start from"
+    _add_columns(table, sites, columns)
+    lines = _lines(findings, columns, lambda key: key in findings.training)
+    for view, members in _by_view(lines).items():
+        _section(table, view)
+        for line in members:
+            runs = [findings.training.get(_key(line, column), ()) for column in columns]
+            table.add_row(_name(line), *(_training(each) for each in runs))
+    return table
+
+
+def _training(runs: Sequence[Training]) -> str:
+    if not runs:
+        return ""
+    epochs = sorted({each.epochs for each in runs})
+    text = str(epochs[0]) if len(epochs) == 1 else f"{epochs[0]} to {epochs[-1]}"
+    text += f" + {runs[0].pretraining_epochs}" if runs[0].pretraining_epochs else ""
+    times_s = [each.cpu_s for each in runs if each.cpu_s is not None]
+    return f"{text}; {sum(times_s) / len(times_s):.0f} s" if times_s else text
 
 
 def _table(title: str) -> Table:
@@ -297,6 +366,19 @@ def _means(means: Mapping[str, SeedMean]) -> Text:
     return text.append(f"\n{range_text.strip()}", style="dim") if range_text else text
 
 
+def _shares(means: Mapping[str, SeedMean]) -> Text:
+    """Shares in per cent, – where one does not apply."""
+    if not means:
+        return Text()
+    shown = [means.get(violation) for violation in VIOLATIONS]
+    text = Text(" / ".join("–" if m is None else f"{100 * m.estimate.value:.1f}" for m in shown))
+    first = means.get(VIOLATIONS[0])
+    if first is None or first.estimate.low is None or first.estimate.high is None:
+        return text
+    low, high = 100 * first.estimate.low, 100 * first.estimate.high
+    return text.append(f"\n[{low:.1f}, {high:.1f}]", style="dim")
+
+
 def _differences(means: Mapping[str, SeedMean], shown: Sequence[str] = SHOWN) -> Text:
     if not means:
         return Text()
@@ -340,14 +422,21 @@ pre {{ font-family: ui-monospace, Menlo, Consolas, monospace; line-height: 1.25;
 """
 
 
-def read_findings(jobs: Mapping[Cell, EvaluationJob]) -> Findings:
+def read_findings(
+    jobs: Mapping[Cell, EvaluationJob], training: Mapping[Cell, Training] = MappingProxyType({})
+) -> Findings:
     """Reads the results of the cells whose jobs are done.
+
+    Args:
+        jobs: the evaluations of the cells.
+        training: the training of the cells.
 
     Raises:
         AspEnvError: cells of one site and horizon were evaluated on different snippets.
     """
     sums: dict[Key, dict[int, Sums]] = {}
     features: dict[Key, list[dict[str, float]]] = {}
+    trainings: dict[Key, list[Training]] = {}
     for cell, job in jobs.items():
         if not job.done:
             continue
@@ -358,10 +447,14 @@ def read_findings(jobs: Mapping[Cell, EvaluationJob]) -> Findings:
                 sums.setdefault(Key.of(cell, chaining), {})[seed] = Sums.of(Errors.load(path))
         if job.run:
             features.setdefault(Key.of(cell), []).append(best_features(Path(job.run)))
-    return Findings(sums=sums, features=features)
+        if cell in training:
+            trainings.setdefault(Key.of(cell), []).append(training[cell])
+    return Findings(sums=sums, features=features, training=trainings)
 
 
-def tables(findings: Findings, sites: Sequence[Site], width: int) -> list[Table]:
+def tables(
+    findings: Findings, sites: Sequence[Site], width: int, *, budget: str = "epochs"
+) -> list[Table]:
     """All tables that have results.
 
     Args:
@@ -369,6 +462,7 @@ def tables(findings: Findings, sites: Sequence[Site], width: int) -> list[Table]
         sites: all sites.
         width: width in characters. If a table with all columns is wider, there is one for each
             site.
+        budget: what the number of epochs follows from, in words.
     """
     by_column = {(key.site, key.horizon_s): key for key in findings.sums}
     names = [site.name for site in sites]
@@ -385,15 +479,19 @@ def tables(findings: Findings, sites: Sequence[Site], width: int) -> list[Table]
         for group in filter(None, groups):
             shown.append(main_table(findings, names, group, choice))
             shown.append(difference_table(findings, names, group, choice))
+    if any(findings.violations(key, subset) for key in findings.sums for subset in SUBSETS):
+        shown += [violation_table(findings, names, g, SUBSETS[0]) for g in groups if g]
     for column in columns:
         if any(key.variant and key.view and _same_column(key, column) for key in findings.sums):
             moving = (choice for choice in CHOICES if choice.subset == "moving")
             shown += [ablation_table(findings, column, choice) for choice in moving]
+    if findings.training:
+        shown += [training_table(findings, names, group, budget) for group in filter(None, groups)]
     return shown
 
 
 def rows(findings: Findings, sites: Mapping[str, Site], recipe: str) -> list[Row]:
-    """Lines of `metrics.csv`: means, deviations over seeds, differences, feature statistics.
+    """Lines of `metrics.csv`: means, deviations over seeds, differences, features, epochs.
 
     Args:
         findings: results of the cells.
@@ -419,9 +517,19 @@ def rows(findings: Findings, sites: Mapping[str, Site], recipe: str) -> list[Row
             lines += _rows(common, choice, findings.means(key, choice))
             for suffix, other in others:
                 lines += _rows(common, choice, findings.differences(key, other, choice), suffix)
+        for subset in SUBSETS:
+            every_mode = Choice(selection="", subset=subset)
+            lines += _rows(common, every_mode, findings.violations(key, subset))
         for name, values in _features_by_name(findings, key).items():
             value = sum(values) / len(values)
             lines.append(Row(**common, metric=name, value=value, n=len(values)))
+        if runs := findings.training.get(key):
+            for name, epochs in (
+                ("prediction epochs", [each.epochs for each in runs]),
+                ("epochs of pre-training", [each.pretraining_epochs for each in runs]),
+            ):
+                value = sum(epochs) / len(runs)
+                lines.append(Row(**common, metric=name, value=value, n=len(runs)))
     return lines
 
 

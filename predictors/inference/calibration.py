@@ -31,10 +31,11 @@ def calibrate(network: AbstractNetwork, batches: Iterable[tuple[Batch, Labels]])
     """Fits the temperatures of a network on validation data.
 
     The factor of the accelerations is fitted first, if the network has one, then the merging
-    temperature, if it merges chains, and both are stored in the network; the temperature of its
-    forecasts and the probability of standing are fitted next. A GPU is used if there is one: at
-    full size a CPU would take longer than the training. Afterwards the network is on the CPU, in
-    evaluation mode.
+    temperature, if it merges chains, and both are stored in the network; where all chains of all
+    segments would be too many it is fitted on the first segments. The temperature of its forecasts
+    and the probability of standing are fitted next. A GPU is used if there is one: at full size a
+    CPU would take longer than the training. Afterwards the network is on the CPU, in evaluation
+    mode.
 
     Args:
         network: The trained network.
@@ -47,7 +48,7 @@ def calibrate(network: AbstractNetwork, batches: Iterable[tuple[Batch, Labels]])
     network.eval().to(device)
     _fit_acceleration_scale(network, batches, device)
     if network.merging_temperature is not None:
-        merging = _temperature(lambda batch: network.chain(batch, "full"), batches, device)
+        merging = _temperature(network.all_chains, batches, device)
         network.merging_temperature.fill_(merging)
     temperature = _temperature(network, batches, device)
     _calibrate_standing(network, batches, device)
@@ -120,7 +121,8 @@ def _temperature(
         for sample in batches:
             batch, labels = move_data_to_device(sample, device)
             modes = forecast(batch)
-            nearest = best_mode(modes.states[..., :2], labels.states[..., :2], "distance")
+            truth = labels.states[:, : modes.states.shape[2], :2]
+            nearest = best_mode(modes.states[..., :2], truth, "distance")
             learned = torch.ones_like(nearest, dtype=torch.bool)
             if modes.standing is not None:
                 learned = ~stands(labels.states)

@@ -27,7 +27,7 @@ from predictors.inference.feature_distance import FeatureDistance
 from predictors.inference.model_card import model_card
 from predictors.inference.pretrained import PRETRAINED, pretrained_folder, pretrained_names
 from predictors.inference.trained import TrainedPredictor
-from predictors.models.chaining import CHAININGS, Chaining
+from predictors.models.chaining import CHAININGS, MAX_CHAINS, Chaining
 from predictors.models.network import AbstractNetwork, NetworkConfig, NetworkShape
 
 CONFIG = "config.json"
@@ -183,7 +183,13 @@ def load_trained(
             f"{spec.name} in {folder} was trained for a time step of {shape.dt_s:g} s, "
             f"the scenes have {dt_s:g} s"
         )
-    if len(network.later_ticks) > 1:
+    segments = len(network.later_ticks)
+    if chaining == "full" and network.config.modes**segments > MAX_CHAINS:
+        raise AspEnvError(
+            f"{spec.name} in {folder} chains {segments} segments of {network.config.modes} modes: "
+            f"@full would forecast more than {MAX_CHAINS} chains, take @beam"
+        )
+    if segments > 1:
         metadata["chaining"] = chaining or "beam"
     elif chaining is not None:
         raise AspEnvError(

@@ -18,6 +18,8 @@ class Export:
     """A trained predictor with its folder, such as ssp-asp:runs/1 or ssp-asp:runs/1@top1."""
     out: Path
     """The file to write; it must not exist."""
+    features: bool = False
+    """Add the network's features of each target to the outputs."""
 
     def run(self) -> None:
         """Exports the predictor, compares the file with the network, and writes it.
@@ -34,7 +36,7 @@ class Export:
         except ModuleNotFoundError as error:
             raise MissingExtraError(str(error.name), "export", "export to ONNX") from error
 
-        difference = write_onnx(self.predictor, self.out)
+        difference = write_onnx(self.predictor, self.out, features=self.features)
         Console().print(
             f"wrote {self.out}: differs from the network by at most {difference:.0e} on random "
             "inputs",

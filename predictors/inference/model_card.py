@@ -30,6 +30,7 @@ HISTORIES = MappingProxyType(
         "recorded": "as in the files, which may be smoothed with later frames that a vehicle does "
         "not have",
         "causal": "filtered forward from noisy positions, without later frames",
+        "accelerations": "as recorded, with the recorded accelerations in past actions",
     }
 )
 """What the option `history` of a training means."""
@@ -154,6 +155,7 @@ def _recipe(provenance: dict[str, Any]) -> dict[str, object]:
         **{field: value for field, value in sorted(training.items()) if field not in elsewhere},
         "initial weights": provenance.get("start"),
         "processes": provenance.get("processes"),
+        "trained prediction epochs": provenance.get("trained_epochs"),
         "best epoch": provenance.get("best_epoch"),
         "selected by": None
         if best is None

@@ -36,6 +36,7 @@ from predictors.inference.checkpoint import (
 )
 from predictors.inference.trained import TrainedPredictor
 from predictors.models.batch import Batch, VectorTensors
+from predictors.models.network import Modes
 
 OPSET = 18
 """Version of the ONNX operators."""
@@ -67,6 +68,8 @@ MEANINGS: Mapping[str, str] = MappingProxyType(
         "of the target's pose now.",
         "log_probs": "Logarithm of each mode's probability.",
         "actions": "Mode, tick ahead, and acceleration m/s^2, steering angle rad.",
+        "features": "What the network encodes of the target: z; for ssp-asp, z and then the "
+        "predicted features at the end of the first segment.",
     }
 )
 """Description of each tensor; the axes are those after the axis of targets."""
@@ -75,12 +78,13 @@ _CHECKED_TARGETS = 3
 _LENGTH_M = 4.5
 
 
-def write_onnx(name: str, out: Path) -> float:
+def write_onnx(name: str, out: Path, *, features: bool = False) -> float:
     """Writes a trained predictor to a file if onnxruntime agrees with the network.
 
     Args:
         name: `predictor:RUN` or `predictor:RUN@chaining`.
         out: The file, in an existing folder.
+        features: Whether `features` is an output, behind the others.
 
     Returns:
         The largest difference between both on random inputs, at most 1e-4.
@@ -102,8 +106,9 @@ def write_onnx(name: str, out: Path) -> float:
     folder, _ = folder_and_chaining(kind, argument)
     config = read_config(folder)
     metadata = {"config": json.dumps(config, sort_keys=True)} | _metadata(predictor)
-    content = _to_onnx(predictor, metadata)
-    difference = _largest_difference(predictor, content)
+    forecaster = _Forecaster(predictor, features=features)
+    content = _to_onnx(predictor, forecaster, metadata)
+    difference = _largest_difference(predictor, forecaster, content)
     if not difference <= TOLERANCE:
         raise AspEnvError(
             f"{name} is not exported: onnxruntime would differ from the network by "
@@ -145,32 +150,42 @@ def batch_of(inputs: Sequence[Tensor]) -> Batch:
 class _Forecaster(nn.Module):
     """The calibrated network as a function of tensors."""
 
-    def __init__(self, predictor: TrainedPredictor) -> None:
+    def __init__(self, predictor: TrainedPredictor, *, features: bool) -> None:
         super().__init__()
         self.network = predictor.network
         self._predictor = predictor
+        self._features = features
 
     def forward(self, *inputs: Tensor) -> tuple[Tensor, ...]:
-        modes = self._predictor.modes(batch_of(inputs))
-        outputs = (modes.states, modes.logits)
-        return outputs if modes.actions is None else (*outputs, modes.actions)
+        return tuple(self.outputs(inputs).values())
+
+    def outputs(self, inputs: Sequence[Tensor]) -> dict[str, Tensor]:
+        """The file's outputs by name, in order, without those that the network does not have."""
+        modes: Modes = self._predictor.modes(batch_of(inputs))
+        outputs = {"states": modes.states, "log_probs": modes.logits}
+        if modes.actions is not None:
+            outputs["actions"] = modes.actions
+        if self._features and modes.features is not None:
+            outputs["features"] = modes.features
+        return outputs
 
 
-def _to_onnx(predictor: TrainedPredictor, metadata: dict[str, str]) -> bytes:
+def _to_onnx(
+    predictor: TrainedPredictor, forecaster: _Forecaster, metadata: dict[str, str]
+) -> bytes:
     names = input_names(predictor)
     inputs = _random_inputs(predictor, 2)
     with _quiet_export(), torch.no_grad():
         axis = torch.export.Dim(TARGETS)
         program = torch.export.export(
-            _Forecaster(predictor),
+            forecaster,
             tuple(inputs),
             dynamic_shapes=(tuple({0: axis} for _ in inputs),),
         )
-        outputs = ("states", "log_probs", "actions")[: len(program.graph_signature.user_outputs)]
         exported = torch.onnx.export(
             program,
             input_names=names,
-            output_names=outputs,
+            output_names=tuple(forecaster.outputs(inputs)),
             opset_version=OPSET,
             dynamo=True,
             verbose=False,
@@ -229,13 +244,15 @@ def _random_inputs(predictor: TrainedPredictor, count: int) -> list[Tensor]:
     return [torch.from_numpy(array) for array in arrays]
 
 
-def _largest_difference(predictor: TrainedPredictor, content: bytes) -> float:
+def _largest_difference(
+    predictor: TrainedPredictor, forecaster: _Forecaster, content: bytes
+) -> float:
     inputs = _random_inputs(predictor, _CHECKED_TARGETS)
     session = onnxruntime.InferenceSession(content, providers=["CPUExecutionProvider"])
     named = zip(input_names(predictor), inputs, strict=True)
     outputs: Any = session.run(None, {name: tensor.numpy() for name, tensor in named})
     with torch.inference_mode():
-        expected = _Forecaster(predictor)(*inputs)
+        expected = forecaster(*inputs)
     pairs = zip(outputs, expected, strict=True)
     return max(float(np.abs(output - tensor.numpy()).max()) for output, tensor in pairs)
 

@@ -74,6 +74,11 @@ class TrainedPredictor:
             self._chunk = min(MAX_CHUNK_TARGETS, max(1, MAX_CHUNK_PIXELS // pixels))
 
     @property
+    def feature_size(self) -> int:
+        """Number of features of each target in its forecasts."""
+        return self.network.feature_size
+
+    @property
     def metadata(self) -> Mapping[str, str]:
         """Source of the training data, view, recipe, and a hash of the weights."""
         return self._metadata
@@ -100,15 +105,19 @@ class TrainedPredictor:
         ]
         log_probs = _scatter([chunk.log_probs for chunk in chunks], valid)
         log_probs[~valid] = -np.log(log_probs.shape[1])
-        actions = None
+        actions = features = None
         if chunks[0].actions_valid.all():
             actions = _scatter([chunk.actions for chunk in chunks], valid)
+        encoded = [chunk.features for chunk in chunks if chunk.features is not None]
+        if encoded:
+            features = _scatter(encoded, valid)
         return make_forecast(
             scene,
             states=_scatter([chunk.states for chunk in chunks], valid),
             actions=actions,
             log_probs=log_probs,
             valid=valid,
+            features=features,
         )
 
     @torch.inference_mode()

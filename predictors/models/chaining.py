@@ -18,6 +18,7 @@ import torch
 from jaxtyping import Float, Int
 from torch import Tensor
 
+from asp_env.errors import AspEnvError
 from asp_env.geometry import wrap_angle
 from predictors.models.losses import Assignment, best_mode
 
@@ -27,6 +28,36 @@ CHAININGS: tuple[Chaining, ...] = ("beam", "top1", "full", "oracle")
 MIN_MASS = 1e-4
 """Probability of a merged chain whose neighbourhood has no probability left. Chosen by hand: it
 keeps logarithms finite."""
+
+MAX_CHAINS = 243
+"""Largest number of chains that are predicted without selection: five segments of three modes.
+Chosen by hand: it bounds memory and time, which grow with the number of modes to the power of the
+number of segments."""
+
+
+def segment_ticks(segment_s: float, *, horizon_s: float, dt_s: float) -> int:
+    """Number of ticks of a segment.
+
+    Args:
+        segment_s: Length of a segment, seconds.
+        horizon_s: Horizon, seconds; a whole number of ticks.
+        dt_s: Time step, seconds.
+
+    Raises:
+        AspEnvError: A segment is no whole, positive number of ticks, or the horizon no whole number
+            of segments; the message lists the lengths that fit.
+    """
+    horizon, segment = round(horizon_s / dt_s), segment_s / dt_s
+    if segment > 0.5 and abs(segment - round(segment)) < 1e-6 and not horizon % round(segment):
+        return round(segment)
+    fault = f"the horizon of {horizon_s:g} s is no whole number of them"
+    if segment <= 0.5 or abs(segment - round(segment)) >= 1e-6:
+        fault = f"they are no whole number of ticks of {dt_s:g} s"
+    fitting = ", ".join(f"{n * dt_s:g}" for n in range(1, horizon + 1) if not horizon % n)
+    raise AspEnvError(
+        f"ssp-asp chains segments of {segment_s:g} s, {fault}: {horizon_s:g} s can be cut into "
+        f"segments of {fitting} s"
+    )
 
 
 class Chains(NamedTuple):

@@ -72,4 +72,4 @@ class DKMNetwork(AbstractNetwork):
             actions = self.bounded_actions(outputs)
             states = rollout_from_now(actions, batch, self.shape.dt_s, self._integrator)
             standing = self.standing_logit(z, batch)
-        return Modes(states, logits, actions, standing)
+        return Modes(states, logits, actions, features=z, standing=standing)

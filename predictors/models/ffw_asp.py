@@ -5,8 +5,12 @@ surroundings to features z. The decoder γ, a GRU, reads [z, a] at every tick of
 its last state gives future actions and a logit for each mode. The bicycle model f (equation 4)
 turns actions into states, on which the loss L_FFW (equation 10) is taken.
 
-The paper leaves open: here z passes a LayerNorm before γ, and outputs are scaled by tanh times the
-99.9th percentile of the absolute actions in the training data, within the limits of actions.
+The paper leaves open how the GRU makes the actions: with `decoder="read"`, the default, one linear
+layer maps its last state to the actions of all ticks; with `decoder="unrolled"` it goes on over the
+ticks ahead, and the state after each of them gives the actions of that tick
+(`predictors.models.heads`). It leaves open as well: here z passes a LayerNorm before γ, and outputs
+are scaled by tanh times the 99.9th percentile of the absolute actions in the training data, within
+the limits of actions.
 
 Options that differ from the paper; the recipe `paper` leaves them off: `skip` leads z, the present
 speed and the past actions around the GRU to the output (the GRU alone loses accuracy); `hidden`
@@ -26,7 +30,7 @@ from asp_env.dynamics.bicycle import Integrator
 from asp_env.errors import AspEnvError
 from predictors.models.batch import Batch
 from predictors.models.encoders import make_encoder
-from predictors.models.heads import ConnectedHead, RecurrentReader
+from predictors.models.heads import ConnectedHead, Decoder, RecurrentReader, UnrolledDecoder
 from predictors.models.network import (
     AbstractNetwork,
     Modes,
@@ -42,6 +46,8 @@ class FFWASPConfig(NetworkConfig):
 
     head: Literal["recurrent", "connected"] = "recurrent"
     """Whether a GRU or a fully connected layer reads the features and the past actions."""
+    decoder: Decoder = "read"
+    """How the GRU makes actions, see `heads.Decoder`; only `read` for the connected head."""
     gru_width: int = 512
     gru_layers: int = 2
     skip: bool = False
@@ -54,9 +60,14 @@ class FFWASPConfig(NetworkConfig):
         """Checks the sizes.
 
         Raises:
-            AspEnvError: A size is not positive.
+            AspEnvError: A size is not positive, or a connected head is to be unrolled.
         """
         self.check_positive("features", "modes", "gru_width", "gru_layers")
+        if self.head == "connected" and self.decoder != "read":
+            raise AspEnvError(
+                f"network: decoder is {self.decoder!r} with the connected head, which has no GRU: "
+                "take the recurrent head"
+            )
         if self.hidden < 0:
             raise AspEnvError(f"network: hidden is {self.hidden}, expected 0 or more")
 
@@ -77,13 +88,25 @@ class FFWASPNetwork(AbstractNetwork):
         self.encoder = make_encoder(config.encoder, shape, config.features)
         self.norm = nn.LayerNorm(config.features)
         self.reader: RecurrentReader | None = None
-        width = 0
+        self.head: ConnectedHead | None = None
+        self.decoder: UnrolledDecoder | None = None
+        skipped = config.features + 2 * shape.history + 1 if config.skip else 0
+        if config.decoder == "unrolled":
+            self.decoder = UnrolledDecoder(
+                config.features,
+                config.gru_width,
+                config.gru_layers,
+                modes=config.modes,
+                static=skipped,
+                hidden=config.hidden,
+            )
+            return
+        width = skipped
         if config.head == "recurrent":
             self.reader = RecurrentReader(config.features, config.gru_width, config.gru_layers)
-            width = config.gru_width
-        if config.skip or self.reader is None:
-            width += config.features + 2 * shape.history
-        width += config.skip
+            width += config.gru_width
+        elif not config.skip:
+            width = config.features + 2 * shape.history
         self.head = ConnectedHead(width, config.hidden, modes=config.modes, ticks=shape.horizon)
 
     def forward(self, batch: Batch) -> Modes:
@@ -91,13 +114,17 @@ class FFWASPNetwork(AbstractNetwork):
         z = self.norm(self.encoder(batch.observation).float())
         with torch.autocast(z.device.type, enabled=False):
             past = self.scaled_actions(batch.actions)
-            inputs = [] if self.reader is None else [self.reader(z, past)]
-            if self._skip or self.reader is None:
-                inputs += [z, past.flatten(1)]
+            static = [z, past.flatten(1)] if self._skip or self.reader is None else []
             if self._skip:
-                inputs.append(self.scaled_motion(batch)[:, :1])
-            outputs, logits = self.head(torch.cat(inputs, dim=-1))
+                static.append(self.scaled_motion(batch)[:, :1])
+            if self.decoder is not None:
+                skipped = torch.cat(static, dim=-1) if self._skip else None
+                outputs, logits = self.decoder(z, past, self.shape.horizon, skipped)
+            else:
+                assert self.head is not None
+                read = [] if self.reader is None else [self.reader(z, past)]
+                outputs, logits = self.head(torch.cat([*read, *static], dim=-1))
             actions = self.bounded_actions(outputs)
             states = rollout_from_now(actions, batch, self.shape.dt_s, self._integrator)
             standing = self.standing_logit(z, batch)
-        return Modes(states, logits, actions, standing)
+        return Modes(states, logits, actions, features=z, standing=standing)

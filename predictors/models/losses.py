@@ -22,6 +22,12 @@ from asp_env.metrics.forecast.errors import ModeRule, ends_in_true_direction
 Assignment = Literal["angle", "distance", "angle-random"]
 """How the best mode of a label is chosen: see `best_mode` and `best_or_random_mode`."""
 
+DEFAULT_ASSIGNMENT: Assignment = "angle"
+"""The assignment of every recipe that sets none (`cpu` and `paper` of all predictors).
+
+It is that of the paper's text.
+"""
+
 Classification = Literal["cross-entropy", "softmax"]
 """The classification term: see `classification_loss`."""
 
@@ -77,8 +83,8 @@ def best_or_random_mode(
 ) -> Int[Tensor, " n"]:
     """Chooses as `best_mode` by angle, but a random mode where none lies within 5°.
 
-    This is the rule of the published code of MTP (Cui et al. 2019). Without it, a mode that wins
-    all labels at first may keep winning them, and the other modes never learn. The random choice is
+    This is the rule of the published code of MTP (Cui et al. 2019). Where all inputs are equal, a
+    mode that wins all labels at first may keep winning them without it. The random choice is
     derived from the last bits of the distances (multiplicative hashing, Knuth), so that equal
     weights and labels give equal choices.
 

@@ -11,7 +11,7 @@ from dataclasses import dataclass
 from typing import final
 
 import torch
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 from torch import Tensor, nn
 
 from predictors.models.batch import Batch
@@ -65,19 +65,25 @@ class MTPNetwork(AbstractNetwork):
         z = self.norm(self.encoder(batch.observation).float())
         with torch.autocast(z.device.type, enabled=False):
             outputs, logits = self.head(torch.cat([z, self.scaled_motion(batch)], dim=-1))
-            states = states_along(outputs * POSITION_SCALE_M, self.shape.dt_s)
+            positions = outputs * POSITION_SCALE_M
+            states = states_along(positions, batch.motion[:, 0] < 0, self.shape.dt_s)
             standing = self.standing_logit(z, batch)
-        return Modes(states, logits, standing=standing)
+        return Modes(states, logits, features=z, standing=standing)
 
 
-def states_along(positions: Float[Tensor, "n m t 2"], dt_s: float) -> Float[Tensor, "n m t 4"]:
+def states_along(
+    positions: Float[Tensor, "n m t 2"], backwards_now: Bool[Tensor, " n"], dt_s: float
+) -> Float[Tensor, "n m t 4"]:
     """Derives states from positions of a target that is now at (0, 0) with heading 0.
 
     The heading is that of the last step of at least 0.1 m, and the speed is the length of the last
-    step over the time step. Gradients pass through the positions only.
+    step over the time step. Steps to the rear of a target that drives backwards now are driven
+    backwards: their heading is opposite to the step, and their speed is negative. Gradients pass
+    through the positions only.
 
     Args:
         positions: Positions at each tick, metres.
+        backwards_now: Whether the present speed is negative.
         dt_s: Time step.
     """
     with torch.no_grad():
@@ -87,7 +93,9 @@ def states_along(positions: Float[Tensor, "n m t 2"], dt_s: float) -> Float[Tens
         ticks = torch.arange(1, length.shape[-1] + 1, device=length.device)
         # The last tick with a heading of its own; 0 stands for the heading now.
         last = torch.where(length >= MIN_STEP_M, ticks, 0).cummax(dim=-1).values
-        headings = torch.atan2(steps[..., 1], steps[..., 0])
+        backwards = backwards_now[:, None, None] & (steps[..., 0] < 0)
+        sign = 1.0 - 2.0 * backwards.to(steps.dtype)
+        headings = torch.atan2(sign * steps[..., 1], sign * steps[..., 0])
         headings = torch.cat([torch.zeros_like(headings[..., :1]), headings], dim=-1)
-        motion = torch.stack([headings.gather(-1, last), length / dt_s], dim=-1)
+        motion = torch.stack([headings.gather(-1, last), sign * length / dt_s], dim=-1)
     return torch.cat([positions, motion], dim=-1)

@@ -23,6 +23,7 @@ from asp_env.views.vectors import VectorShape
 from predictors.models.batch import Batch, Labels
 from predictors.models.chaining import Chaining
 from predictors.models.losses import (
+    DEFAULT_ASSIGNMENT,
     Assignment,
     Classification,
     mode_terms,
@@ -52,6 +53,8 @@ class Modes(NamedTuple):
     logits: Float[Tensor, "n m"]
     actions: Float[Tensor, "n m t 2"] | None = None
     """[acceleration m/s², steering rad]; None from a network that predicts positions."""
+    features: Float[Tensor, "n f"] | None = None
+    """What the network encodes of the inputs: z, and for SSP-ASP the predicted ẑ behind it."""
     standing: Float[Tensor, " n"] | None = None
     """Logit of the probability that a target stands; None from a network without that mode."""
 
@@ -60,7 +63,7 @@ class TrainingProgress(NamedTuple):
     """How far the training has come, for losses that depend on it."""
 
     share: float = 1.0
-    """Share of all optimiser steps: 0 at the first one, 1 at the end."""
+    """Share of the steps of the prediction epochs: 0 in pre-training, 1 at the end."""
     pretraining: bool = False
     """Whether only the features are learned (the first epochs of `ssp-asp`)."""
 
@@ -72,6 +75,15 @@ class Features(NamedTuple):
     """Features encoded from the inputs at that time."""
     predicted: Float[Tensor, "n z"]
     """Features predicted from the inputs at the present tick."""
+
+
+class Validation(NamedTuple):
+    """What the validation of a batch computes besides the modes."""
+
+    terms: dict[str, Tensor]
+    """The terms of the loss by name; `loss` is their weighted sum."""
+    features: Features | None = None
+    """None if the network predicts no features."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -101,7 +113,7 @@ class NetworkConfig:
     """Number of features z that the encoder returns."""
     modes: int = 3
     """Number of modes M; SSP-ASP predicts M in each segment."""
-    assignment: Assignment = "angle-random"
+    assignment: Assignment = DEFAULT_ASSIGNMENT
     """How the best mode of a label is chosen."""
     classification: Classification = "cross-entropy"
     """The classification term of the loss."""
@@ -172,6 +184,11 @@ class AbstractNetwork(nn.Module, ABC):
         """Ticks ahead at which the loss reads future inputs: the ends of the segments, if any."""
         return ()
 
+    @property
+    def feature_size(self) -> int:
+        """Number of features of each target in `Modes.features`."""
+        return self.config.features
+
     @abstractmethod
     def forward(self, batch: Batch) -> Modes:
         """Returns the modes of every target."""
@@ -189,6 +206,19 @@ class AbstractNetwork(nn.Module, ABC):
             label: Recorded positions in the targets' frames; read by `oracle` only.
         """
         del chaining, label
+        return self(batch)
+
+    def all_chains(self, batch: Batch) -> Modes:
+        """Returns all chains of segments, over as many segments as `MAX_CHAINS` allows.
+
+        Networks that predict the whole horizon at once return their modes.
+
+        Args:
+            batch: Inputs.
+
+        Returns:
+            The chains, of at most the horizon, with logits.
+        """
         return self(batch)
 
     def calibrated(
@@ -254,7 +284,12 @@ class AbstractNetwork(nn.Module, ABC):
             [modes.logits + functional.logsigmoid(-logit), functional.logsigmoid(logit)], dim=1
         )
         actions = None if modes.actions is None else torch.cat([modes.actions, stops], dim=1)
-        return Modes(torch.cat([modes.states, states], dim=1), log_probs, actions)
+        return modes._replace(
+            states=torch.cat([modes.states, states], dim=1),
+            logits=log_probs,
+            actions=actions,
+            standing=None,
+        )
 
     @torch.inference_mode()
     def forecast(
@@ -289,6 +324,7 @@ class AbstractNetwork(nn.Module, ABC):
             actions=None if modes.actions is None else modes.actions.numpy(),
             log_probs=modes.logits.numpy(),
             valid=np.ones(len(local), dtype=bool),
+            features=None if modes.features is None else modes.features.numpy(),
         )
 
     def loss(self, modes: Modes, labels: Labels, progress: TrainingProgress) -> dict[str, Tensor]:
@@ -312,10 +348,19 @@ class AbstractNetwork(nn.Module, ABC):
         """The terms of the loss in training by name; `loss` is their weighted sum."""
         return self.loss(self(batch), labels, progress)
 
-    def features(self, batch: Batch, labels: Labels) -> Features | None:
-        """Features at the end of the first segment; None if the network predicts no features."""
-        del batch, labels
-        return None
+    def validate(
+        self, modes: Modes, batch: Batch, labels: Labels, progress: TrainingProgress
+    ) -> Validation:
+        """The loss of a forecast with the terms and weights of the training, and the features.
+
+        Args:
+            modes: The forecast, which is made without the labels.
+            batch: Inputs.
+            labels: Labels.
+            progress: How far the training has come; its `share` is 1.
+        """
+        del batch
+        return Validation(self.loss(modes, labels, progress))
 
     def after_step(self) -> None:
         """Called after every step of the optimiser."""

@@ -2,24 +2,33 @@
 
 The encoder φ maps the observation to features z. The feature predictor ψ maps z and the past
 actions to the features ẑ at the end of the next segment (equation 15). The action predictor γ maps
-z, ẑ and the past actions to the actions of that segment (equation 18). In training the observation
+z, ẑ and the past actions to the actions of that segment (equation 18), as a GRU in one of the two
+readings of `predictors.models.heads` (`decoder`). In training the observation
 at the end of the segment is encoded too (equation 16); the action reconstructor ξ maps both encoded
 features to the past actions (equation 13), and γ runs on the encoded and on the predicted features.
-A forecast has only the predicted ones, so validation uses those. The loss is L_SSP (equation 20).
-Longer horizons chain segments, see `predictors.models.chaining`.
+A forecast has only the predicted ones, so validation uses those. The loss is L_SSP (equation 20);
+its terms have the weights w1 (reconstruction of the past actions), w2 (mismatch of the features),
+w3 (regression) and w4 (classification), in validation as in training. Longer horizons chain
+segments, see `predictors.models.chaining`.
 
-Choices that the paper leaves open: the future observation is rendered in the target's pose at the
-end of the segment; features pass a LayerNorm before ψ and γ; a linear layer follows ψ, since
-features are unbounded; the loss is the mean over both branches and over the segments; a later
-segment is predicted from what is available at inference, the predicted features and the actions of
-the matched mode.
+Choices that the paper leaves open: the actions of w1 are normalised, in units of the action range
+(99.9th percentiles of the training data), so that acceleration and steering count alike; the future
+observation is rendered in the target's pose at the end of the segment; features pass a LayerNorm
+before ψ and γ; a linear layer follows ψ, since features are unbounded; the loss is the mean over
+both branches and over the segments; a later segment is predicted from what is available at
+inference, the predicted features and the actions of the matched mode.
+
+In the paper the past and the segments have the same length ("the same T-step time interval for all
+the past and future values", section IV-D), 3 s. Here `segment_s` may differ from the history: γ and
+ψ always read the last h actions before a segment, which are recorded ones as far as the segments
+before it do not reach back that far, and ξ reconstructs the last h actions before the segment. A
+horizon has as many segments as fit: the whole horizon in one segment is possible, too.
 
 Options that differ from the paper; the recipe `paper` leaves them off: `normalise`,
 `stop_gradient`, `ema`, `skip`, `hidden`, `scheduled`, `annealed`, `kept`, and, for an ablation,
 `encoded_branch`.
 
-Dimensions: n targets, m modes, k chains, t ticks of a segment (as many as of the history), z
-features.
+Dimensions: n targets, m modes, k chains, h past ticks, t ticks of a segment, z features.
 """
 
 import copy
@@ -36,9 +45,18 @@ from asp_env.dynamics import clip_actions, inverse
 from asp_env.dynamics.bicycle import Integrator
 from asp_env.errors import AspEnvError
 from predictors.models.batch import Batch, Labels
-from predictors.models.chaining import Chaining, Chains, chains_to_extend, extend, merge, prune
+from predictors.models.chaining import (
+    MAX_CHAINS,
+    Chaining,
+    Chains,
+    chains_to_extend,
+    extend,
+    merge,
+    prune,
+    segment_ticks,
+)
 from predictors.models.encoders import make_encoder
-from predictors.models.heads import ConnectedHead, RecurrentReader
+from predictors.models.heads import ConnectedHead, Decoder, RecurrentReader, UnrolledDecoder
 from predictors.models.losses import (
     HUBER_M,
     best_mode,
@@ -54,6 +72,7 @@ from predictors.models.network import (
     NetworkConfig,
     NetworkShape,
     TrainingProgress,
+    Validation,
     rollout_from,
     rollout_from_now,
     start_states,
@@ -67,6 +86,10 @@ RECONSTRUCTOR = (256, 128, 64)
 class SSPASPConfig(NetworkConfig):
     """Options of SSP-ASP; the defaults are the paper's."""
 
+    segment_s: float = 3.0
+    """Length of the segments that are chained, seconds; 3 s in the paper."""
+    decoder: Decoder = "read"
+    """How γ makes actions, see `heads.Decoder`."""
     gru_width: int = 512
     gru_layers: int = 2
     skip: bool = False
@@ -125,8 +148,8 @@ class SegmentInput(NamedTuple):
 
     z: Float[Tensor, "n z"]
     """Features at the start of the segment."""
-    past: Float[Tensor, "n t 2"]
-    """Actions of the segment before, in units of the action range."""
+    past: Float[Tensor, "n h 2"]
+    """The last actions before the segment, in units of the action range."""
     start: Float[Tensor, "n 4"]
     """State at the start of the segment, in the target's frame now."""
     length_m: Float[Tensor, " n"]
@@ -134,26 +157,27 @@ class SegmentInput(NamedTuple):
 
 @final
 class SSPASPNetwork(AbstractNetwork):
-    """φ (`encoder`), ψ (`forward_*`), ξ (`reconstructor`), γ (`reader`, `head`), the bicycle model.
+    """φ (`encoder`), ψ (`forward_*`), ξ (`reconstructor`), γ and the bicycle model.
 
-    φ maps the observation to z (n, z); ψ maps z and the past actions (n, t, 2) to ẑ (n, z); γ maps
+    γ is `reader` and `head`, or `decoder` if it is unrolled.
+
+    φ maps the observation to z (n, z); ψ maps z and the past actions (n, h, 2) to ẑ (n, z); γ maps
     [z, ẑ] (n, 2z) and the past actions to actions (n, m, t, 2) and logits (n, m); ξ maps two
-    encoded features (n, 2z) to the past actions (n, t, 2).
+    encoded features (n, 2z) to the past actions (n, h, 2).
     """
 
     def __init__(self, config: SSPASPConfig, shape: NetworkShape) -> None:
         """Initialises the weights at random.
 
         Raises:
-            AspEnvError: The horizon is not a whole number of segments as long as the history.
+            AspEnvError: The horizon is not a whole number of segments, or a segment not one of
+                ticks.
         """
         super().__init__(config, shape)
         self._options = config
-        if shape.horizon % shape.history:
-            raise AspEnvError(
-                f"ssp-asp chains segments of {shape.history * shape.dt_s:g} s, the horizon of "
-                f"{shape.horizon * shape.dt_s:g} s is no whole number of them"
-            )
+        self._segment_ticks = segment_ticks(
+            config.segment_s, horizon_s=shape.horizon * shape.dt_s, dt_s=shape.dt_s
+        )
         z, width = config.features, config.gru_width
         self.encoder = make_encoder(config.encoder, shape, z)
         self.target_encoder = copy.deepcopy(self.encoder) if config.ema else None
@@ -166,17 +190,37 @@ class SSPASPNetwork(AbstractNetwork):
         for before, after in zip((2 * z, *RECONSTRUCTOR), RECONSTRUCTOR, strict=False):
             layers += [nn.Linear(before, after), nn.ReLU(inplace=True)]
         self.reconstructor = nn.Sequential(*layers, nn.Linear(RECONSTRUCTOR[-1], 2 * shape.history))
-        self.reader = RecurrentReader(2 * z, width, config.gru_layers)
-        if config.skip:
-            width += 2 * z + 1 + 2 * shape.history
-        self.head = ConnectedHead(width, config.hidden, modes=config.modes, ticks=shape.history)
+        skipped = 2 * z + 1 + 2 * shape.history if config.skip else 0
+        self.reader: RecurrentReader | None = None
+        self.head: ConnectedHead | None = None
+        self.decoder: UnrolledDecoder | None = None
+        if config.decoder == "unrolled":
+            self.decoder = UnrolledDecoder(
+                2 * z,
+                width,
+                config.gru_layers,
+                modes=config.modes,
+                static=skipped,
+                hidden=config.hidden,
+            )
+        else:
+            self.reader = RecurrentReader(2 * z, width, config.gru_layers)
+            self.head = ConnectedHead(
+                width + skipped, config.hidden, modes=config.modes, ticks=self._segment_ticks
+            )
         # A weight: a run that starts from another run is validated with that run's temperature.
         self.register_buffer("merging_temperature", torch.ones(()) if config.kept else None)
 
     @property
     def later_ticks(self) -> tuple[int, ...]:
         """The ends of all segments."""
-        return tuple(range(self.shape.history, self.shape.horizon + 1, self.shape.history))
+        step = self._segment_ticks
+        return tuple(range(step, self.shape.horizon + 1, step))
+
+    @property
+    def feature_size(self) -> int:
+        """Number of features of z and ẑ, the latter at the end of the first segment."""
+        return 2 * self.config.features
 
     def forward(self, batch: Batch) -> Modes:
         """Returns the modes of every target; segments are chained by beam."""
@@ -186,19 +230,40 @@ class SSPASPNetwork(AbstractNetwork):
         self, batch: Batch, chaining: Chaining, label: Float[Tensor, "n t 2"] | None = None
     ) -> Modes:
         """Returns the modes of every target; see the base class."""
+        return self._chain(batch, chaining, label, segments=len(self.later_ticks))
+
+    def all_chains(self, batch: Batch) -> Modes:
+        """Returns all chains of the first segments; see the base class."""
+        segments = len(self.later_ticks)
+        while segments > 1 and self.config.modes**segments > MAX_CHAINS:
+            segments -= 1
+        return self._chain(batch, "full", None, segments=segments)
+
+    def _chain(
+        self,
+        batch: Batch,
+        chaining: Chaining,
+        label: Float[Tensor, "n t 2"] | None,
+        *,
+        segments: int,
+    ) -> Modes:
+        """The modes over the first segments."""
         z = self.encode(batch)
         with torch.autocast(z.device.type, enabled=False):
             past = self.scaled_actions(batch.actions)
             chains = self._segment(SegmentInput(z, past, start_states(batch), batch.length_m))
+            features = torch.cat([z, chains.z[:, 0]], dim=1)  # ẑ, equal for all modes
             chains = self._reduce(chains, chaining, batch)
-            for _ in self.later_ticks[1:]:
+            for _ in range(segments - 1):
                 chains = chains_to_extend(
                     chains, chaining, label=label, assignment=self.config.assignment
                 )
                 chains = extend(chains, self._next_segment(chains, batch))
                 chains = self._reduce(chains, chaining, batch)
             standing = self.standing_logit(self.norm(z), batch)
-        return Modes(chains.states, chains.log_probs, chains.actions, standing)
+        return Modes(
+            chains.states, chains.log_probs, chains.actions, features=features, standing=standing
+        )
 
     def encode(self, batch: Batch) -> Float[Tensor, "n z"]:
         """φ: the features of the observation."""
@@ -222,11 +287,18 @@ class SSPASPNetwork(AbstractNetwork):
             Actions, states and logits.
         """
         context = torch.cat([self.norm(inputs.z), self.norm(z_next)], dim=-1)
-        readings = [self.reader(context, inputs.past)]
+        static: list[Tensor] = []
         if self._options.skip:
             speed = inputs.start[:, 3:] / self.get_buffer("motion_scale")[0]
-            readings += [context, inputs.past.flatten(1), speed]
-        outputs, logits = self.head(torch.cat(readings, dim=-1))
+            static = [context, inputs.past.flatten(1), speed]
+        if self.decoder is not None:
+            skipped = torch.cat(static, dim=-1) if static else None
+            outputs, logits = self.decoder(context, inputs.past, self._segment_ticks, skipped)
+        else:
+            assert self.reader is not None
+            assert self.head is not None
+            reading = self.reader(context, inputs.past)
+            outputs, logits = self.head(torch.cat([reading, *static], dim=-1))
         actions = self.bounded_actions(outputs)
         start = inputs.start[:, None].expand(-1, actions.shape[1], -1)
         states = rollout_from(
@@ -242,28 +314,30 @@ class SSPASPNetwork(AbstractNetwork):
         with torch.autocast(batch.actions.device.type, enabled=False):
             segments = list(self._terms(batch, labels, progress, encoded, targets))
             standing = self.standing_logit(self.norm(encoded[0]), batch)
-        terms = {name: torch.stack([s[name] for s in segments]).mean() for name in segments[0]}
+        terms = _means(segments)
         if standing is not None and not progress.pretraining:
             terms["standing"] = standing_loss(standing, labels.states)
-        weights = {
-            "actions": self._options.action_weight,
-            "features": self._options.feature_weight,
-            "regression": self._options.regression_weight,
-            "classification": self._options.classification_weight,
-            "standing": 1.0,
-        }
-        total = torch.stack([weights[name] * value for name, value in terms.items()]).sum()
-        return {"loss": total, **terms}
+        return self._weighted(terms)
 
-    def features(self, batch: Batch, labels: Labels) -> Features | None:
-        """Encoded and predicted features at the end of the first segment."""
-        z = self.encode(batch)
-        inputs = SegmentInput(
-            z, self.scaled_actions(batch.actions), start_states(batch), batch.length_m
-        )
-        with torch.autocast(z.device.type, enabled=False):
-            predicted = self.predict_features(inputs)
-        return Features(self.encode(labels.later[0]), predicted)
+    def validate(
+        self, modes: Modes, batch: Batch, labels: Labels, progress: TrainingProgress
+    ) -> Validation:
+        """L_SSP (equation 20) of a forecast, and the features at the end of the first segment.
+
+        The terms of w1 and w2 are those of the training, along the recorded actions; those of w3
+        and w4, and that of the standing mode, are of the forecast and missing in pre-training.
+        """
+        encoded, targets = self._encode_all(batch, labels)
+        of_features = progress._replace(pretraining=True)
+        with torch.autocast(batch.actions.device.type, enabled=False):
+            terms = _means(list(self._terms(batch, labels, of_features, encoded, targets)))
+            past = self.scaled_actions(batch.actions)
+            inputs = SegmentInput(encoded[0], past, start_states(batch), batch.length_m)
+            features = Features(encoded[1], self.predict_features(inputs))
+        if not progress.pretraining:
+            of_modes = self.loss(modes, labels, progress)
+            terms |= {name: value for name, value in of_modes.items() if name != "loss"}
+        return Validation(self._weighted(terms), features)
 
     def after_step(self) -> None:
         """Updates the second encoder, if there is one: averages weights, copies buffers."""
@@ -276,6 +350,18 @@ class SSPASPNetwork(AbstractNetwork):
             for follower, leader in zip(followers.buffers(), leaders.buffers(), strict=True):
                 follower.copy_(leader)
 
+    def _weighted(self, terms: dict[str, Tensor]) -> dict[str, Tensor]:
+        """The terms, and `loss`, their sum with the weights w1 to w4 (standing mode: 1)."""
+        weights = {
+            "actions": self._options.action_weight,
+            "features": self._options.feature_weight,
+            "regression": self._options.regression_weight,
+            "classification": self._options.classification_weight,
+            "standing": 1.0,
+        }
+        total = torch.stack([weights[name] * value for name, value in terms.items()]).sum()
+        return {"loss": total, **terms}
+
     def _segment(self, inputs: SegmentInput) -> Chains:
         """One segment as in a forecast, on predicted features."""
         z_next = self.predict_features(inputs)
@@ -286,10 +372,13 @@ class SSPASPNetwork(AbstractNetwork):
     def _next_segment(self, chains: Chains, batch: Batch) -> Chains:
         """The segment that follows each chain, (n, k·m) rows."""
         n, k = chains.log_probs.shape
-        recent = chains.actions[:, :, -self.shape.history :].flatten(0, 1)
+        done, history = chains.actions, self.shape.history
+        if done.shape[2] < history:
+            recorded = batch.actions[:, None].expand(-1, k, -1, -1)
+            done = torch.cat([recorded, done], dim=2)
         inputs = SegmentInput(
             chains.z.flatten(0, 1),
-            self.scaled_actions(recent),
+            self.scaled_actions(done[:, :, -history:].flatten(0, 1)),
             chains.states[:, :, -1].flatten(0, 1),
             batch.length_m.repeat_interleave(k),
         )
@@ -399,7 +488,7 @@ class SSPASPNetwork(AbstractNetwork):
         )
         z_next = torch.cat([b[1] for b in branches])
         actions, states, logits = self.predict_actions(inputs, z_next)
-        ticks = self.shape.history
+        ticks = self._segment_ticks
         label = labels.states[:, number * ticks : (number + 1) * ticks].repeat(len(branches), 1, 1)
         positions, truth = states[..., :2], label[..., :2]
         if number:
@@ -421,9 +510,10 @@ class SSPASPNetwork(AbstractNetwork):
             # The order of a batch is random, so its first rows are a random share of it.
             free = rows % len(labels.states) < progress.share * len(labels.states)
             continued = torch.where(free, logits.argmax(dim=1), continued)
+        done = torch.cat([inputs.past, self.scaled_actions(actions[rows, continued])], dim=1)
         end = SegmentInput(
             z_next,
-            self.scaled_actions(actions[rows, continued]),
+            done[:, -self.shape.history :],
             states[rows, continued, -1],
             inputs.length_m,
         )
@@ -432,3 +522,8 @@ class SSPASPNetwork(AbstractNetwork):
 
     def _normalised(self, z: Float[Tensor, "n z"]) -> Float[Tensor, "n z"]:
         return functional.layer_norm(z, z.shape[1:]) if self._options.normalise else z
+
+
+def _means(segments: Sequence[dict[str, Tensor]]) -> dict[str, Tensor]:
+    """The mean of each term over the segments."""
+    return {name: torch.stack([each[name] for each in segments]).mean() for name in segments[0]}

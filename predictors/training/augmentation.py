@@ -104,9 +104,9 @@ def one_situation_each(scene: Scene) -> Scene:
     of_target, slots = scene.targets.T
     names = ("states", "actions", "valid", "sizes", "classes", "ids", "tick", "map_index")
     arrays = {name: getattr(scene, name)[of_target] for name in (*names, "route", "route_valid")}
-    return dataclasses.replace(
-        scene, targets=np.stack([np.arange(len(slots)), slots], axis=-1), **arrays
-    )
+    signals = None if scene.signals is None else scene.signals.of_situations(of_target)
+    targets = np.stack([np.arange(len(slots)), slots], axis=-1)
+    return dataclasses.replace(scene, targets=targets, signals=signals, **arrays)
 
 
 def measured_again(

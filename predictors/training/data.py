@@ -8,7 +8,7 @@ from typing import final
 import numpy as np
 from jaxtyping import Bool, Int, Shaped
 
-from asp_env.data.causal import causal_histories
+from asp_env.data.histories import histories
 from asp_env.data.recording import Recording
 from asp_env.data.snippets import SnippetIndex, gather_future, gather_present, index_snippets
 from asp_env.data.source import Recordings, join_data, open_data
@@ -171,9 +171,7 @@ class DatasetSplit:
 
     def histories(self, config: TrainingConfig) -> Sequence[Recording]:
         """The recordings as inputs show them, as `history` of the configuration says."""
-        if config.history == "causal":
-            return causal_histories(self.recordings)
-        return self.recordings
+        return histories(self.recordings, config.history)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -352,7 +350,13 @@ def _chunks(snippets: SnippetIndex) -> Iterator[SnippetIndex]:
 
 def snippets_of(recordings: Recordings, config: TrainingConfig) -> SnippetIndex:
     """All snippets of recordings, as the configuration needs them."""
-    return index_snippets(recordings, dt_s=config.dt_s, horizon_s=config.horizon_s)
+    return index_snippets(
+        recordings,
+        dt_s=config.dt_s,
+        horizon_s=config.horizon_s,
+        history_s=config.history_s,
+        parked=config.parked,
+    )
 
 
 def _split(

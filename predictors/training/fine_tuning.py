@@ -63,8 +63,9 @@ from predictors.training.data import (
     open_training_data,
     snippets_of,
 )
-from predictors.training.fitting import add_features, torch_threads, versions
+from predictors.training.fitting import add_features, versions
 from predictors.training.recipes import TrainingConfig
+from predictors.training.trainer import threads
 
 FINE_TUNED = "fine-tuned"
 """What follows the name of the recipe, as the name of a variant does."""
@@ -195,7 +196,7 @@ def fine_tune_on(
             data.validation.batches(size=VALIDATION_BATCH, config=as_recorded, **settings),
             own=own,
         )
-        with torch_threads(config.threads):
+        with threads(config.threads):
             course.run()
         share, errors = course.average(before.network)
         temperature = read_config(start)["temperature"]

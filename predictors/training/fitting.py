@@ -5,8 +5,8 @@ import dataclasses
 import json
 import platform
 import shutil
-from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager, nullcontext
+from collections.abc import Callable, Sequence
+from contextlib import nullcontext
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any
@@ -16,9 +16,10 @@ import torch
 from safetensors.torch import load_file
 
 from asp_env import registry
+from asp_env.data.recording import ticks
 from asp_env.data.source import join_data
 from asp_env.errors import AspEnvError
-from asp_env.views import make_view
+from asp_env.views import make_view, with_history
 from predictors.inference.calibration import calibrate
 from predictors.inference.checkpoint import (
     CONFIG,
@@ -30,6 +31,7 @@ from predictors.inference.checkpoint import (
     write_json,
 )
 from predictors.inference.fit_features import feature_distance_of
+from predictors.training.budgets import COSTS
 from predictors.training.data import (
     VALIDATION_BATCH,
     DatasetSplit,
@@ -39,19 +41,16 @@ from predictors.training.data import (
     open_training_data,
 )
 from predictors.training.data_loading import batch_workers
-from predictors.training.initial_weights import InitialWeights
+from predictors.training.initial_weights import InitialWeights, file_hash
 from predictors.training.lightning_parts import BestCheckpoint, EpochLogger, TrainingModule
-from predictors.training.recipes import SEGMENT_S, TrainingConfig
-from predictors.training.trainer import LOGS, Hardware, SafetensorsIO, make_trainer, quiet
+from predictors.training.recipes import TrainingConfig
+from predictors.training.trainer import LOGS, Hardware, SafetensorsIO, make_trainer, quiet, threads
 
 RUN = "run.json"
 """File of an unfinished run's configuration and data hash."""
 
 STATE = "unfinished"
 """Folder of an unfinished run's state."""
-
-FIRST_STAGE = "3s"
-"""Folder of the run for 3 s that a run for a longer horizon starts from."""
 
 ONE_PROCESS = Hardware()
 
@@ -117,12 +116,14 @@ def train_on(
     if chosen.validation_hash is not None:
         run["validation_hash"] = chosen.validation_hash
     spec: PredictorSpec = registry.find("predictors", config.predictor)
-    view = make_view(config.view, pixels=config.pixels)
+    history = ticks(config.history_s, config.dt_s)
+    view = with_history(make_view(config.view, pixels=config.pixels), history)
     initial = None
     if start is not None:
         initial = InitialWeights.read(start, spec, view=view, dt_s=config.dt_s)
         run["start"] = initial.weights_hash
-    resumed = _resumes(out, run, staged=start == out / FIRST_STAGE)
+    first_stage = first_stage_folder(config, out)
+    resumed = _resumes(out, run, first_stage=first_stage if start == first_stage else None)
 
     training = chosen.training
     if initial is None or initial.action_range is None:
@@ -131,7 +132,7 @@ def train_on(
         scale = initial.action_range
     shape = shape_for(
         view,
-        history=training.snippets.history,
+        history=history,
         horizon=training.snippets.horizon_ticks,
         dt_s=config.dt_s,
         action_range=scale,
@@ -189,6 +190,7 @@ def train_on(
                 "validation": len(chosen.validation.snippets),
             },
             "not_started": not_loaded,
+            "trained_epochs": best.last_epoch + 1 - config.pretraining_epochs,
             "best_epoch": best.best_epoch,
             "best_value": best.best_value,
             "processes": trainer.world_size,
@@ -225,16 +227,17 @@ def train_stages(
     start: Path | None = None,
     hardware: Hardware = ONE_PROCESS,
 ) -> Path:
-    """Trains in stages: a run for more than 3 s starts from a run for 3 s in `out/3s`.
+    """Trains in stages: a long run starts from a run for one segment, or for 3 s, within `out`.
 
-    The first stage is trained if it is missing.
+    The first stage, such as `out/3s`, is trained if it is missing and the horizon is longer.
 
     Args:
         config_for: Maps a horizon in seconds to the configuration.
         horizon_s: The horizon of the predictor.
         data: One or several DATA, as `open_data` takes them.
         out: The run's folder.
-        start: Where to start from instead of a first stage.
+        start: The folder of a finished run to start from instead of a first stage, or a file of
+            ResNet18 weights, which the first stage starts from.
         hardware: Devices and nodes.
 
     Returns:
@@ -244,33 +247,62 @@ def train_stages(
         AspEnvError: As `train`, or the first stage is of another configuration or other data.
     """
     config = config_for(horizon_s)
-    if start is None and horizon_s > SEGMENT_S:
-        start, first = out / FIRST_STAGE, config_for(SEGMENT_S)
-        if (start / CONFIG).exists():
-            _check_first_stage(start, first, data)
+    if horizon_s > config.first_stage_s and (start is None or start.is_file()):
+        stage, first = first_stage_folder(config, out), config_for(config.first_stage_s)
+        if (stage / CONFIG).exists():
+            _check_first_stage(stage, first, data, start)
         else:
-            train(first, data, start, hardware=hardware)
+            open_training_data(config, data)  # too short for the horizon: before the first stage
+            train(first, data, stage, start=start, hardware=hardware)
+        start = stage
     return train(config, data, out, start=start, hardware=hardware)
 
 
-def _check_first_stage(start: Path, config: TrainingConfig, data: str | Sequence[str]) -> None:
-    """Refuses a first stage of other data, possibly the test recordings, or another recipe."""
-    provenance = read_config(start).get("provenance", {})
+def first_stage_folder(config: TrainingConfig, out: Path) -> Path:
+    """Folder of the run that a run in two stages starts from."""
+    return out / f"{config.first_stage_s:g}s"
+
+
+def _check_first_stage(
+    stage: Path, config: TrainingConfig, data: str | Sequence[str], start: Path | None
+) -> None:
+    """Refuses a first stage of other data, possibly the test recordings, recipe or start."""
+    provenance = read_config(stage).get("provenance", {})
     expected = {
         "config": json.loads(json.dumps(dataclasses.asdict(config))),
         "data_hash": join_data(open_all(data)).data_hash(),
+        "start": None if start is None else file_hash(start),
     }
     if other := [name for name, value in expected.items() if provenance.get(name) != value]:
         raise AspEnvError(
-            f"{start} holds a finished run of another {' and '.join(other)}: delete it to train it "
+            f"{stage} holds a finished run of another {' and '.join(other)}: delete it to train it "
             "again, or name it by --start"
         )
 
 
-def _resumes(out: Path, run: dict[str, Any], *, staged: bool) -> bool:
-    """Whether the folder holds this run unfinished; False if it is new or empty."""
+def check_folder(out: Path, *, first_stage: Path | None) -> None:
+    """Refuses a folder that no run can begin or continue in.
+
+    Args:
+        out: The folder, which may be missing.
+        first_stage: The folder of a first stage that it may hold.
+
+    Raises:
+        AspEnvError: It holds a finished run, or something that is no run.
+    """
     if (out / CONFIG).exists():
         raise AspEnvError(f"{out} holds a finished run: give another --out, or delete it")
+    if (out / STATE / RUN).exists():
+        return
+    # An interruption right after the folder was made leaves it without `run.json`.
+    allowed = {out / COSTS, out / STATE, first_stage}
+    if out.exists() and (not out.is_dir() or any(each not in allowed for each in out.iterdir())):
+        raise AspEnvError(f"{out} holds something that is no run: give another --out")
+
+
+def _resumes(out: Path, run: dict[str, Any], *, first_stage: Path | None) -> bool:
+    """Whether the folder holds this run unfinished; False if it is new or empty."""
+    check_folder(out, first_stage=first_stage)
     if (out / STATE / RUN).exists():
         try:
             stored = json.loads((out / STATE / RUN).read_text())
@@ -282,12 +314,6 @@ def _resumes(out: Path, run: dict[str, Any], *, staged: bool) -> bool:
                 "give another --out, or delete it"
             )
         return True
-    # An interruption right after the folder was made leaves it without `run.json`.
-    allowed = (FIRST_STAGE, STATE) if staged else (STATE,)
-    if out.exists() and (
-        not out.is_dir() or any(each.name not in allowed for each in out.iterdir())
-    ):
-        raise AspEnvError(f"{out} holds something that is no run: give another --out")
     return False
 
 
@@ -295,19 +321,8 @@ def _fit(trainer: pl.Trainer, module: TrainingModule, state: Path, hardware: Har
     _retain_freed_memory()
     if hardware.compiled:
         module.network.get_submodule("encoder").compile()
-    with quiet(), torch_threads(module.config.threads):
+    with quiet(), threads(module.config.threads):
         trainer.fit(module, ckpt_path=str(state) if state.exists() else None)
-
-
-@contextmanager
-def torch_threads(count: int | None) -> Iterator[None]:
-    """Limits the threads of torch's operations in a `with` block; None for its default."""
-    before = torch.get_num_threads()
-    torch.set_num_threads(before if count is None else count)
-    try:
-        yield
-    finally:
-        torch.set_num_threads(before)
 
 
 def _epochs_done(state: Path) -> int:

@@ -1,15 +1,15 @@
 """Weights that a run starts from instead of random ones."""
 
 import hashlib
-import json
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 from torch import Tensor
 
 from asp_env.data.split import TrainedOn
-from asp_env.errors import CheckpointError
-from asp_env.views import SceneView
+from asp_env.errors import AspEnvError, CheckpointError
+from asp_env.views import SceneView, view_from_config
 from predictors.inference.checkpoint import WEIGHTS, PredictorSpec, read_config, read_weights
 from predictors.models.encoders import load_resnet18
 from predictors.models.network import AbstractNetwork
@@ -45,9 +45,12 @@ class InitialWeights:
                 step.
         """
         if path.is_file():
-            digest = hashlib.sha256(path.read_bytes()).hexdigest()
             return cls(
-                path=path, weights_hash=digest, action_range=None, weights=None, trained_on=None
+                path=path,
+                weights_hash=file_hash(path),
+                action_range=None,
+                weights=None,
+                trained_on=None,
             )
         config = read_config(path)
         if config["predictor"] != spec.name:
@@ -56,7 +59,7 @@ class InitialWeights:
                 "start from"
             )
         # Rasters of the same size may show other things: the weights would fit, and be wrong.
-        if config.get("view") != json.loads(json.dumps(view.config())):
+        if not _is_view(config.get("view"), view):
             raise CheckpointError(
                 f"{path} has another view than this run: start from one of the same"
             )
@@ -73,10 +76,9 @@ class InitialWeights:
             raise CheckpointError(
                 f"{path} does not name its normaliser and its training data: train again"
             ) from error
-        digest = hashlib.sha256((path / WEIGHTS).read_bytes()).hexdigest()
         return cls(
             path=path,
-            weights_hash=digest,
+            weights_hash=file_hash(path / WEIGHTS),
             action_range=scale,
             weights=weights,
             trained_on=trained_on,
@@ -112,3 +114,16 @@ class InitialWeights:
             )
         network.load_state_dict(fitting, strict=False)
         return sorted(set(own) - set(fitting))
+
+
+def _is_view(config: Any, view: SceneView) -> bool:
+    """Whether a stored configuration, which may lack newer options, describes a view."""
+    try:
+        return view_from_config(config) == view
+    except (AspEnvError, AttributeError, TypeError, ValueError):
+        return False
+
+
+def file_hash(path: Path) -> str:
+    """The SHA-256 of a file of weights."""
+    return hashlib.sha256(path.read_bytes()).hexdigest()

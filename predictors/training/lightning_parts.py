@@ -1,6 +1,8 @@
 """What Lightning runs: the training module, its callbacks, and the statistics of features.
 
-The learning-rate schedules are `plateau`, which is the paper's, and `one-cycle`.
+The learning-rate schedules are `plateau`, which is the paper's, and `one-cycle`. In pre-training
+the validation loss is that of the features alone, and there is no validation error, since the
+forecast does not learn.
 """
 
 import math
@@ -24,7 +26,7 @@ from predictors.models.losses import ANNEAL_UNTIL
 from predictors.models.network import AbstractNetwork, Features, TrainingProgress
 from predictors.training.data import Batches, epoch_rows
 from predictors.training.recipes import TrainingConfig
-from predictors.training.trainer import gathered, share_buffers
+from predictors.training.trainer import gathered, share_buffers, stage_of
 
 SELECTED_BY = "validation FDE moving"
 """FDE of the most probable mode over moving targets, metres: the epoch with the lowest is the
@@ -94,7 +96,8 @@ class TrainingModule(pl.LightningModule):
         self._feature_statistics = FeatureStatistics()
         count = len(training.snippets)
         self._per_epoch = min(config.snippets_per_epoch or count, count)
-        self._steps = config.all_epochs * -(-self._per_epoch // config.batch_size)
+        self._steps_per_epoch = -(-self._per_epoch // config.batch_size)
+        self._steps = config.all_epochs * self._steps_per_epoch
 
     def train_dataloader(self) -> Iterable[tuple[Batch, Labels]]:
         """This process's shard of the current epoch's batches; called before each epoch."""
@@ -156,16 +159,27 @@ class TrainingModule(pl.LightningModule):
             scheduler.step()
 
     @property
+    def is_pretraining(self) -> bool:
+        """Whether the current epoch is one of pre-training."""
+        return self.current_epoch < self.config.pretraining_epochs
+
+    @property
     def is_selectable(self) -> bool:
         """Whether the current epoch may be the result of the run.
 
         It may not in pre-training, nor while annealing lets several modes learn from a label.
         """
         if self.config.network.annealed:
-            ended = (self.current_epoch + 1) / self.config.all_epochs
+            ended = self._progress((self.current_epoch + 1) * self._steps_per_epoch)
             if ended <= ANNEAL_UNTIL and ended < 1:
                 return False
-        return self.current_epoch >= self.config.pretraining_epochs
+        return not self.is_pretraining
+
+    def _progress(self, steps: int) -> float:
+        """Share of the steps of the progress epochs that is over after some steps of the run."""
+        epochs = self.config.progress_epochs or self.config.epochs
+        before = self.config.pretraining_epochs * self._steps_per_epoch
+        return min(1.0, max(0, steps - before) / (epochs * self._steps_per_epoch))
 
     def step_plateau(self, loss: float) -> None:
         """Steps the schedule `plateau` with an epoch's validation loss; ignores other schedules."""
@@ -180,8 +194,10 @@ class TrainingModule(pl.LightningModule):
             AspEnvError: It is not finite in one of the processes.
         """
         batch, labels = sample
-        pretraining = self.current_epoch < self.config.pretraining_epochs
-        progress = TrainingProgress(share=self.global_step / self._steps, pretraining=pretraining)
+        progress = TrainingProgress(
+            share=self._progress(self.global_step),
+            pretraining=self.is_pretraining,
+        )
         terms: dict[str, Tensor] = self.network.training_loss(batch, labels, progress)
         finite = bool(torch.isfinite(terms["loss"]))
         if not self.trainer.strategy.reduce_boolean_decision(finite):
@@ -209,8 +225,8 @@ class TrainingModule(pl.LightningModule):
         batch, labels = sample
         modes = self.network(batch)
         own = self._validation.num_own(batch_idx)
-        terms: dict[str, Tensor] = self.network.loss(modes, labels, TrainingProgress())
-        features = self.network.features(batch, labels)
+        progress = TrainingProgress(pretraining=self.is_pretraining)
+        terms, features = self.network.validate(modes, batch, labels, progress)
         self._feature_statistics.add(features and Features(*(each[:own] for each in features)))
         truth = labels.states[..., :2].cpu().numpy()
         valid = np.ones(truth.shape[:2], dtype=bool)
@@ -230,7 +246,10 @@ class TrainingModule(pl.LightningModule):
         self._target_errors.append({name: array[:own] for name, array in values.items()})
 
     def on_validation_epoch_end(self) -> None:
-        """Logs the loss, and the mean errors over the subset `moving`; over all if none moves."""
+        """Logs the loss, and the mean errors over the subset `moving`; over all if none moves.
+
+        There are no errors in pre-training.
+        """
         own = {
             name: np.concatenate([each[name] for each in self._target_errors])
             for name in self._target_errors[0]
@@ -244,8 +263,9 @@ class TrainingModule(pl.LightningModule):
         self._target_errors.clear()
         rows = joined["moving"] if joined["moving"].any() else np.ones_like(joined["moving"])
         values[VALIDATION_LOSS] = float(joined["loss"].mean())
-        values[SELECTED_BY] = float(joined["most-probable"][rows].mean())
-        values[f"{SELECTED_BY} best of 3"] = float(joined["best-of-3"][rows].mean())
+        if not self.is_pretraining:
+            values[SELECTED_BY] = float(joined["most-probable"][rows].mean())
+            values[f"{SELECTED_BY} best of 3"] = float(joined["best-of-3"][rows].mean())
         # What decides must be equal bit for bit in all processes, on any machines.
         values = self.trainer.strategy.broadcast(values)
         for name, value in values.items():
@@ -259,7 +279,11 @@ class TrainingModule(pl.LightningModule):
 
 @final
 class BestCheckpoint(pl.Callback):
-    """Writes the best weights and the state of the run after every epoch."""
+    """Writes the best weights and the state of the run after every epoch.
+
+    A run with `patience` ends after that many selectable epochs without a better one; the count is
+    part of the state, so that a resumed run ends after the same epoch.
+    """
 
     def __init__(self, *, best: Path, state: Path) -> None:
         """Stores the paths of the best weights and of the state."""
@@ -267,6 +291,9 @@ class BestCheckpoint(pl.Callback):
         self.state_path = state
         self.best_value = math.inf
         self.best_epoch = -1
+        self.last_epoch = -1
+        self.waited = 0
+        """Selectable epochs since the best one."""
 
     @property
     def state_key(self) -> str:
@@ -274,28 +301,47 @@ class BestCheckpoint(pl.Callback):
         return "KeepBest"
 
     def state_dict(self) -> dict[str, Any]:
-        """The best epoch and its error."""
-        return {"best_value": self.best_value, "best_epoch": self.best_epoch}
+        """The best epoch, its error, the last epoch, and the epochs without improvement."""
+        return {
+            "best_value": self.best_value,
+            "best_epoch": self.best_epoch,
+            "last_epoch": self.last_epoch,
+            "waited": self.waited,
+        }
 
     def load_state_dict(self, state_dict: dict[str, Any]) -> None:
         """Restores what `state_dict` returned."""
         self.best_value = state_dict["best_value"]
         self.best_epoch = state_dict["best_epoch"]
+        self.last_epoch = state_dict["last_epoch"]
+        self.waited = state_dict["waited"]
+
+    def on_train_start(self, trainer: pl.Trainer, pl_module: pl.LightningModule) -> None:
+        """Ends a run that was interrupted after its last epoch."""
+        self._stop_if_converged(trainer, pl_module)
 
     def on_train_epoch_end(self, trainer: pl.Trainer, pl_module: pl.LightningModule) -> None:
         """Writes the weights before the state, so that the state never refers to missing ones."""
-        value = float(trainer.callback_metrics[SELECTED_BY])
         module = pl_module if isinstance(pl_module, TrainingModule) else None
-        selectable = module is None or module.is_selectable
-        if selectable and value < self.best_value:
-            self.best_value, self.best_epoch = value, trainer.current_epoch
-            network: nn.Module = pl_module.get_submodule("network")
-            if trainer.is_global_zero:
-                save_weights(network.state_dict(), self.best_path)
-        # Lightning would step after the state is saved, and a resumed run would lack the step.
-        if selectable and module is not None:
-            module.step_plateau(float(trainer.callback_metrics[VALIDATION_LOSS]))
+        self.last_epoch = trainer.current_epoch
+        if module is None or module.is_selectable:
+            value = float(trainer.callback_metrics[SELECTED_BY])
+            self.waited += 1
+            if value < self.best_value:
+                self.best_value, self.best_epoch, self.waited = value, trainer.current_epoch, 0
+                network: nn.Module = pl_module.get_submodule("network")
+                if trainer.is_global_zero:
+                    save_weights(network.state_dict(), self.best_path)
+            # Lightning would step after the state is saved, and a resumed run would lack the step.
+            if module is not None:
+                module.step_plateau(float(trainer.callback_metrics[VALIDATION_LOSS]))
         trainer.save_checkpoint(self.state_path)
+        self._stop_if_converged(trainer, pl_module)
+
+    def _stop_if_converged(self, trainer: pl.Trainer, pl_module: pl.LightningModule) -> None:
+        if isinstance(pl_module, TrainingModule):
+            patience = pl_module.config.patience
+            trainer.should_stop = patience is not None and self.waited >= patience
 
 
 @final
@@ -304,15 +350,15 @@ class EpochLogger(pl.Callback):
 
     def on_train_epoch_end(self, trainer: pl.Trainer, pl_module: pl.LightningModule) -> None:
         """Writes the line to standard error."""
-        del pl_module
         if trainer.progress_bar_callback is not None or not trainer.is_global_zero:
             return
+        assert isinstance(pl_module, TrainingModule)
         metrics = trainer.callback_metrics
+        error = "n/a" if pl_module.is_pretraining else f"{float(metrics[SELECTED_BY]):.2f} m"
         sys.stderr.write(
-            f"epoch {trainer.current_epoch + 1}/{trainer.max_epochs}: training loss "
+            f"{stage_of(pl_module.config, trainer.current_epoch)}: training loss "
             f"{float(metrics['training loss']):.3f}, validation loss "
-            f"{float(metrics[VALIDATION_LOSS]):.3f}, {SELECTED_BY} "
-            f"{float(metrics[SELECTED_BY]):.2f} m\n"
+            f"{float(metrics[VALIDATION_LOSS]):.3f}, {SELECTED_BY} {error}\n"
         )
 
 

@@ -10,9 +10,13 @@ from dataclasses import dataclass
 from types import MappingProxyType
 from typing import Literal
 
-from asp_env.data.recording import DEFAULT_DT_S
+from asp_env.data.histories import History
+from asp_env.data.recording import DEFAULT_DT_S, ticks
+from asp_env.data.snippets import HISTORY_S
 from asp_env.data.split import Split
 from asp_env.errors import AspEnvError, unknown_name
+from asp_env.views import RasterView, make_view
+from predictors.models.chaining import segment_ticks
 from predictors.models.dkm import DKMConfig
 from predictors.models.ffw_asp import FFWASPConfig
 from predictors.models.mtp import MTPConfig
@@ -20,8 +24,16 @@ from predictors.models.network import NetworkConfig
 from predictors.models.ssp_asp import SSPASPConfig
 from predictors.training.augmentation import Augmentation
 
+Budget = Literal["epochs", "cpu", "converged"]
+"""What the prediction epochs of a run follow from: its recipe, equal CPU time, or convergence."""
+
 SEGMENT_S = 3.0
-"""Length of the segments that `ssp-asp` chains, seconds: the paper's shorter horizon."""
+"""Length of the segments that `ssp-asp` chains by default, seconds: the paper's shorter horizon."""
+
+SHORT_SEGMENT_SHARE = 0.5
+"""Share of the budget of a run for 3 s that a run for one shorter segment has; the rest is that of
+the run for 3 s, which starts from it. Chosen by hand: both learn the same, over fewer or more
+ticks."""
 
 CHAINED = frozenset({"ssp-asp"})
 """Predictors whose runs for longer horizons start from the weights of a run for one segment, as in
@@ -47,9 +59,13 @@ class TrainingConfig:
     split: Split = "recording"
     validation: tuple[str, ...] = ()
     """Separate validation data; all of DATA is trained on if there are any."""
-    history: Literal["recorded", "causal"] = "recorded"
+    history: History = "recorded"
     """Whether inputs show the histories as recorded, smoothed with later frames, or filtered
-    forward."""
+    forward, or with recorded accelerations."""
+    history_s: float = HISTORY_S
+    """Length of the past that inputs show, in actions and in the view (`mtp` shows at most 2 s)."""
+    parked: bool = False
+    """Whether parked vehicles are targets, too."""
     seed: int = 0
     max_snippets: int | None = None
     """Largest number of training snippets, chosen at random; None for all."""
@@ -57,9 +73,17 @@ class TrainingConfig:
     standing_share: float = 1.0
     """Largest share of standing targets in the training snippets."""
     epochs: int = 10
-    """Epochs after the pre-training."""
+    """Prediction epochs: those after the pre-training; their largest number with `patience`."""
     pretraining_epochs: int = 0
-    """Epochs before, in which `ssp-asp` learns its features only."""
+    """Epochs before the prediction epochs, in which `ssp-asp` learns its features only."""
+    budget: Budget = "epochs"
+    """What the number of prediction epochs follows from, see `predictors.training.budgets`."""
+    patience: int | None = None
+    """Prediction epochs without a lower validation error after which the training ends; None for
+    all epochs."""
+    progress_epochs: int | None = None
+    """Prediction epochs after which the annealing of modes and the scheduled continuation of
+    segments are complete; None for all."""
     snippets_per_epoch: int | None = None
     """Largest number of snippets in an epoch, which bounds the time of a run on much data; None for
     all."""
@@ -84,6 +108,8 @@ class TrainingConfig:
         """
         for field in (
             "epochs",
+            "patience",
+            "progress_epochs",
             "batch_size",
             "snippets_per_epoch",
             "max_snippets",
@@ -97,14 +123,34 @@ class TrainingConfig:
             raise AspEnvError(
                 f"training: pretraining_epochs is {self.pretraining_epochs}, expected 0 or more"
             )
+        if self.patience is not None and self.schedule != "plateau":
+            raise AspEnvError(
+                f"training: patience is {self.patience} with the schedule {self.schedule}, which "
+                "ends after a given number of steps: expected the schedule plateau"
+            )
+        if self.augmentation is not None and self.history == "accelerations":
+            raise AspEnvError(
+                "training: augmentation infers past actions from changed states, the history "
+                "accelerations takes them from the files: expected another history or recipe"
+            )
         if not 0 < self.standing_share <= 1:
             raise AspEnvError(
                 f"training: standing_share is {self.standing_share}, expected within (0, 1]"
             )
 
     @property
+    def segment_s(self) -> float | None:
+        """Length of the segments that are chained, seconds; None if the horizon is one forecast."""
+        return self.network.segment_s if isinstance(self.network, SSPASPConfig) else None
+
+    @property
+    def first_stage_s(self) -> float:
+        """Horizon of the run that a run in two stages starts from: one segment, or 3 s."""
+        return SEGMENT_S if self.segment_s is None else self.segment_s
+
+    @property
     def all_epochs(self) -> int:
-        """Number of epochs, pre-training included."""
+        """Number of epochs of the run: pre-training and prediction epochs."""
         return self.pretraining_epochs + self.epochs
 
 
@@ -167,55 +213,58 @@ def ffw_asp_robust(view: str, horizon_s: float) -> TrainingConfig:
     return _robust(ffw_asp_ours(view, horizon_s))
 
 
-def ssp_asp_paper(view: str, horizon_s: float) -> TrainingConfig:
+def ssp_asp_paper(view: str, horizon_s: float, segment_s: float = SEGMENT_S) -> TrainingConfig:
     """`asp-env train ssp-asp DATA --recipe paper`: the paper's SSP-ASP.
 
-    Three epochs of pre-training come before the ten of the paper. A run for more than 3 s starts
-    from one for 3 s, without pre-training.
+    Three epochs of pre-training come before the ten of the paper. A run for more than one segment
+    (3 s) starts from one for one segment, without pre-training.
 
     Raises:
-        AspEnvError: The horizon is not a whole number of segments.
+        AspEnvError: The horizon is not a whole number of segments, or a segment not one of ticks.
     """
-    _check_segments(horizon_s)
-    config = _paper("ssp-asp", SSPASPConfig(), view, horizon_s)
-    return _pretrained(config, horizon_s, 3, of=config.epochs + 3)
+    segment_ticks(segment_s, horizon_s=horizon_s, dt_s=DEFAULT_DT_S)
+    config = _paper("ssp-asp", SSPASPConfig(segment_s=segment_s), view, horizon_s)
+    return _with_pretraining(config, horizon_s, 3)
 
 
-def ssp_asp_cpu(view: str, horizon_s: float) -> TrainingConfig:
+def ssp_asp_cpu(view: str, horizon_s: float, segment_s: float = SEGMENT_S) -> TrainingConfig:
     """`asp-env train ssp-asp DATA`: SSP-ASP at small size, see `_small`, by Heun's method.
 
-    Pre-training takes two of the eight epochs, so that the time is that of the other predictors.
+    Two epochs of pre-training come before the eight prediction epochs, as in the paper, where they
+    are additional.
 
     Raises:
-        AspEnvError: The horizon is not a whole number of segments.
+        AspEnvError: The horizon is not a whole number of segments, or a segment not one of ticks.
     """
-    _check_segments(horizon_s)
-    network = SSPASPConfig(gru_width=128, integrator="heun")
+    segment_ticks(segment_s, horizon_s=horizon_s, dt_s=DEFAULT_DT_S)
+    network = SSPASPConfig(segment_s=segment_s, gru_width=128, integrator="heun")
     config = _small("ssp-asp", "cpu", network, view, horizon_s)
-    return _pretrained(config, horizon_s, 2, of=config.epochs)
+    return _with_pretraining(config, horizon_s, 2)
 
 
-def ssp_asp_ours(view: str, horizon_s: float) -> TrainingConfig:
+def ssp_asp_ours(view: str, horizon_s: float, segment_s: float = SEGMENT_S) -> TrainingConfig:
     """`asp-env train ssp-asp DATA --recipe ours`: small size, improved by the ablations.
 
     Differs from `cpu`: no pre-training; features, speed and past actions skip the GRU, which has
     one layer and is followed by a hidden layer; features are normalised and fixed as targets; modes
-    are assigned by distance and annealed at 3 s, which keeps them apart, and a run for 6 s starts
-    from those; later segments follow the most probable mode ever more often; forecasts are merged
-    into three modes. Chosen on validation data of synthetic traffic (`docs/results.md`).
+    are assigned by distance and annealed in the run for one segment, which keeps them apart, and a
+    longer run starts from those; later segments follow the most probable mode ever more often;
+    forecasts are merged into three modes. Chosen on validation data of synthetic traffic
+    (`docs/results.md`).
 
     Raises:
-        AspEnvError: The horizon is not a whole number of segments.
+        AspEnvError: The horizon is not a whole number of segments, or a segment not one of ticks.
     """
-    _check_segments(horizon_s)
+    segment_ticks(segment_s, horizon_s=horizon_s, dt_s=DEFAULT_DT_S)
     network = SSPASPConfig(
+        segment_s=segment_s,
         gru_width=128,
         gru_layers=1,
         skip=True,
         hidden=256,
         integrator="heun",
         assignment="distance",
-        annealed=horizon_s <= SEGMENT_S,
+        annealed=horizon_s <= segment_s,
         kept=3,
         spread_mps=0.8,
         normalise=True,
@@ -225,19 +274,21 @@ def ssp_asp_ours(view: str, horizon_s: float) -> TrainingConfig:
     return _small("ssp-asp", "ours", network, view, horizon_s)
 
 
-def ssp_asp_robust(view: str, horizon_s: float) -> TrainingConfig:
+def ssp_asp_robust(view: str, horizon_s: float, segment_s: float = SEGMENT_S) -> TrainingConfig:
     """`asp-env train ssp-asp DATA --recipe robust`: `ours` for traffic that it is not trained on.
 
     See `_robust`.
 
     Raises:
-        AspEnvError: The view renders rasters, or the horizon is not a whole number of segments.
+        AspEnvError: The view renders rasters, the horizon is not a whole number of segments, or a
+            segment not one of ticks.
     """
-    return _robust(ssp_asp_ours(view, horizon_s))
+    return _robust(ssp_asp_ours(view, horizon_s, segment_s))
 
 
-Recipe = Callable[[str, float], TrainingConfig]
-"""Makes a configuration of a view and a horizon in seconds."""
+Recipe = Callable[..., TrainingConfig]
+"""Makes a configuration of a view and a horizon in seconds and, for the predictors of `CHAINED`,
+the length of a segment in seconds."""
 
 RECIPES: Mapping[str, Mapping[str, Recipe]] = MappingProxyType(
     {
@@ -260,7 +311,15 @@ RECIPES: Mapping[str, Mapping[str, Recipe]] = MappingProxyType(
 """Recipes by predictor and name."""
 
 
-def recipe(predictor: str, name: str, *, view: str, horizon_s: float) -> TrainingConfig:
+def recipe(
+    predictor: str,
+    name: str,
+    *,
+    view: str,
+    horizon_s: float,
+    segment_s: float | None = None,
+    history_s: float = HISTORY_S,
+) -> TrainingConfig:
     """Makes the configuration of a recipe.
 
     Args:
@@ -268,21 +327,35 @@ def recipe(predictor: str, name: str, *, view: str, horizon_s: float) -> Trainin
         name: Name of the recipe.
         view: Name of the view.
         horizon_s: Horizon, seconds.
+        segment_s: Length of the segments that are chained, seconds; None for the default. Only for
+            the predictors of `CHAINED`.
+        history_s: Length of the past that inputs show, seconds.
 
     Raises:
-        AspEnvError: A name is unknown (known ones are listed), or the horizon does not fit.
+        AspEnvError: A name is unknown (known ones are listed), the horizon is no whole number of
+            segments, the predictor chains no segments, or a duration is no whole number of ticks.
     """
     if predictor not in RECIPES:
         raise unknown_name("trainable predictor", predictor, RECIPES)
     recipes = RECIPES[predictor]
     if name not in recipes:
         raise unknown_name(f"recipe of {predictor}", name, recipes)
-    return recipes[name](view, horizon_s)
+    ticks(history_s, DEFAULT_DT_S)
+    if predictor in CHAINED:
+        config = recipes[name](view, horizon_s, SEGMENT_S if segment_s is None else segment_s)
+    elif segment_s is None:
+        config = recipes[name](view, horizon_s)
+    else:
+        raise AspEnvError(
+            f"segments of {segment_s:g} s: {predictor} forecasts the whole horizon at once, only "
+            f"{', '.join(sorted(CHAINED))} chains segments; leave their length out"
+        )
+    return dataclasses.replace(config, history_s=history_s)
 
 
 def _paper(predictor: str, network: NetworkConfig, view: str, horizon_s: float) -> TrainingConfig:
     """The paper's size and schedule: Adam at 1e-4, batches of 32, 10 epochs, `plateau`."""
-    if view.startswith("vectors"):
+    if not isinstance(make_view(view), RasterView):
         network = dataclasses.replace(network, encoder="vector")
     return TrainingConfig(
         predictor=predictor,
@@ -300,19 +373,20 @@ def _small(
     """Small size, for minutes on two cores; the numbers are chosen by hand.
 
     Rasters have a quarter of the resolution, the encoder is small, and the schedule is
-    `one-cycle`. A longer horizon takes as many epochs again: after those for 3 s if segments are
-    chained, else at once.
+    `one-cycle`. A longer horizon takes as many prediction epochs again: after those for 3 s if
+    segments are chained, else at once.
     """
     at_once = horizon_s > SEGMENT_S and predictor not in CHAINED
-    vectors = view.startswith("vectors")
-    pixels = (90, 90) if view == "mtp" else (90, 60)
+    drawn = make_view(view)
+    vectors = not isinstance(drawn, RasterView)
+    pixels = None if vectors else (drawn.shape[1] // 4, drawn.shape[2] // 4)
     network = dataclasses.replace(network, encoder="vector" if vectors else "small", features=256)
     return TrainingConfig(
         predictor=predictor,
         preset=name,
         network=network,
         view=view,
-        pixels=None if vectors else pixels,
+        pixels=pixels,
         horizon_s=horizon_s,
         standing_share=0.25,
         epochs=16 if at_once else 8,
@@ -352,19 +426,8 @@ def _robust(config: TrainingConfig) -> TrainingConfig:
     )
 
 
-def _check_segments(horizon_s: float) -> None:
-    """Refuses a horizon that cannot be chained, before anything is trained."""
-    if horizon_s < SEGMENT_S or abs(horizon_s / SEGMENT_S - round(horizon_s / SEGMENT_S)) > 1e-6:
-        raise AspEnvError(
-            f"ssp-asp chains segments of {SEGMENT_S:g} s, the horizon of {horizon_s:g} s is no "
-            "whole number of them: give 3, 6 or 9"
-        )
-
-
-def _pretrained(
-    config: TrainingConfig, horizon_s: float, epochs: int, *, of: int
-) -> TrainingConfig:
-    """Makes some of all epochs pre-training, unless the run starts from one that had it."""
-    if horizon_s > SEGMENT_S:
+def _with_pretraining(config: TrainingConfig, horizon_s: float, epochs: int) -> TrainingConfig:
+    """Adds epochs of pre-training, unless the run starts from one that had them."""
+    if horizon_s > config.first_stage_s:
         return config
-    return dataclasses.replace(config, pretraining_epochs=epochs, epochs=of - epochs)
+    return dataclasses.replace(config, pretraining_epochs=epochs)

@@ -23,6 +23,7 @@ import torch
 from lightning.fabric.plugins.environments.lightning import LightningEnvironment
 from lightning.fabric.utilities.exceptions import MisconfigurationException
 from lightning.fabric.utilities.types import _PATH
+from lightning.pytorch.callbacks import TQDMProgressBar
 from lightning.pytorch.loggers import CSVLogger, TensorBoardLogger
 from lightning.pytorch.plugins.io import CheckpointIO
 from lightning.pytorch.strategies import DDPStrategy, ParallelStrategy
@@ -86,6 +87,7 @@ def make_trainer(
     out: Path,
     started: str,
     callbacks: Sequence[pl.Callback],
+    shown: bool = True,
 ) -> pl.Trainer:
     """Makes the trainer of a run.
 
@@ -95,6 +97,7 @@ def make_trainer(
         out: The run's folder.
         started: Folder of the logs within `out/logs`.
         callbacks: Lightning's callbacks.
+        shown: Whether there is a progress bar on a terminal, and logs are written.
 
     Raises:
         AspEnvError: There are too few devices, the nodes cannot find each other, or a batch has
@@ -112,6 +115,8 @@ def make_trainer(
     if processes > 1 or hardware.strategy == "ddp":
         # In pre-training the action predictor gets no gradient.
         strategy = DDPStrategy(find_unused_parameters=config.pretraining_epochs > 0)
+    has_bar = shown and sys.stderr.isatty()
+    loggers = (CSVLogger, TensorBoardLogger) if shown else ()
     try:
         with quiet():
             trainer = pl.Trainer(
@@ -123,15 +128,12 @@ def make_trainer(
                 use_distributed_sampler=False,
                 precision=config.precision,
                 max_epochs=config.all_epochs,
-                callbacks=list(callbacks),
-                logger=[
-                    CSVLogger(out, name=LOGS, version=started),
-                    TensorBoardLogger(out, name=LOGS, version=started),
-                ],
+                callbacks=[*callbacks, *([StageProgressBar(config)] if has_bar else [])],
+                logger=[each(out, name=LOGS, version=started) for each in loggers],
                 plugins=[SafetensorsIO()],
                 enable_checkpointing=False,
                 enable_model_summary=False,
-                enable_progress_bar=sys.stderr.isatty(),
+                enable_progress_bar=has_bar,
                 num_sanity_val_steps=0,
                 reload_dataloaders_every_n_epochs=1,
                 log_every_n_steps=50,
@@ -153,6 +155,45 @@ def make_trainer(
                 "first node's address, a free port there and this node's number, or use torchrun"
             )
     return trainer
+
+
+def stage_of(config: TrainingConfig, epoch: int) -> str:
+    """The name of an epoch for messages, such as `pre-training 1/3` or `epoch 1/10`.
+
+    Args:
+        config: The configuration of the run.
+        epoch: Index of the epoch, pre-training included.
+    """
+    if epoch < config.pretraining_epochs:
+        return f"pre-training {epoch + 1}/{config.pretraining_epochs}"
+    most = "at most " if config.patience is not None else ""
+    return f"epoch {epoch + 1 - config.pretraining_epochs}/{most}{config.epochs}"
+
+
+@final
+class StageProgressBar(TQDMProgressBar):
+    """Lightning's progress bar with the name of the epoch by `stage_of`."""
+
+    def __init__(self, config: TrainingConfig) -> None:
+        """Stores the configuration of the run."""
+        super().__init__()
+        self._config = config
+
+    def on_train_epoch_start(self, trainer: pl.Trainer, *args: Any) -> None:
+        """Names the epoch."""
+        super().on_train_epoch_start(trainer, *args)
+        self.train_progress_bar.set_description(stage_of(self._config, trainer.current_epoch))
+
+
+@contextmanager
+def threads(count: int | None) -> Iterator[None]:
+    """Sets torch's threads within one operation; None leaves them."""
+    before = torch.get_num_threads()
+    torch.set_num_threads(before if count is None else count)
+    try:
+        yield
+    finally:
+        torch.set_num_threads(before)
 
 
 @contextmanager

@@ -11,7 +11,6 @@ from asp_env.data.recording import frames_per_tick
 from asp_env.data.scenarios.scenario import Scenario
 from asp_env.data.scene import EGO
 from asp_env.data.source import Recordings
-from asp_env.dynamics import forward
 from asp_env.errors import AspEnvError, DataError
 from asp_env.sim.episodes import gather_controlled
 from asp_env.sim.world import World
@@ -151,7 +150,9 @@ class HighwayWorld(World):
     ) -> None:
         states, held, lengths = gather_controlled(self.episodes, rows, now, actions, acting)
         times_s = [*((k + 1) * STEP_S for k in range(self._stride - 1)), self.dt_s]
-        states_at = np.stack([forward(states, held, lengths, each) for each in times_s])
+        states_at = np.stack(
+            [self._drive(states, held, lengths, each, rows, acting) for each in times_s]
+        )
         poses = mirror_states(states_at.astype(np.float64)).swapaxes(0, 1).tolist()
         commands = mirror_actions(held.astype(np.float64)).tolist()
         at = 0

@@ -3,6 +3,7 @@
 import shutil
 import tempfile
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -17,22 +18,27 @@ from scenarios.processes import run_with_progress
 from scenarios.sumo.demand import RoadUser, Traffic, demand
 from scenarios.sumo.motion import FRAME_RATE_HZ, Motion, reconstruct
 from scenarios.sumo.network import Movements, simulate
-from scenarios.sumo.place import DENSE_SITES, METRES_PER_ORTHO_PIXEL, SITES, Place, make_place
+from scenarios.sumo.place import METRES_PER_ORTHO_PIXEL, SITES, Place, draw_site, make_place
+from scenarios.sumo.tracker import Tracker, draw_tracker, observe
 from scenarios.tables import Meta, Track, write_recording_meta, write_tracks, write_tracks_meta
 
-EVERY_FRAMES = 5
-"""Overlaps are checked at every fifth frame, 5 Hz."""
+CHECKS_PER_S = 5.0
+"""Overlaps are checked at 5 Hz."""
 
 WARM_UP_S = 80.0
 """Simulated before the recording starts, so that traffic fills the location by then."""
 
 _AFTER_S = 4.0
 
-_FEWEST_FRAMES = 25
+_LEAST_S = 1.0
 
 _EDGE_M = 1.0
 
 _MOST_ATTEMPTS = 12
+
+_MOST_MPS2 = 14.0
+"""Agents of varied traffic with a larger acceleration are left out. Chosen by hand: above emergency
+braking and the sharpest corners of pedestrians, far below a jump."""
 
 MAX_SECONDS = 24 * 3600.0
 
@@ -48,7 +54,11 @@ SOURCE_VERSION = 2
 """Raised when the same seed gives other bytes, so that cached folders are not reused."""
 
 
-def overlapping(motions: dict[str, Motion], users: dict[str, RoadUser]) -> set[tuple[str, str]]:
+def overlapping(
+    motions: dict[str, Motion],
+    users: dict[str, RoadUser],
+    frame_rate_hz: float = FRAME_RATE_HZ,
+) -> set[tuple[str, str]]:
     """Pairs of agents whose boxes overlap at some time; pedestrians may overlap each other.
 
     SUMO prevents collisions within lanes, but not between the corners of boxes that cut across
@@ -57,15 +67,17 @@ def overlapping(motions: dict[str, Motion], users: dict[str, RoadUser]) -> set[t
     Args:
         motions: of all agents, by name.
         users: size and class, by the same names.
+        frame_rate_hz: frames per second of the motions.
     """
+    every = round(frame_rate_hz / CHECKS_PER_S)
     names = [name for name in sorted(motions) if len(motions[name].xy)]
     rows: list[np.ndarray] = []
     for number, name in enumerate(names):
         motion, user = motions[name], users[name]
-        first = -motion.first_frame % EVERY_FRAMES
-        xy, heading = motion.xy[first::EVERY_FRAMES], motion.heading_rad[first::EVERY_FRAMES]
+        first = -motion.first_frame % every
+        xy, heading = motion.xy[first::every], motion.heading_rad[first::every]
         table = np.empty((len(xy), 7))
-        table[:, 0] = (motion.first_frame + first) // EVERY_FRAMES + np.arange(len(xy))
+        table[:, 0] = (motion.first_frame + first) // every + np.arange(len(xy))
         table[:, 1] = number
         table[:, 2:4], table[:, 4] = xy, heading
         table[:, 5:] = user.length_m, user.width_m
@@ -94,7 +106,11 @@ def overlapping(motions: dict[str, Motion], users: dict[str, RoadUser]) -> set[t
 
 
 def record(
-    rng: np.random.Generator, place: Place, *, num_frames: int, traffic: Traffic = "normal"
+    rng: np.random.Generator,
+    place: Place,
+    *,
+    num_frames: int,
+    frame_rate_hz: float = FRAME_RATE_HZ,
 ) -> tuple[dict[str, Motion], dict[str, RoadUser]]:
     """Simulates traffic at a location without overlapping agents.
 
@@ -106,13 +122,13 @@ def record(
         rng: draws the demand and SUMO's seed.
         place: the location.
         num_frames: length of the recording.
-        traffic: `normal` or `dense`.
+        frame_rate_hz: frames per second of the recording.
 
     Returns:
         All motions in the recording's frame and all agents, both by name.
     """
-    seconds = WARM_UP_S + num_frames / FRAME_RATE_HZ + _AFTER_S
-    wanted = demand(rng, place.site, seconds, traffic)
+    seconds = WARM_UP_S + num_frames / frame_rate_hz + _AFTER_S
+    wanted = demand(rng, place.site, seconds, place.mix)
     seed = int(rng.integers(1, 2**31 - 1))
     motions: dict[str, Motion] = {}
     late: set[str] = set()
@@ -122,14 +138,17 @@ def record(
             wanted.routes,
             seconds=seconds,
             seed=seed,
-            impatient=traffic == "dense",
+            impatient=place.mix.impatient,
+            lenient=place.mix.lenient,
         )
-        motions = _motions(moved, place, wanted.users)
+        motions = _motions(moved, place, wanted.users, frame_rate_hz)
         departs = {name: depart for depart, name, _ in wanted.entries}
         late = {
             max(pair, key=lambda name: (departs[name], name))
-            for pair in overlapping(motions, wanted.users)
+            for pair in overlapping(motions, wanted.users, frame_rate_hz)
         }
+        if place.mix.lenient:
+            late |= {name for name in motions if _jumps(motions[name], frame_rate_hz)}
         if not late:
             break
         wanted = wanted.without(late)
@@ -138,7 +157,15 @@ def record(
     return motions, wanted.users
 
 
-def _motions(moved: Movements, place: Place, users: dict[str, RoadUser]) -> dict[str, Motion]:
+def _jumps(motion: Motion, frame_rate_hz: float) -> bool:
+    """Whether an agent accelerates as none can; some of netconvert's sidewalks have gaps."""
+    acceleration = np.diff(motion.xy, 2, axis=0) * frame_rate_hz**2
+    return bool(np.hypot(*acceleration.T).max(initial=0.0) > _MOST_MPS2)
+
+
+def _motions(
+    moved: Movements, place: Place, users: dict[str, RoadUser], frame_rate_hz: float
+) -> dict[str, Motion]:
     motions: dict[str, Motion] = {}
     for number, name in enumerate(moved.names):
         rows = slice(moved.starts[number], moved.starts[number + 1])
@@ -147,6 +174,8 @@ def _motions(moved: Movements, place: Place, users: dict[str, RoadUser]) -> dict
             moved.points[rows] + place.shift_m,
             kind=users[name].kind,
             length_m=users[name].length_m,
+            style=users[name].style,
+            frame_rate_hz=frame_rate_hz,
         )
         if motion is not None:
             motions[name] = motion
@@ -159,6 +188,7 @@ def tracks_in_view(
     users: dict[str, RoadUser],
     *,
     num_frames: int,
+    frame_rate_hz: float = FRAME_RATE_HZ,
     noise: np.random.Generator | None = None,
 ) -> list[Track]:
     """The tracks that a camera above the location sees, in the order of appearance.
@@ -168,18 +198,19 @@ def tracks_in_view(
         motions: of all agents, by name; frame 0 is the start of the simulation.
         users: class and size, by the same names.
         num_frames: length of the recording.
+        frame_rate_hz: frames per second of the recording.
         noise: draws measurement errors; without it the true tracks are returned.
     """
     tracks: list[tuple[int, str, Track]] = []
     for name in sorted(motions):
         motion, user = motions[name], users[name]
-        window = _seen(motion, place, num_frames)
+        window = _seen(motion, place, num_frames, frame_rate_hz)
         if window is None:
             continue
         xy, heading = motion.xy, motion.heading_rad
         if noise is not None:
             xy, heading = measure(noise, xy, heading)
-        track = make_track(user, xy, heading, motion.first_frame, window)
+        track = make_track(user, xy, heading, motion.first_frame, window, frame_rate_hz)
         tracks.append((track.first_frame, name, track))
     tracks.sort(key=lambda entry: entry[:2])
     return [track for _, _, track in tracks]
@@ -191,15 +222,16 @@ def make_track(
     heading_rad: Float[np.ndarray, " frames"],
     first_frame: int,
     window: slice,
+    frame_rate_hz: float = FRAME_RATE_HZ,
 ) -> Track:
     """Derives velocities and accelerations of a motion and selects the rows of `window`."""
-    velocity = np.gradient(xy, 1.0 / FRAME_RATE_HZ, axis=0)
-    acceleration = np.gradient(velocity, 1.0 / FRAME_RATE_HZ, axis=0)
+    velocity = np.gradient(xy, 1.0 / frame_rate_hz, axis=0)
+    acceleration = np.gradient(velocity, 1.0 / frame_rate_hz, axis=0)
     return Track(
         kind=user.kind,
         length_m=user.length_m,
         width_m=user.width_m,
-        first_frame=first_frame + window.start - round(WARM_UP_S * FRAME_RATE_HZ),
+        first_frame=first_frame + window.start - round(WARM_UP_S * frame_rate_hz),
         xy=xy[window],
         heading_rad=heading_rad[window],
         velocity_mps=velocity[window],
@@ -207,9 +239,9 @@ def make_track(
     )
 
 
-def _seen(motion: Motion, place: Place, num_frames: int) -> slice | None:
+def _seen(motion: Motion, place: Place, num_frames: int, frame_rate_hz: float) -> slice | None:
     """The longest uninterrupted span in which a motion is inside the image."""
-    frames = motion.first_frame + np.arange(len(motion.xy)) - round(WARM_UP_S * FRAME_RATE_HZ)
+    frames = motion.first_frame + np.arange(len(motion.xy)) - round(WARM_UP_S * frame_rate_hz)
     half = np.array(place.site.half_size_m) - _EDGE_M
     seen = np.all(np.abs(motion.xy - place.shift_m) < half, axis=1)
     seen &= (frames >= 0) & (frames < num_frames)
@@ -218,7 +250,7 @@ def _seen(motion: Motion, place: Place, num_frames: int) -> slice | None:
         return None
     begins, ends = edges[::2], edges[1::2]
     longest = int(np.argmax(ends - begins))
-    if ends[longest] - begins[longest] < _FEWEST_FRAMES:
+    if ends[longest] - begins[longest] < _LEAST_S * frame_rate_hz:
         return None
     return slice(int(begins[longest]), int(ends[longest]))
 
@@ -276,12 +308,20 @@ class _Content:
             ]
             for recording in mine:
                 rng = self._rng(1, recording)
-                _write_recording(self, place, rng, recording=recording, location=location)
+                varied = self.traffic == "varied"
+                _write_recording(
+                    self,
+                    place,
+                    rng,
+                    recording=recording,
+                    location=location,
+                    tracker=draw_tracker(self._rng(2, recording)) if varied else None,
+                )
 
     def _place(self, location: int, scratch: Path) -> Place:
         rng = self._rng(0, location)
-        kinds = SITES[self.site] if self.traffic == "normal" else DENSE_SITES[self.site]
-        place = make_place(rng, kinds[location % len(kinds)](rng), scratch / str(location))
+        site = draw_site(rng, self.site, self.traffic, location, scratch)
+        place = make_place(rng, site, scratch / str(location), traffic=self.traffic)
         maps = self.folder / "maps" / "lanelets" / f"{location:02d}_{place.site.kind}"
         maps.mkdir(parents=True)
         place.write_map(maps / f"location{location}.osm")
@@ -318,7 +358,7 @@ def synthesize(
         noise: whether to write measured instead of true tracks; the true tracks go to
             `truth/XX_trueTracks.csv`, which readers ignore.
         locations: number of locations; by default one for three recordings.
-        traffic: `normal` or `dense`.
+        traffic: `normal`, `dense` or `varied`.
         compress: whether to write tracks as `.csv.gz`.
         jobs: number of processes; the bytes do not depend on it.
         progress: whether to show a progress bar.
@@ -354,25 +394,34 @@ def synthesize(
 
 
 def _write_recording(
-    content: _Content, place: Place, rng: np.random.Generator, *, recording: int, location: int
+    content: _Content,
+    place: Place,
+    rng: np.random.Generator,
+    *,
+    recording: int,
+    location: int,
+    tracker: Tracker | None,
 ) -> None:
     folder = content.folder
     suffix = ".csv.gz" if content.compress else ".csv"
-    num_frames = round(content.minutes * 60.0 * FRAME_RATE_HZ)
-    motions, users = record(rng, place, num_frames=num_frames, traffic=content.traffic)
+    rate_hz = FRAME_RATE_HZ if tracker is None else tracker.frame_rate_hz
+    num_frames = round(content.minutes * 60.0 * rate_hz)
+    motions, users = record(rng, place, num_frames=num_frames, frame_rate_hz=rate_hz)
     parked = parked_cars(rng, place, num_frames)
-    true = parked + tracks_in_view(place, motions, users, num_frames=num_frames)
+    view = partial(
+        tracks_in_view, place, motions, users, num_frames=num_frames, frame_rate_hz=rate_hz
+    )
+    true = parked + view()
     seen = true
     if content.noise:
-        moving = tracks_in_view(place, motions, users, num_frames=num_frames, noise=rng)
-        seen = parked + moving
+        seen = parked + view(noise=rng) if tracker is None else observe(tracker, true)
         (folder / "truth").mkdir(exist_ok=True)
         write_tracks(folder / "truth" / f"{recording:02d}_trueTracks{suffix}", recording, true)
     lat, lon = place.lat_lon_deg
     meta = Meta(
         recording=recording,
         location=location,
-        frame_rate_hz=FRAME_RATE_HZ,
+        frame_rate_hz=rate_hz,
         speed_limit_mps=place.site.speed_limit_mps,
         weekday=str(rng.choice(_DAYS)),
         start_hour=int(rng.integers(7, 19)),

@@ -32,6 +32,27 @@ CHANGE_S, CHANGE_M = 2.5, (15.0, 28.0)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
+class PathStyle:
+    """How the path of an agent differs from the middle of the lane, on which SUMO's agents move."""
+
+    offset_m: float = 0.0
+    """Constant distance to the left of the middle."""
+    wander_m: float = 0.0
+    """Amplitude of a sinusoidal deviation along the way."""
+    wander_length_m: float = 1.0
+    """Wave length of this deviation."""
+    phase_rad: float = 0.0
+    """Phase of this deviation."""
+    rounding: float = 1.0
+    """Factor on the length over which the path is smoothed: corners are cut further."""
+
+    def left_m(self, along_m: Float[np.ndarray, " n"]) -> Float[np.ndarray, " n"]:
+        """Distance to the left of the middle at the given distances along the way."""
+        turn = 2.0 * np.pi * along_m / self.wander_length_m
+        return self.offset_m + self.wander_m * np.sin(turn + self.phase_rad)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
 class Motion:
     """The motion of one agent, frame by frame; the reference point is the centre of its box."""
 
@@ -80,6 +101,8 @@ def reconstruct(
     *,
     kind: str,
     length_m: float,
+    style: PathStyle | None = None,
+    frame_rate_hz: float = FRAME_RATE_HZ,
 ) -> Motion | None:
     """The motion of an agent from the reported positions of its front bumper.
 
@@ -88,6 +111,8 @@ def reconstruct(
         points: (n, 2) centre of the front bumper, m; of pedestrians the centre of the body.
         kind: class name.
         length_m: length of the agent.
+        style: deviation from the middle of the lane, if there is one.
+        frame_rate_hz: frames per second of the motion.
 
     Returns:
         The motion at all whole frames between the first and last time; None if the agent never
@@ -98,7 +123,10 @@ def reconstruct(
     if arc[-1] < 2.0 or len(points) < 4:
         return None
     lead = round((length_m + 6.0) / SPACING_M)
-    path, tangent = _smoothed_path(points, arc, lead, PATH_SIGMA_M.get(kind, PATH_SIGMA_DEFAULT_M))
+    sigma_m = PATH_SIGMA_M.get(kind, PATH_SIGMA_DEFAULT_M)
+    path, tangent = _smoothed_path(points, arc, lead, sigma_m * (style.rounding if style else 1.0))
+    if style is not None:
+        path, tangent = _beside(path, tangent, style)
     if kind in ("pedestrian", "bicycle"):
         behind_m, wheelbase_m = 0.5 * length_m, 0.0
         heading = tangent
@@ -106,11 +134,11 @@ def reconstruct(
         behind_m = (0.5 - AXLE_SHARE_OF_LENGTH) * length_m
         wheelbase_m = 2.0 * AXLE_SHARE_OF_LENGTH * length_m
         heading = _tractrix(tangent, wheelbase_m)
-    first = int(np.ceil(times_s[0] * FRAME_RATE_HZ - 1e-6))
-    last = int(np.floor(times_s[-1] * FRAME_RATE_HZ + 1e-6))
+    first = int(np.ceil(times_s[0] * frame_rate_hz - 1e-6))
+    last = int(np.floor(times_s[-1] * frame_rate_hz + 1e-6))
     frames = np.arange(first, last + 1)
     progress = gaussian(
-        np.interp(frames / FRAME_RATE_HZ, times_s, arc), PROGRESS_SIGMA_S * FRAME_RATE_HZ
+        np.interp(frames / frame_rate_hz, times_s, arc), PROGRESS_SIGMA_S * frame_rate_hz
     )
     progress = np.maximum.accumulate(progress)
     at = lead + (np.clip(progress, 0.0, arc[-1]) - behind_m) / SPACING_M
@@ -171,6 +199,16 @@ def _smoothed_path(
     path = gaussian(raw, sigma_m / SPACING_M)
     steps = np.gradient(path, axis=0)
     return path, np.unwrap(np.arctan2(steps[:, 1], steps[:, 0]))
+
+
+def _beside(
+    path: Polyline, tangent_rad: np.ndarray, style: PathStyle
+) -> tuple[Polyline, np.ndarray]:
+    """A path beside another one, and its direction."""
+    left = style.left_m(SPACING_M * np.arange(len(path)))
+    beside = path + left[:, None] * np.stack([-np.sin(tangent_rad), np.cos(tangent_rad)], axis=1)
+    steps = np.gradient(beside, axis=0)
+    return beside, np.unwrap(np.arctan2(steps[:, 1], steps[:, 0]))
 
 
 def _tractrix(tangent_rad: Float[np.ndarray, " n"], wheelbase_m: float) -> np.ndarray:

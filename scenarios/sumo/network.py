@@ -16,7 +16,7 @@ import pandas as pd
 from jaxtyping import Float
 
 from asp_env.errors import AspEnvError, MissingExtraError
-from asp_env.geometry import arc_lengths
+from asp_env.geometry import arc_lengths, wrap_angle
 from scenarios.lanelet2 import Border, Lanelet, Marking, Subtype
 from scenarios.polylines import Polyline, dense, offset
 from scenarios.sumo.sites import Site
@@ -33,6 +33,9 @@ WIDENING_M = 1.3
 
 _MEETS_M = 0.3
 
+_LEAST_ROAD_M, _MOST_KINK_RAD = 3.0, 1.0
+"""Bounds of sound roads: length, and change of direction at a point. Chosen by hand."""
+
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Lane:
@@ -44,6 +47,8 @@ class Lane:
     pedestrian: bool
     """Whether only pedestrians may use it."""
     index: int
+    speed_mps: float
+    """Speed limit."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -152,6 +157,7 @@ def _read_network(path: Path) -> Network:
                         width_m=width,
                         pedestrian=lane.get("allow") == "pedestrian",
                         index=int(lane.attrib["index"]),
+                        speed_mps=float(lane.attrib["speed"]),
                     )
     return Network(
         lanes=lanes,
@@ -187,7 +193,13 @@ def _turns(
 
 
 def simulate(
-    folder: Path, routes: str, *, seconds: float, seed: int, impatient: bool = False
+    folder: Path,
+    routes: str,
+    *,
+    seconds: float,
+    seed: int,
+    impatient: bool = False,
+    lenient: bool = False,
 ) -> Movements:
     """Simulates `routes` on the network in `folder` with SUMO.
 
@@ -198,6 +210,8 @@ def simulate(
         seed: of SUMO's random numbers.
         impatient: whether waiting drivers accept shorter gaps after `IMPATIENT_AFTER_S` instead of
             SUMO's 180 s.
+        lenient: whether agents without a possible route are left out instead of an error; on
+            one-way roads not every sidewalk leads to every other.
     """
     (folder / "routes.xml").write_text(f"<routes>{routes}</routes>")
     _run(
@@ -215,6 +229,7 @@ def simulate(
         "--collision.action", "warn",
         "--time-to-teleport", "-1",
         *(("--time-to-impatience", str(IMPATIENT_AFTER_S)) if impatient else ()),
+        "--ignore-route-errors", str(lenient).lower(),
         "--xml-validation", "never",
         "--no-step-log", "true",
     )  # fmt: skip
@@ -257,6 +272,39 @@ def lanelets(network: Network, half_size_m: tuple[float, float]) -> list[Lanelet
     return [*strips.values(), *turns, *crossings]
 
 
+def narrowest_lane_m(network: Network) -> float:
+    """Width of the narrowest lane for vehicles, m."""
+    return min(lane.width_m for lane in network.lanes.values() if not lane.pedestrian)
+
+
+def is_sound(network: Network) -> bool:
+    """Whether vehicles can drive on all roads without a jump or a kink.
+
+    At small angles netconvert enlarges a junction beyond the next one, so that the road between
+    them vanishes or points backwards.
+    """
+    lengths = [
+        arc_lengths(lane.shape)[-1]
+        for lane in network.lanes.values()
+        if not lane.edge.startswith("ring")
+    ]
+    paths = [
+        np.concatenate(
+            [network.lanes[turn.begin].shape[-2:], turn.shape, network.lanes[turn.end].shape[:2]]
+        )
+        for turn in network.turns
+    ]
+    sharpest_rad = max(map(_sharpest_kink_rad, paths))
+    return bool(min(lengths) > _LEAST_ROAD_M and sharpest_rad < _MOST_KINK_RAD)
+
+
+def _sharpest_kink_rad(path: Polyline) -> float:
+    steps = np.diff(path, axis=0)
+    steps = steps[np.hypot(*steps.T) > 0.05]
+    ahead = np.arctan2(steps[:, 1], steps[:, 0])
+    return float(np.abs(wrap_angle(np.diff(ahead))).max(initial=0.0))
+
+
 def _lane_strip(lane: Lane, lanes: dict[str, Lane], reach: np.ndarray) -> Lanelet:
     half = 0.5 * lane.width_m
     left, right = offset(lane.shape, half), offset(lane.shape, -half)
@@ -278,6 +326,7 @@ def _lane_strip(lane: Lane, lanes: dict[str, Lane], reach: np.ndarray) -> Lanele
         subtype=subtype,
         left=(Border(line=left[part], marking=left_is),),
         right=(Border(line=right[part], marking=right_is),),
+        speed_limit_mps=None if lane.pedestrian else lane.speed_mps,
     )
 
 
@@ -319,6 +368,7 @@ def _turn_strip(turn: Turn, network: Network, strips: dict[str, Lanelet]) -> Lan
         subtype="road",
         left=(Border(line=left, marking=left_is),),
         right=(Border(line=right, marking=right_is),),
+        speed_limit_mps=max(network.lanes[turn.begin].speed_mps, network.lanes[turn.end].speed_mps),
     )
 
 

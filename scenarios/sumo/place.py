@@ -9,9 +9,11 @@ import cv2
 import numpy as np
 from jaxtyping import Float, UInt8
 
+from asp_env.errors import AspEnvError
 from scenarios.lanelet2 import Area, Border, Lanelet, to_degrees, write_map
 from scenarios.polylines import Polyline, dense
-from scenarios.sumo.network import build_network, lanelets
+from scenarios.sumo.demand import Mix, Traffic, usual_mix
+from scenarios.sumo.network import build_network, is_sound, lanelets, narrowest_lane_m
 from scenarios.sumo.sites import (
     Site,
     crossroads,
@@ -19,6 +21,9 @@ from scenarios.sumo.sites import (
     t_junction,
     two_lane_roundabout,
 )
+from scenarios.sumo.varied_map import draw_map
+from scenarios.sumo.varied_mix import varied_mix
+from scenarios.sumo.varied_sites import varied_intersection, varied_roundabout
 
 METRES_PER_ORTHO_PIXEL = 0.01
 DOWNSCALE = 12
@@ -41,6 +46,48 @@ DENSE_SITES = {
     "roundabout": (roundabout, partial(two_lane_roundabout, leave_inside=True)),
 }
 """The same for dense traffic."""
+
+VARIED_SITES = {"intersection": (varied_intersection,), "roundabout": (varied_roundabout,)}
+"""The same for varied traffic."""
+
+_SITES_OF: dict[Traffic, dict[str, tuple[Callable[[np.random.Generator], Site], ...]]] = {
+    "normal": SITES,
+    "dense": DENSE_SITES,
+    "varied": VARIED_SITES,
+}
+
+
+def draw_site(
+    rng: np.random.Generator, name: str, traffic: Traffic, location: int, scratch: Path
+) -> Site:
+    """The junction of a location; the kinds of a site take turns.
+
+    Args:
+        rng: draws the junction.
+        name: `intersection` or `roundabout`.
+        traffic: `normal`, `dense` or `varied`. Varied junctions are drawn until one is sound.
+        location: number of the location.
+        scratch: folder in which junctions are tried.
+
+    Raises:
+        AspEnvError: no sound junction was found.
+    """
+    kinds = _SITES_OF[traffic][name]
+    draw = kinds[location % len(kinds)]
+    if traffic != "varied":
+        return draw(rng)
+    for attempt in range(_MOST_ATTEMPTS):
+        site, folder = draw(rng), scratch / f"attempt{attempt}"
+        folder.mkdir(parents=True)
+        if is_sound(build_network(site, folder)):
+            return site
+    raise AspEnvError(
+        f"location {location}: none of {_MOST_ATTEMPTS} junctions drawn has roads without kinks; "
+        "choose another seed"
+    )
+
+
+_MOST_ATTEMPTS = 50
 
 JOIN_M = 0.06
 """Ends of netconvert's lines that are nearer than this belong together."""
@@ -145,6 +192,12 @@ class Place:
     """Offset from coordinates around the site's centre to the recording's frame."""
     origin_utm_m: tuple[float, float]
     strips: list[Lanelet]
+    """The lanelets of the roads as they are."""
+    mapped: list[Lanelet]
+    """The lanelets as the map shows them."""
+    mapped_parking: Float[np.ndarray, "lots 4 2"]
+    mix: Mix
+    """From what the agents are drawn."""
     corners: list[np.ndarray]
     parking: Float[np.ndarray, "lots 4 2"]
     trees: Float[np.ndarray, "trees 3"]
@@ -162,42 +215,54 @@ class Place:
         write_picture(path, image)
 
     def write_map(self, path: Path) -> None:
-        lots = [np.concatenate([lot, lot[:1]]) for lot in self.parking]
+        lots = [np.concatenate([lot, lot[:1]]) for lot in self.mapped_parking]
         areas = [
             Area(subtype="parking", outer=(Border(line=lot, marking="virtual"),)) for lot in lots
         ]
-        write_map(path, self.strips, areas, origin_utm_m=self.origin_utm_m, join_m=JOIN_M)
+        write_map(path, self.mapped, areas, origin_utm_m=self.origin_utm_m, join_m=JOIN_M)
 
 
-def make_place(rng: np.random.Generator, site: Site, folder: Path) -> Place:
+def make_place(
+    rng: np.random.Generator, site: Site, folder: Path, *, traffic: Traffic = "normal"
+) -> Place:
     """Builds the roads of a site in `folder` and converts them to a recording's frame.
 
     Args:
-        rng: draws the UTM origin and the trees.
+        rng: draws the UTM origin and the trees; in varied traffic also mix and style of the map.
         site: the site.
         folder: folder to create.
+        traffic: `normal`, `dense` or `varied`.
     """
     folder.mkdir(parents=True)
     network = build_network(site, folder)
     shift = np.array([site.half_size_m[0], -site.half_size_m[1]])
-    limit = site.speed_limit_mps
-    strips = [_moved(strip, shift, limit) for strip in lanelets(network, site.half_size_m)]
+    built = lanelets(network, site.half_size_m)
+    strips = [_moved(strip, shift, site.speed_limit_mps) for strip in built]
     corners = [corner + shift for corner in network.corners]
     parking = site.parking + shift
     east, north = np.array(_NEAR_AACHEN_UTM_M) + np.round(rng.uniform(0.0, 3000.0, 2), 2)
+    trees = _trees(rng, strips, parking, 2.0 * np.array(site.half_size_m))
+    mapped, mapped_parking, mix = strips, parking, None
+    if traffic == "varied":
+        mix = varied_mix(rng, narrowest_m=narrowest_lane_m(network), tight=site.tight)
+        own_limits = [_moved(strip, shift, strip.speed_limit_mps) for strip in built]
+        mapped, mapped_parking = draw_map(rng, own_limits, parking, middle=shift)
     return Place(
         site=site,
         folder=folder,
         shift_m=shift,
         origin_utm_m=(float(east), float(north)),
         strips=strips,
+        mapped=mapped,
+        mapped_parking=mapped_parking,
+        mix=mix or usual_mix(site.kind, traffic),
         corners=corners,
         parking=parking,
-        trees=_trees(rng, strips, parking, 2.0 * np.array(site.half_size_m)),
+        trees=trees,
     )
 
 
-def _moved(strip: Lanelet, shift: np.ndarray, speed_limit_mps: float) -> Lanelet:
+def _moved(strip: Lanelet, shift: np.ndarray, speed_limit_mps: float | None) -> Lanelet:
     left, right = (
         tuple(Border(line=border.line + shift, marking=border.marking) for border in side)
         for side in (strip.left, strip.right)

@@ -158,3 +158,6 @@ def assert_same(one: Forecast, other: Forecast, rows: np.ndarray | None = None) 
     order = np.arange(len(one.ids)) if rows is None else rows
     for field in ("states", "actions", "actions_valid", "log_probs", "valid", "ids", "tick"):
         np.testing.assert_array_equal(getattr(one, field)[order], getattr(other, field), field)
+    assert (one.features is None) == (other.features is None)
+    if one.features is not None and other.features is not None:
+        np.testing.assert_array_equal(one.features[order], other.features, "features")

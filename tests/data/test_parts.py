@@ -108,6 +108,25 @@ def test_split_by_recording() -> None:
         assert unseen.all() if trained_on.parts[content] == "test" else not unseen.any()
 
 
+def test_split_by_time_of_day() -> None:
+    """Of ten hours of the clock one is unseen; without a start time there is an error."""
+    recordings = MadeUp([3_000] * 20)
+    with pytest.raises(AspEnvError, match=r"no start time.*use --split recording"):
+        snippet_parts(recordings, all_snippets(recordings), "daytime")
+    recordings.made = [
+        dataclasses.replace(recording, start_hour=8.0 + number // 2)
+        for number, recording in enumerate(recordings.made)
+    ]
+    index = all_snippets(recordings)
+    parts, trained_on = snippet_parts(recordings, index, "daytime")
+    assert trained_on.split == "daytime"
+    held_out = np.unique(index.recording[parts == "test"])
+    assert held_out[0] % 2 == 0
+    assert held_out.tolist() == [held_out[0], held_out[0] + 1]
+    unseen = unseen_ticks(recordings, [trained_on], 0.2)
+    assert [bool(mask.all()) for mask in unseen] == [number in held_out for number in range(20)]
+
+
 def test_too_few_recordings() -> None:
     """The error suggests the other split."""
     recordings = MadeUp([3_000] * 2)

@@ -178,3 +178,16 @@ def test_unsuitable_time_steps_are_rejected() -> None:
         index_snippets([recording], dt_s=0.25, horizon_s=3.0, interval_s=0.5)
     with pytest.raises(AspEnvError, match=r"0\.6 s is no whole number of ticks of 0\.5 s"):
         index_snippets([recording], dt_s=0.5, horizon_s=3.0)
+
+
+def test_parked_agents_are_targets_if_asked_for() -> None:
+    """The parked car is there for ticks 0 to 100: it has a snippet at each of 15, 18, …, 84."""
+    recordings = [make_recording()]
+    (parked,) = np.flatnonzero(recordings[0].parked)
+    without = index_snippets(recordings, dt_s=0.2, horizon_s=3.0)
+    both = index_snippets(recordings, dt_s=0.2, horizon_s=3.0, parked=True)
+    rows = both.track == parked
+    assert both.tick[rows].tolist() == list(range(15, 86, 3))
+    for column in ("recording", "track", "tick"):
+        np.testing.assert_array_equal(getattr(both, column)[~rows], getattr(without, column))
+    assert gather_scene(recordings, both).predictable.all()

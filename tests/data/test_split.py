@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 from hypothesis import given
 
-from asp_env.data.split import split_blocks, split_by_recording
+from asp_env.data.split import split_blocks, split_by_daytime, split_by_recording
 from asp_env.errors import AspEnvError
 
 
@@ -33,13 +33,68 @@ def test_shares_are_of_snippets() -> None:
     assert counts[parts == "validation"].sum() == 100
 
 
-def test_each_location_is_split() -> None:
-    """A location with three recordings has one test recording; one with two has none."""
+def test_small_locations_are_split_together() -> None:
+    """Two locations with three recordings: 4:1:1, not twice 1:1:1; one with two is not split.
+
+    Test and validation are at different locations, so that both are trained on.
+    """
     locations = ["4", "4", "4", "1", "1", "1", "2", "2"]
     parts = split_by_recording(np.full(8, 5), locations)
-    for place in (slice(0, 3), slice(3, 6)):
-        assert sorted(parts[place]) == ["test", "train", "validation"]
     assert parts[6:] == ("train", "train")
+    for place in (slice(0, 3), slice(3, 6)):
+        assert parts[place].count("train") == 2
+    assert sorted(parts[:6]) == ["test"] + ["train"] * 4 + ["validation"]
+
+
+def test_a_location_with_three_recordings_alone() -> None:
+    """Nothing but 1:1:1 is possible."""
+    assert sorted(split_by_recording(np.full(3, 5), ["1"] * 3)) == ["test", "train", "validation"]
+
+
+def test_locations_as_those_of_ind() -> None:
+    """7, 11, 12 and 3 equal recordings: 3 of 33 for testing, and as many for validation.
+
+    Those with 11 and 12 are split on their own, the other ten together.
+    """
+    locations = ["4"] * 7 + ["1"] * 11 + ["2"] * 12 + ["3"] * 3
+    parts = np.array(split_by_recording(np.full(33, 9), locations))
+    for held_out in ("test", "validation"):
+        at = [locations[i] for i in np.flatnonzero(parts == held_out)]
+        assert len(at) == 3
+        assert {"1", "2"} < set(at)
+
+
+@given(
+    counts=st.lists(st.integers(1, 900), min_size=8, max_size=40),
+    places=st.integers(2, 9),
+)
+def test_pooled_locations_keep_training_recordings(counts: list[int], places: int) -> None:
+    """A location is never without training recordings, whatever the counts."""
+    table = np.array(counts)
+    locations = [str(number % places) for number in range(len(counts))]
+    try:
+        parts = split_by_recording(table, locations)
+    except AspEnvError:
+        assert len(counts) < 3 * places  # locations with fewer than three recordings each
+        return
+    for place in set(locations):
+        own = [part for part, other in zip(parts, locations, strict=True) if other == place]
+        assert "train" in own or locations.count(place) < 3
+
+
+def test_times_of_day() -> None:
+    """Ten hours of the clock with two equal recordings each, of which one is the test."""
+    hours = [8 + number % 10 + number / 40 for number in range(20)]
+    parts = split_by_daytime(np.full(20, 5), hours)
+    assert sorted(parts) == ["test"] * 2 + ["train"] * 16 + ["validation"] * 2
+    assert parts[:10] == parts[10:]
+    assert parts == split_by_daytime(np.full(20, 5), hours)
+
+
+def test_recordings_without_snippets_have_no_time_of_day() -> None:
+    assert split_by_daytime(np.array([4, 0, 4, 4]), [8.0, 9.0, 10.0, 11.0])[1] == "none"
+    with pytest.raises(AspEnvError, match=r"2 hours of the clock \(8:00, 10:00\).*needs three"):
+        split_by_daytime(np.array([4, 0, 4, 4]), [8.0, 9.0, 10.0, 10.5])
 
 
 def test_recordings_without_snippets_are_left_out() -> None:

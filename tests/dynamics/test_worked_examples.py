@@ -97,6 +97,17 @@ def test_driving_backwards() -> None:
     np.testing.assert_allclose(states[:, 0], [0.16, 0.24, 0.24, 0.16], atol=1e-12)
 
 
+def test_a_vehicle_that_drives_backwards() -> None:
+    """From -1 m/s: on at -1, no faster under -2 m/s², -0.6 and -0.2 under 2, then forwards 0.2.
+
+    By Heun's method it is at -0.2, -0.4, -0.56, -0.64 and -0.64 m. Braking then ends at rest.
+    """
+    actions = [(0.0, 0.0), (-2.0, 0.0), (2.0, 0.0), (2.0, 0.0), (2.0, 0.0), (-2.0, 0.0)]
+    states = drive((0.0, 0.0, 0.0, -1.0), actions)
+    assert states[:, 3] == pytest.approx([-1.0, -1.0, -0.6, -0.2, 0.2, 0.0], abs=1e-12)
+    assert states[:, 0] == pytest.approx([-0.2, -0.4, -0.56, -0.64, -0.64, -0.62], abs=1e-12)
+
+
 def test_inverse_has_the_time_step_that_the_paper_lacks() -> None:
     """At 8 m/s and 0.1 rad the paper's formula gives 0.020 rad instead of 0.100 rad."""
     start = np.array([0.0, 0.0, 0.0, 8.0])

@@ -10,7 +10,7 @@ from stable_baselines3.common.env_checker import check_env as check_env_sb3
 
 import asp_env
 from asp_env.envs.replay import ReplayEnv
-from asp_env.sim.observation import OBSERVATION_NAMES
+from asp_env.sim.observation import observation_names
 
 COMPONENTS = ("raster", "vectors", "actions", "state", "route")
 SUBSETS = [names for n in range(1, 6) for names in itertools.combinations(COMPONENTS, n)]
@@ -50,7 +50,7 @@ def test_default_spaces(crossing):
     assert set(np.unique(obs["raster"])) == {0, 255}
 
 
-@pytest.mark.parametrize("name", OBSERVATION_NAMES)
+@pytest.mark.parametrize("name", observation_names())
 def test_observations_are_finite_and_within_finite_bounds(crossing, name):
     """Also far off the road."""
     env = ReplayEnv(crossing, observations=(name,))

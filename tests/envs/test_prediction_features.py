@@ -280,3 +280,36 @@ def test_unsuitable_environments_are_rejected(crossing):
     env = PredictionFeatures(_env(crossing), "constant-velocity")
     with pytest.raises(asp_env.AspEnvError, match="has an entry 'forecast' already"):
         PredictionFeatures(env, "constant-turn-rate")
+
+
+@pytest.mark.parametrize("name", ["ssp-asp", "mtp"])
+def test_features_of_a_trained_predictor(crossing, tmp_path, name):
+    """Those of the forecast, at the rank of each agent; zeros where there is no forecast."""
+    run = Case(name, "vectors").save(tmp_path)
+    env = PredictionFeatures(_env(crossing), run, agents=4, features=True)
+    size = 16 if name == "ssp-asp" else 8
+    box = env.observation_space["forecast_features"]  # pyright: ignore[reportIndexIssue]
+    assert (box.shape, box.dtype) == ((4 * size,), np.float32)
+    predictor = load_predictor(run, horizon=15, dt_s=0.2)
+    seen, _ = env.reset(options={"scenario": 1})
+    assert seen in env.observation_space
+    targets, _ = nearest_agents(_scene(env), 4)
+    forecast = predictor.predict(_scene(env).with_targets(targets))
+    shown = seen["forecast_features"].reshape(4, size)
+    assert forecast.features is not None
+    assert forecast.features.any()
+    np.testing.assert_array_equal(shown[: len(targets)], forecast.features)
+    assert not shown[: len(targets)][~forecast.valid].any()
+    envs = asp_env.VectorPredictionFeatures(_envs(crossing, 1), run, agents=4, features=True)
+    together, _ = envs.reset(options={"scenario": [1]})
+    np.testing.assert_array_equal(together["forecast_features"][0], seen["forecast_features"])
+
+
+def test_features_need_a_trained_predictor(crossing):
+    with pytest.raises(
+        asp_env.AspEnvError, match="constant-velocity has no features, only trained"
+    ):
+        PredictionFeatures(_env(crossing), "constant-velocity", features=True)
+    space = PredictionFeatures(_env(crossing), Fan((1.0,))).observation_space
+    assert isinstance(space, gymnasium.spaces.Dict)
+    assert "forecast_features" not in space.spaces

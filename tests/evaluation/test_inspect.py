@@ -2,6 +2,7 @@
 
 import math
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pandas as pd
@@ -68,6 +69,19 @@ def test_straight_tracks_do_not_drift() -> None:
     assert moves.tolist() == [True, True, False]
 
 
+def test_euler_lags_behind() -> None:
+    """At 1 m/s² each tick of 0.2 s is 0.5 · 1 · 0.2² = 0.02 m short: 0.3 m after 15 ticks."""
+    time = np.arange(500) / RATE_HZ
+    zeros = np.zeros_like(time)
+    cars = recording(np.stack([5 * time + 0.5 * time**2, zeros, zeros, 5 + time], axis=-1))
+    for integrator, expected_m in (("heun", 0.0), ("euler", 0.3)):
+        method: Any = integrator
+        metres, _ = drift_m(
+            cars, np.zeros(1, int), np.full(1, 15), dt_s=DT_S, horizon=15, integrator=method
+        )
+        assert metres[0] == pytest.approx(expected_m, abs=1e-3)
+
+
 def test_lateral_speed_is_drift() -> None:
     """1 m/s to the side is 3 m after 3 s and 6 m after 6 s."""
     cars = recording(straight(8.0, sideways_mps=1.0))
@@ -110,8 +124,9 @@ def test_tables(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
     out = capsys.readouterr().out
     row = next(line for line in out.splitlines() if line.startswith("│ 00"))
     cells = [cell.strip() for cell in row.strip("│").split("│")]
-    assert cells[:8] == ["00", "1", "25", "10.0", "747", "3", "2 car, 1 pedestrian", "0"]
-    assert cells[8:] == ["100", "13", "3", "no"]
+    assert cells[:3] == ["00", "1", "Mon 8:00"]
+    assert cells[3:9] == ["25", "10.0", "747", "3", "2 car, 1 pedestrian", "0"]
+    assert cells[9:] == ["100", "13", "3", "no"]
     row = next(line for line in out.splitlines() if line.startswith("│ location1"))
     cells = [cell.strip() for cell in row.strip("│").split("│")]
     assert cells[:4] == ["location1", "2", "0", "3"]

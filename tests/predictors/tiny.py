@@ -11,7 +11,7 @@ import torch
 from asp_env import registry
 from asp_env.data.recording import Recording
 from asp_env.data.snippets import index_snippets
-from asp_env.views import make_view
+from asp_env.views import RasterView, make_view, with_history
 from predictors.inference.checkpoint import PredictorSpec, save_trained, shape_for
 from predictors.inference.feature_distance import FeatureDistance
 from predictors.models.batch import Batch, Labels
@@ -30,9 +30,11 @@ SIZES = {"features": 8, "hidden": 8, "gru_width": 8, "gru_layers": 1}
 
 def pixels_of(view: str) -> tuple[int, int] | None:
     """Height and width of the rasters of a view in tests."""
-    if view.startswith("vectors"):
+    drawn = make_view(view)
+    if not isinstance(drawn, RasterView):
         return None
-    return (36, 36) if view == "mtp" else PIXELS
+    _, height, width = drawn.shape
+    return (36, 36 * width // height)
 
 
 def tiny_network(
@@ -41,7 +43,7 @@ def tiny_network(
     """The network's configuration of a recipe with `SIZES` and further changes."""
     config = recipe(predictor, preset, view=view, horizon_s=3.0).network
     small: dict[str, Any] = {n: size for n, size in SIZES.items() if getattr(config, n, 0)}
-    small["encoder"] = "vector" if view.startswith("vectors") else "small"
+    small["encoder"] = "vector" if pixels_of(view) is None else "small"
     return dataclasses.replace(config, **{**small, **changes})
 
 
@@ -61,10 +63,10 @@ def tiny_config(
     return dataclasses.replace(config, **changes)
 
 
-def tiny_shape(view: str = "chauffeurnet", horizon: int = 15) -> NetworkShape:
+def tiny_shape(view: str = "chauffeurnet", horizon: int = 15, history: int = 15) -> NetworkShape:
     """The shape of a network for small rasters, or for vectors."""
-    drawn = make_view(view, pixels=pixels_of(view))
-    return shape_for(drawn, history=15, horizon=horizon, dt_s=0.2, action_range=RANGE)
+    drawn = with_history(make_view(view, pixels=pixels_of(view)), history)
+    return shape_for(drawn, history=history, horizon=horizon, dt_s=0.2, action_range=RANGE)
 
 
 def make_network(
@@ -117,10 +119,16 @@ def save_random(
     seed: int = 0,
     preset: str = "cpu",
     temperature: float = 1.0,
+    history: int = 15,
+    **changes: Any,
 ) -> Path:
-    """Writes a checkpoint of a tiny network with random weights and returns the folder."""
+    """Writes a checkpoint of a tiny network with random weights and returns the folder.
+
+    The network differs from the recipe's by `SIZES` and `changes`.
+    """
     spec: PredictorSpec = registry.find("predictors", predictor)
-    config, shape = tiny_network(predictor, view, preset=preset), tiny_shape(view, horizon)
+    config = tiny_network(predictor, view, preset=preset, **changes)
+    shape = tiny_shape(view, horizon, history)
     network = make_network(predictor, config, shape, seed=seed)
     folder.mkdir(parents=True)
     save_trained(
@@ -128,7 +136,7 @@ def save_random(
         spec=spec,
         network_config=config,
         shape=shape,
-        view=make_view(view, pixels=pixels_of(view)),
+        view=with_history(make_view(view, pixels=pixels_of(view)), history),
         weights=network.state_dict(),
         temperature=temperature,
         provenance={

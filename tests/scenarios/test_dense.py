@@ -11,7 +11,7 @@ from asp_env.data.source import open_data
 from asp_env.errors import AspEnvError
 from asp_env.geometry import boxes_overlap
 from scenarios.sumo import synthesize
-from scenarios.sumo.demand import demand
+from scenarios.sumo.demand import demand, usual_mix
 from scenarios.sumo.drivers import TEMPERAMENTS, dense_driver
 from scenarios.sumo.sites import LEFT_TURN_RAD, Arm, crossroads, right_turn_rad, two_lane_roundabout
 from scenarios.synthesize import Synthesize
@@ -22,7 +22,8 @@ def left_share(traffic: str) -> float:
     site = crossroads(np.random.default_rng(0), left_lanes=True)
     angle = {arm.enter: arm.angle_rad for arm in site.arms}
     angle |= {arm.leave: arm.angle_rad for arm in site.arms}
-    wanted = demand(np.random.default_rng(1), site, 36000.0, traffic)  # pyright: ignore
+    mix = usual_mix(site.kind, traffic)  # pyright: ignore
+    wanted = demand(np.random.default_rng(1), site, 36000.0, mix)
     trips = [trip.attrib for trip in ElementTree.fromstring(f"<r>{wanted.routes}</r>").iter("trip")]
     turns = [right_turn_rad(angle[trip["from"]], angle[trip["to"]]) for trip in trips]
     return float(np.mean(np.array(turns) < -LEFT_TURN_RAD))
@@ -39,7 +40,7 @@ def test_vehicles_follow_each_other_after_3_to_6_s_on_the_main_road() -> None:
     for seed in range(20):
         rng = np.random.default_rng(seed)
         site = crossroads(rng, left_lanes=True)
-        wanted = demand(rng, site, 3600.0, "dense")
+        wanted = demand(rng, site, 3600.0, usual_mix(site.kind, "dense"))
         main = sorted(site.arms, key=lambda arm: -arm.weight)[:2]
         gaps += [3600.0 / wanted.routes.count(f'from="{arm.enter}"') for arm in main]
     assert 3.0 < np.mean(gaps) < 7.0
@@ -76,7 +77,7 @@ def test_the_left_lane_of_a_main_road_is_for_left_turns_only() -> None:
     arms: dict[str, Arm] = {arm.enter: arm for arm in site.arms}
     ends = {arm.leave: arm for arm in site.arms}
     assert sorted(arm.lanes for arm in site.arms) == [1, 1, 2, 2]
-    wanted = demand(rng, site, 3600.0, "dense")
+    wanted = demand(rng, site, 3600.0, usual_mix(site.kind, "dense"))
     for trip in ElementTree.fromstring(f"<r>{wanted.routes}</r>").iter("trip"):
         begin, end = arms[trip.attrib["from"]], ends[trip.attrib["to"]]
         left = right_turn_rad(begin.angle_rad, end.angle_rad) < -LEFT_TURN_RAD
@@ -113,7 +114,7 @@ def test_no_vehicle_overlaps_anything(dense: Path) -> None:
         assert moving >= 15
 
 
-@pytest.mark.parametrize("traffic", ["normal", "dense"])
+@pytest.mark.parametrize("traffic", ["normal", "dense", "varied"])
 def test_bytes_do_not_depend_on_the_number_of_processes(tmp_path: Path, traffic: str) -> None:
     """Three locations, written by one process and by two."""
     contents = []

@@ -35,7 +35,7 @@ def test_channels_are_in_the_documented_order() -> None:
     assert ChauffeurNet().shape == (12, 360, 240)
     assert ChauffeurNet.channels[:4] == ("road_boundary", "ego_box", "ego_trail", "agents_0")
     assert ChauffeurNet.channels[-1] == "agents_8"
-    assert ChauffeurNet.history == 15
+    assert ChauffeurNet().history == 15
 
 
 def test_lone_ego_on_an_empty_map() -> None:
@@ -112,6 +112,13 @@ def test_snapshots_are_those_of_the_paper() -> None:
         drawn = np.flatnonzero(COARSE.render(scene)[0, 3:].any(axis=(1, 2))).tolist()
         assert drawn == [i for i, snapshot in enumerate(SNAPSHOT_TICKS) if snapshot == state]
     assert SNAPSHOT_TICKS == (0, 2, 4, 6, 8, 9, 11, 13, 15)
+
+
+def test_snapshots_are_regular_intervals_rounded_to_ticks() -> None:
+    """Nine snapshots of 3 s are 1.875 ticks apart; each is at most half a tick off, 7.5 at 8."""
+    regular = np.arange(9) * 15 / 8
+    assert np.round(regular).tolist() == list(SNAPSHOT_TICKS)  # halves to even
+    assert np.abs(regular - SNAPSHOT_TICKS).max() == 0.5
 
 
 def test_of_longer_histories_the_last_15_ticks_are_drawn() -> None:

@@ -1,9 +1,8 @@
-"""Raster views: what must not change the raster."""
+"""Raster views: what must not change the raster, besides `tests/conformance/test_views.py`."""
 
 import copy
 import dataclasses
 import math
-import pickle
 
 import numpy as np
 import pytest
@@ -17,7 +16,6 @@ from asp_env.views import MTP, BinaryView, ChauffeurNet, RasterView
 from asp_env.views.raster import Viewport
 from tests.views.scenes import (
     RASTER_VIEWS,
-    busy_scene,
     channel,
     cross_map,
     make_map,
@@ -109,82 +107,6 @@ def test_ego_box_is_the_same_at_every_pose() -> None:
     boxes = (view.render(scene) == np.array([255, 0, 0])[:, None, None]).all(axis=1)
     assert (boxes == boxes[0]).all()
     assert boxes[0].sum() == 19 * 7
-
-
-@pytest.mark.parametrize("view", [*RASTER_VIEWS, ChauffeurNet(), MTP()], ids=lambda view: view.name)
-def test_rendering_into_an_array_equals_rendering_a_new_one(view: RasterView) -> None:
-    """`out` is returned and equals a new raster bit for bit, regardless of its content before."""
-    scene = busy_scene()
-    scene.valid[0, 3, -1] = False  # one of the targets is absent
-    out = np.full((len(scene.targets), *view.shape), 77, dtype=np.uint8)
-    assert view.render(scene, out) is out
-    np.testing.assert_array_equal(out, view.render(scene))
-
-
-@EACH
-def test_targets_do_not_depend_on_each_other(view: RasterView) -> None:
-    scene = busy_scene()
-    together = view.render(scene)
-    reversed_ = view.render(scene.with_targets(scene.targets[::-1].copy()))
-    np.testing.assert_array_equal(reversed_[::-1], together)
-    for row, target in enumerate(scene.targets):
-        alone = view.render(scene.with_targets(target[None]))
-        np.testing.assert_array_equal(alone[0], together[row])
-
-
-@EACH
-def test_order_of_slots_does_not_matter(view: RasterView) -> None:
-    scene = busy_scene()
-    order = np.random.default_rng(1).permutation(scene.states.shape[1])
-    targets = np.stack([scene.targets[:, 0], np.argsort(order)[scene.targets[:, 1]]], axis=1)
-    shuffled = dataclasses.replace(
-        scene,
-        **{
-            name: np.ascontiguousarray(getattr(scene, name)[:, order])
-            for name in ("states", "actions", "valid", "sizes", "classes", "ids")
-        },
-        targets=targets,
-    )
-    np.testing.assert_array_equal(view.render(shuffled), view.render(scene))
-
-
-@EACH
-@pytest.mark.parametrize("garbage", [math.nan, math.inf, 1e30, 3.0])
-def test_entries_that_are_not_valid_have_no_effect(garbage: float, view: RasterView) -> None:
-    """States that are not valid, and sizes and classes of absent agents, may be any number."""
-    scene = busy_scene()
-    scene.valid[:, 4] = False
-    clean = view.render(scene)
-    states, sizes, classes = scene.states.copy(), scene.sizes.copy(), scene.classes.copy()
-    states[~scene.valid] = garbage
-    sizes[:, 4] = garbage
-    classes[:, 4] = 99
-    dirty = dataclasses.replace(scene, states=states, sizes=sizes, classes=classes)
-    np.testing.assert_array_equal(view.render(dirty), clean)
-
-
-@EACH
-def test_an_absent_target_has_an_empty_raster(view: RasterView) -> None:
-    """The rasters of the other targets are unchanged."""
-    scene = busy_scene()
-    whole = view.render(scene)
-    scene.valid[0, 3, -1] = False
-    scene.states[0, 3, -1] = math.nan
-    rasters = view.render(scene)
-    assert not rasters[1].any()
-    np.testing.assert_array_equal(rasters[[0, 3, 4]], whole[[0, 3, 4]])
-    assert whole.any(axis=(1, 2, 3)).all()
-
-
-@EACH
-def test_copies_contain_only_the_configuration(view: RasterView) -> None:
-    """Pickled and copied views are equal, render the same and contain no cached map."""
-    empty = len(pickle.dumps(view))
-    raster = view.render(busy_scene())
-    for again in (pickle.loads(pickle.dumps(view)), copy.deepcopy(view)):
-        assert again == view
-        np.testing.assert_array_equal(again.render(busy_scene()), raster)
-    assert len(pickle.dumps(view)) == empty
 
 
 @EACH

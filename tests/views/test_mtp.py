@@ -45,7 +45,7 @@ def only_at(state: int, agents: int = 2) -> np.ndarray:
 def test_channels() -> None:
     assert MTP().shape == (3, 360, 360)
     assert MTP.channels == ("red", "green", "blue")
-    assert 0.2 * MTP.history == 2.0
+    assert 0.2 * MTP().history == 2.0
 
 
 def test_the_ground_by_hand() -> None:

@@ -38,6 +38,8 @@ class TrackTable:
     """[x m, y m, heading rad, speed m/s signed along the heading]."""
     repairs: tuple[str, ...]
     """One line for each kind of repair."""
+    accelerations: Float[np.ndarray, " rows"] | None = None
+    """Accelerations along the direction of motion, m/s²; None if the files have none."""
 
 
 def walk(root: Path) -> list[tuple[Path, list[str]]]:

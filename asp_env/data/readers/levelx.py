@@ -17,6 +17,7 @@ from jaxtyping import Float, Int
 from asp_env.data.classes import FOOTPRINTS_M, VULNERABLE
 from asp_env.data.readers.lanelet2 import Origin, read_osm, to_local
 from asp_env.data.readers.layout import (
+    COURSE_ABOVE_MPS,
     TrackTable,
     classes_of,
     find_maps,
@@ -48,6 +49,7 @@ MARGIN_PX = 5.0
 Chosen by hand."""
 
 _PART = re.compile(r"^(.+)_(recordingMeta\.csv|tracksMeta\.csv|tracks\.csv(?:\.gz)?)$")
+_TIME = re.compile(r"^(\d{1,2}(?:\.\d*)?)(?::([0-5]\d)(?::[0-5]\d)?)?$")
 _META: Mapping[str, Kind] = {
     "trackId": "whole",
     "initialFrame": "whole",
@@ -67,6 +69,7 @@ _TRACKS: Mapping[str, Kind] = {
     "width": "number",
     "length": "number",
 }
+_ACCELERATIONS = ("xAcceleration", "yAcceleration", "lonAcceleration")
 _MEASURED = ("xCenter", "yCenter", "heading", "xVelocity", "yVelocity")
 
 
@@ -112,6 +115,9 @@ class RecordingMeta:
     speed_limit_mps: float | None
     metres_per_ortho_pixel: float | None
     origin: Origin
+    start_hour: float | None = None
+    """Time of day of the first frame, hours after midnight."""
+    weekday: str | None = None
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -123,6 +129,9 @@ class _Rows:
     measured: Float[np.ndarray, "rows 5"]
     """x, y, heading in degrees, velocity along x and y."""
     sizes: Float[np.ndarray, "rows 2"]
+    accelerations: Float[np.ndarray, "rows 3"] | None
+    """Along x, along y and along the heading, NaN where the file lacks one of these columns; None
+    if it lacks all of them."""
 
 
 def find_recordings(root: Path) -> tuple[LevelxFiles, ...]:
@@ -186,6 +195,8 @@ def read_recording_meta(path: Path) -> RecordingMeta:
             longitude_deg=float(table["lonLocation"][0]),
             latitude_deg=float(table["latLocation"][0]),
         ),
+        start_hour=_hour(_text_or_none(path, "startTime")),
+        weekday=_text_or_none(path, "weekday"),
     )
 
 
@@ -269,7 +280,9 @@ def read_levelx(files: LevelxFiles) -> TrackTable:
     The heading of a vehicle is that of the file; its speed is the norm of the velocity, negative if
     the vehicle moves backwards. The heading of a vulnerable road user is its direction of motion;
     below 0.3 m/s the previous heading is held, and before the first motion it is that of the file.
-    A track with a gap in its frames is split there, and the later part gets a new id.
+    Accelerations are those of the file along the velocity, or along the heading below 0.3 m/s or
+    without the columns `xAcceleration` and `yAcceleration`. A track with a gap in its frames is
+    split there, and the later part gets a new id.
 
     Raises:
         DataError: a file is damaged, or the two tables list different tracks.
@@ -291,10 +304,14 @@ def read_levelx(files: LevelxFiles) -> TrackTable:
     owner = np.searchsorted(ids, rows.track[starts])
     vulnerable = np.isin(classes[owner], [int(kind) for kind in VULNERABLE])
     states = states_of(rows.measured, np.repeat(starts, lengths), np.repeat(vulnerable, lengths))
+    accelerations = _along_motion(rows, states)
     by_id = np.argsort(new_ids, kind="stable")
     if (np.diff(by_id) < 0).any():
         ends = starts + lengths
-        states = np.concatenate([states[starts[track] : ends[track]] for track in by_id])
+        pieces = [slice(starts[track], ends[track]) for track in by_id]
+        states = np.concatenate([states[piece] for piece in pieces])
+        if accelerations is not None:
+            accelerations = np.concatenate([accelerations[piece] for piece in pieces])
     return TrackTable(
         track_ids=new_ids[by_id],
         classes=classes[owner][by_id],
@@ -302,8 +319,26 @@ def read_levelx(files: LevelxFiles) -> TrackTable:
         first_frames=rows.frame[starts][by_id].astype(np.int64),
         starts=np.concatenate([[0], np.cumsum(lengths[by_id])]).astype(np.int64),
         states=states,
+        accelerations=accelerations,
         repairs=tuple(repairs),
     )
+
+
+def _along_motion(
+    rows: _Rows, states: Float[np.ndarray, "rows 4"]
+) -> Float[np.ndarray, " rows"] | None:
+    """Accelerations along the direction of motion, signed as the speed of the states."""
+    if rows.accelerations is None:
+        return None
+    along_x, along_y, along_heading = rows.accelerations.T
+    velocity_x, velocity_y = rows.measured[:, 3], rows.measured[:, 4]
+    speed = np.hypot(velocity_x, velocity_y)
+    backwards = states[:, 3] < 0
+    course = np.arctan2(velocity_y, velocity_x) + np.where(backwards, np.pi, 0)
+    course = np.where(speed > COURSE_ABOVE_MPS, course, states[:, 2])
+    along_course = along_x * np.cos(course) + along_y * np.sin(course)
+    found = np.where(np.isnan(along_course), along_heading, along_course)
+    return None if np.isnan(found).any() else found.astype(np.float32)
 
 
 def _names_location(path: Path, location: int) -> bool:
@@ -343,6 +378,23 @@ def _positive_or_none(path: Path, column: str) -> float | None:
     return value if value > 0 else None
 
 
+def _text_or_none(path: Path, column: str) -> str | None:
+    """The cell of an optional column, without spaces around it; None if it is empty."""
+    try:
+        return str(read_table(path, {column: "text"})[column][0]).strip() or None
+    except DataError:
+        return None
+
+
+def _hour(text: str | None) -> float | None:
+    """Hours after midnight of `11`, `11.5` or `11:30`; None for anything else."""
+    match = _TIME.match(text or "")
+    if match is None:
+        return None
+    hour = float(match[1]) + int(match[2] or 0) / 60
+    return hour if hour < 24 else None
+
+
 def _check_unique(files: LevelxFiles, ids: Int[np.ndarray, " metas"]) -> None:
     values, counts = np.unique(ids, return_counts=True)
     if len(values) < len(ids):
@@ -355,20 +407,26 @@ def _check_unique(files: LevelxFiles, ids: Int[np.ndarray, " metas"]) -> None:
 
 
 def _read_rows(files: LevelxFiles) -> _Rows:
-    track, frame, measured, sizes = [], [], [], []
-    optional = frozenset({"width", "length"})
-    for chunk in read_columns(files.tracks, _TRACKS, optional=optional):
+    track, frame, measured, sizes, accelerations = [], [], [], [], []
+    columns: dict[str, Kind] = {**_TRACKS, **dict.fromkeys(_ACCELERATIONS, "number")}
+    optional = frozenset({"width", "length", *_ACCELERATIONS})
+    for chunk in read_columns(files.tracks, columns, optional=optional):
         track.append(chunk["trackId"].astype(np.int32))
         frame.append(chunk["frame"].astype(np.int32))
         measured.append(np.stack([chunk[name] for name in _MEASURED], axis=-1).astype(np.float32))
         unknown = np.zeros(len(chunk["frame"]))
         size = [chunk.get("length", unknown), chunk.get("width", unknown)]
         sizes.append(np.stack(size, axis=-1).astype(np.float32))
+        if any(name in chunk for name in _ACCELERATIONS):
+            missing = np.full(len(chunk["frame"]), np.nan)
+            found = [chunk.get(name, missing) for name in _ACCELERATIONS]
+            accelerations.append(np.stack(found, axis=-1).astype(np.float32))
     rows = _Rows(
         track=np.concatenate(track),
         frame=np.concatenate(frame),
         measured=np.concatenate(measured),
         sizes=np.concatenate(sizes),
+        accelerations=np.concatenate(accelerations) if accelerations else None,
     )
     return _sorted(files, rows)
 
@@ -382,6 +440,7 @@ def _sorted(files: LevelxFiles, rows: _Rows) -> _Rows:
             frame=rows.frame[order],
             measured=rows.measured[order],
             sizes=rows.sizes[order],
+            accelerations=None if rows.accelerations is None else rows.accelerations[order],
         )
         same = (np.diff(rows.track) == 0) & (np.diff(rows.frame) == 0)
         if same.any():

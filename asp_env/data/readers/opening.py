@@ -109,6 +109,7 @@ def _recording(files: RecordingFiles, meta: Meta, road_map: RoadMap) -> Recordin
     sources = [*files.tables, *([files.background] if files.background else [])]
     facts, arrays = _cached(files.tracks, sources, lambda: _track_entry(files, meta), "tracks")
     scale = facts["metres_per_pixel"]
+    columns: dict[str, Any] = arrays
     background = None
     if files.background is not None and scale is not None:
         background = Background(path=files.background, metres_per_pixel=scale)
@@ -121,7 +122,9 @@ def _recording(files: RecordingFiles, meta: Meta, road_map: RoadMap) -> Recordin
         road_map=road_map,
         background=background,
         repairs=tuple(facts["repairs"]),
-        **arrays,
+        start_hour=meta.start_hour if isinstance(meta, RecordingMeta) else None,
+        weekday=meta.weekday if isinstance(meta, RecordingMeta) else None,
+        **columns,
     )
 
 
@@ -145,7 +148,10 @@ def _track_entry(files: RecordingFiles, meta: Meta) -> CacheEntry:
         "metres_per_pixel": scale,
         "repairs": repairs,
     }
-    return facts, {name: getattr(table, name) for name in _TRACK_COLUMNS}
+    arrays = {name: getattr(table, name) for name in _TRACK_COLUMNS}
+    if table.accelerations is not None:
+        arrays["accelerations"] = table.accelerations
+    return facts, arrays
 
 
 def _scale(

@@ -3,14 +3,14 @@
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any
 
 import numpy as np
 import tyro
 from jaxtyping import Bool, Int
 from rich.console import Console
 
-from asp_env.data.causal import causal_histories
+from asp_env.data.histories import History, histories
 from asp_env.data.predictor import Predictor
 from asp_env.data.recording import DEFAULT_DT_S, ticks
 from asp_env.data.scenarios.scenario import find_scenarios
@@ -90,10 +90,14 @@ class Evaluate:
     part: PartChoice = "auto"
     """Part of DATA; auto is all of it that no predictor was
     trained or selected on."""
-    history: Literal["recorded", "causal"] = "recorded"
+    history: History = "recorded"
     """Histories that predictors observe: as recorded (smoothed
-    with later frames), or filtered again without later frames.
-    The ground truth is always as recorded."""
+    with later frames); filtered again without later frames
+    (causal); or as recorded, with the accelerations of the
+    files in past actions (accelerations). The ground truth is
+    always as recorded."""
+    parked: bool = False
+    """Count parked vehicles as targets, too."""
     best_by: ModeRule = "fde"
     """How the best of 3 modes is chosen: lowest final error,
     lowest mean error, or the rule of the paper."""
@@ -165,12 +169,11 @@ def evaluate(config: Evaluate) -> OpenLoopResult:
         dt_s=config.dt,
         horizon_s=config.horizon,
         history_s=max(HISTORY_S, *(predictor.history * config.dt for predictor in loaded)),
+        parked=config.parked,
     )
     index = snippets_within(index, allowed)
     predictors = dict(zip(names, loaded, strict=True))
-    scenes: Sequence[Any] = recordings
-    if config.history == "causal":
-        scenes = causal_histories(recordings)
+    scenes = histories(recordings, config.history)
     scores = score_forecasts(
         predictors, index, scenes=scenes, recorded=recordings, best_by=config.best_by
     )
@@ -195,6 +198,7 @@ def evaluate(config: Evaluate) -> OpenLoopResult:
             "dt_s": config.dt,
             "part": part,
             "history": config.history,
+            "parked": config.parked,
             "recordings": len(np.unique(index.recording)),
             "snippets": len(index),
             "moving snippets": int(moving.sum()),

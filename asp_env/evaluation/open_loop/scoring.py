@@ -225,7 +225,7 @@ def forecast_metrics(
         (ALL_MODES, "NLL"): mixture_nll(local[:, :, -1], sample.log_probs, true[:, -1], known),
         (ALL_MODES, "Brier"): brier(sample.log_probs, nearest, known),
     }
-    violations = _violations(sample, truth, on_road, dt_s=dt_s)
+    violations = mode_violations(sample, truth, on_road, dt_s=dt_s)
     for metric, (violates, applies) in violations.items():
         metrics[ALL_MODES, metric] = Masked(value=violates.mean(axis=1), valid=applies)
     for selection in SELECTIONS:
@@ -239,10 +239,20 @@ def forecast_metrics(
     return metrics
 
 
-def _violations(
+def mode_violations(
     sample: ForecastSample, truth: GroundTruth, on_road: Bool[np.ndarray, " n"], *, dt_s: float
 ) -> dict[str, tuple[Bool[np.ndarray, "n m"], Bool[np.ndarray, " n"]]]:
-    """For each rule, a mask of the modes that violate it and one of the targets it applies to."""
+    """Which modes cannot be driven: `off-road`, `overlap` and `infeasible`.
+
+    Args:
+        sample: the forecasts.
+        truth: the ground truth of the same targets.
+        on_road: mask of the targets for which the off-road rate is defined, see `stays_on_road`.
+        dt_s: duration of a tick in seconds.
+
+    Returns:
+        For each rule, a mask of the modes that violate it and one of the targets it applies to.
+    """
     future = truth.future
     known = np.asarray(future.valid.all(axis=1))
     off_road, _ = off_road_modes(truth.maps, truth.map_index, sample.states[..., :2])

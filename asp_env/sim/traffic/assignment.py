@@ -1,5 +1,6 @@
 """Assignment of agents to drivers: by id, by class, or by default."""
 
+import dataclasses
 import re
 from collections.abc import Mapping, Sequence
 from typing import Any
@@ -92,13 +93,16 @@ class Traffic:
     def control(self, world: World) -> Control:
         """The controls of all drivers, merged; drivers without any agent are not called."""
         merged = no_control(world.episodes.ids.shape)
+        euler = np.zeros(merged.controlled.shape, dtype=bool)
         for driver, mask in zip(self.drivers, self._masks, strict=True):
             if mask.any():
                 control = driver.control(world)
                 np.copyto(merged.actions, control.actions, where=control.controlled[..., None])
                 np.logical_or(merged.controlled, control.controlled, out=merged.controlled)
                 np.logical_or(merged.leaving, control.leaving, out=merged.leaving)
-        return merged
+                if control.euler is not None:
+                    np.logical_or(euler, control.euler, out=euler)
+        return dataclasses.replace(merged, euler=euler if euler.any() else None)
 
 
 def make_traffic(

@@ -33,6 +33,9 @@ class Control:
     absent."""
     leaving: Bool[np.ndarray, "b a"]
     """Mask of agents that leave now, or that will never appear."""
+    euler: Bool[np.ndarray, "b a"] | None = None
+    """Mask of agents whose action is integrated by Euler's method, because it belongs to a forecast
+    of that kind; None if all are integrated by Heun's."""
 
 
 @runtime_checkable

@@ -302,3 +302,26 @@ def test_background_is_found(tmp_path: Path) -> None:
     (data / "00_background.png").write_bytes(head)
     (files,) = find_recordings(tmp_path)
     assert files.background == data / "00_background.png"
+
+
+@pytest.mark.parametrize(
+    ("text", "expected"),
+    [("11", 11), ("11.5", 11.5), ("8:45", 8.75), ("08:45:30", 8.75), ("0", 0)]
+    + [(each, None) for each in ("", "-1", "NaN", "morning", "24", "8:75")],
+)
+def test_start_times(tmp_path: Path, text: str, expected: float | None) -> None:
+    """Hours as in inD, or a time of day; anything else counts as unknown."""
+    path = write_recording(tmp_path) / "00_recordingMeta.csv"
+    header, row = (line.split(",") for line in path.read_text().splitlines())
+    row[header.index("startTime")] = text
+    path.write_text(",".join(header) + "\n" + ",".join(row) + "\n")
+    assert read_recording_meta(path).start_hour == expected
+
+
+def test_without_start_time(tmp_path: Path) -> None:
+    path = write_recording(tmp_path) / "00_recordingMeta.csv"
+    header, row = (line.split(",") for line in path.read_text().splitlines())
+    keep = [i for i, name in enumerate(header) if name not in ("startTime", "weekday")]
+    path.write_text("\n".join(",".join(cells[i] for i in keep) for cells in (header, row)) + "\n")
+    meta = read_recording_meta(path)
+    assert (meta.start_hour, meta.weekday) == (None, None)

@@ -161,3 +161,27 @@ def test_data_without_snippets_are_an_error(tmp_path):
     write_crossing(tmp_path, drives=((car(-90, 5),),), seconds=5.0)
     with pytest.raises(AspEnvError, match="no snippet is left to evaluate on"):
         _evaluate(tmp_path, "oracle")
+
+
+PARKED = Drive(kind=AgentClass.CAR, start=(25.0, -6.0, 0.0, 0.0))
+
+
+@pytest.mark.parametrize("parked", [False, True])
+def test_parked_vehicles_count_if_asked_for(tmp_path, parked):
+    """Both cars are there for ticks 0 to 70 and have snippets at 15, 18, …, 54: 14 each."""
+    write_crossing(tmp_path, drives=((car(-95, 8), PARKED),), seconds=14.0)
+    result = evaluate(
+        Evaluate(
+            data=str(tmp_path),
+            out=NOWHERE,
+            predictors=("constant-velocity",),
+            planner="none",
+            parked=parked,
+        )
+    )
+    counts = {row.subset: row.n for row in result.rows if row.metric == "FDE"}
+    assert counts["moving"] == 14
+    assert counts["all"] == 14 + 14 * parked
+    assert counts.get("standing", 0) == 14 * parked
+    assert result.manifest["parked"] is parked
+    assert result.manifest["snippets"] == counts["all"]

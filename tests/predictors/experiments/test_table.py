@@ -1,10 +1,13 @@
 """`asp-env table`: a small table, its numbers by hand, and errors."""
 
 import csv
+import dataclasses
 import fcntl
 import io
+import itertools
 import json
 import math
+import re
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -15,16 +18,24 @@ from rich.console import Console
 from asp_env.cli import main
 from asp_env.errors import AspEnvError
 from asp_env.evaluation import statistics
-from predictors.experiments.errors import METRICS, Errors, stamp_of
+from predictors.experiments.errors import METRICS, VIOLATIONS, Errors, stamp_of
 from predictors.experiments.results import (
     NO_SEED,
     Choice,
     Findings,
     Key,
     Sums,
+    Training,
     excludes_zero,
 )
-from predictors.experiments.tables import PAPER, difference_table, main_table, paper_errors
+from predictors.experiments.tables import (
+    PAPER,
+    difference_table,
+    main_table,
+    paper_errors,
+    training_table,
+    violation_table,
+)
 from tests.predictors.tiny import write_data
 
 MOST_PROBABLE = Choice("most-probable", "all")
@@ -36,6 +47,8 @@ def errors(fde: Sequence[float], *, shift: int = 0) -> Errors:
     """Errors of four snippets: three of one recording, the third of which stands, one of another.
 
     MAE, MSE and ADE are 0.1, 0.2 and 0.3 times FDE; the errors of the best mode are half as large.
+    A tenth of FDE is the share of infeasible modes and, of the first snippet alone, that of modes
+    off the road; no snippet shows whether modes overlap.
     """
     most_probable = np.array(fde) * np.array([0.1, 0.2, 0.3, 1.0])[:, None]
     return Errors(
@@ -45,6 +58,8 @@ def errors(fde: Sequence[float], *, shift: int = 0) -> Errors:
         track=np.array([1, 2, 3, 1]),
         tick=np.array([15, 15, 15, 15 + shift]),
         stamp="s",
+        violations=np.tile(np.array(fde, dtype=np.float32) / 10, (3, 1)),
+        violations_valid=np.array([[True] * 4, [True] + [False] * 3, [False] * 4]),
     )
 
 
@@ -113,6 +128,41 @@ def test_differences_are_over_common_seeds() -> None:
     rate = findings().differences(key("dkm"), physical, MOST_PROBABLE)["FDE"]
     assert rate.estimate.value == pytest.approx(-0.5)
     assert not excludes_zero(rate.estimate)
+
+
+def test_violations_by_hand() -> None:
+    """DKM: (0.1, 0.3, 0.2, 0.4) and (0.3, 0.5, 0.2, 0.8), so 0.25 and 0.45: 0.35 ± 0.2/√2."""
+    found = findings().violations(key("dkm"), "all")
+    assert list(found) == ["infeasible", "off-road"]
+    assert found["infeasible"].estimate.value == pytest.approx(0.35)
+    assert found["infeasible"].estimate.n == 4
+    assert found["infeasible"].spread == pytest.approx(0.2 / math.sqrt(2))
+    assert found["off-road"].estimate.value == pytest.approx(0.2)
+    assert found["off-road"].estimate.n == 1
+    moving = findings().violations(key("dkm"), "moving")["infeasible"].estimate
+    assert (moving.value, moving.n) == (pytest.approx(0.4), 3)
+    assert findings().violations(key("mtp"), "all") == {}
+
+
+def test_the_table_of_violations_shows_per_cent() -> None:
+    text = printed(violation_table(findings(), ["here"], [key("dkm")], "all"))
+    assert "35.0 / 20.0 / –" in text
+    assert "[26.7, 60.0]" in text
+
+
+def test_errors_of_earlier_versions_have_no_violations(tmp_path: Path) -> None:
+    """They are read as before, and their line shows none."""
+    old, path = errors([1, 2, 3, 4]), tmp_path / "errors.npz"
+    np.savez_compressed(
+        path,
+        **{
+            name: getattr(old, name)
+            for name in ("values", "moving", "recording", "track", "tick", "stamp")
+        },
+    )
+    sums = Sums.of(Errors.load(path))
+    np.testing.assert_array_equal(sums.errors, Sums.of(old).errors)
+    assert Findings(sums={key("dkm"): {0: sums}}).violations(key("dkm"), "all") == {}
 
 
 def test_references() -> None:
@@ -217,16 +267,62 @@ def test_a_whole_table(table: Path) -> None:
         rows = list(csv.DictReader(file))
     predictors = {row["predictor"] for row in rows}
     assert predictors == {"constant-velocity", "constant-turn-rate", "dkm"}
-    dkm = [row for row in rows if row["predictor"] == "dkm"]
+    dkm = [row for row in rows if row["predictor"] == "dkm" and row["selection"]]
     metrics = {f"{m}{less}" for m in METRICS for less in ("", " less constant-turn-rate")}
-    assert {row["metric"] for row in dkm} == metrics
-    assert {row["selection"] for row in dkm} == {"most-probable", "best-of-3"}
+    of_modes = [row for row in dkm if row["selection"]]
+    assert {row["metric"] for row in of_modes} == metrics
+    assert {row["selection"] for row in of_modes} == {"most-probable", "best-of-3"}
+    rates = {(r["metric"], r["subset"]) for r in dkm if not r["selection"]}
+    assert rates == set(itertools.product(VIOLATIONS, ("moving", "all")))
+    assert "infeasible / off-road / overlap" in (table / "table.txt").read_text()
     assert {(row["recipe"], row["view"]) for row in dkm} == {("cpu", "vectors")}
+    epochs = {row["metric"]: row["value"] for row in rows if "epochs" in row["metric"]}
+    assert {name: float(value) for name, value in epochs.items()} == {
+        "prediction epochs": 1.0,
+        "epochs of pre-training": 0.0,
+    }
+    text = (table / "table.txt").read_text()
+    assert "training, budget: prediction epochs" in text
+    assert re.search(r"DKM +1; \d+ s", text)
     assert "report.html" in content(table)
     assert "paper 0.48 / 0.86 / 2.01" in (table / "table.txt").read_text()
     manifest = json.loads((table / "manifest.json").read_text())
     assert manifest["failed"] == {}
     assert manifest["options"]["seeds"] == [0]
+    assert manifest["options"]["parked"] is False
+
+
+def test_a_table_of_equal_cpu_time(data: str, tmp_path: Path) -> None:
+    """The epochs follow from the stored costs: 3 · 2 s for the reference, 6 s / 4 s are 2."""
+    costs = tmp_path / "costs.json"
+    epochs = {
+        "mtp:cpu/vectors/3s": {"prediction_s": 2.0},
+        "dkm:cpu/vectors/3s": {"prediction_s": 4.0},
+    }
+    costs.write_text(json.dumps({"reference": "mtp:cpu", "epochs": epochs}))
+    out = tmp_path / "table"
+    given = ["--budget", "cpu", "--cpu-reference", "mtp", "--costs", str(costs), "--epochs", "3"]
+    assert main(["table", data, "--out", str(out), *OPTIONS, *given]) == 0
+    config = json.loads(next(out.glob("runs/*/vectors/dkm/3s/seed0/config.json")).read_text())
+    assert config["provenance"]["trained_epochs"] == 2
+    text = " ".join((out / "table.txt").read_text().split())
+    assert "training, budget: CPU time of mtp:cpu" in text
+    assert re.search(r"DKM +2; \d+ s", text)
+    manifest = json.loads((out / "manifest.json").read_text())
+    assert manifest["epoch costs"]["epochs"]["dkm:cpu/vectors/3s"]["prediction_s"] == 4.0
+    assert main(["table", data, "--out", str(out), *OPTIONS, "--epochs", "3"]) == 2
+
+
+def test_the_training_of_a_line_by_hand() -> None:
+    """Epochs of several seeds are a range, CPU times a mean; unknown times are left out."""
+    column = key("dkm")
+    runs = [Training(20, 0, 100.0), Training(31, 0, 140.0)]
+    found = dataclasses.replace(findings(), training={column: runs})
+    text = printed(training_table(found, ["here"], [column], "in words"))
+    assert "training, budget: in words" in text
+    assert "20 to 31; 120 s" in text
+    found = dataclasses.replace(findings(), training={column: [Training(8, 2, None)]})
+    assert "8 + 2 " in printed(training_table(found, ["here"], [column], "in words"))
 
 
 def test_a_finished_table_is_not_repeated(data: str, table: Path) -> None:
@@ -287,6 +383,10 @@ def test_failed_cells_end_with_status_1(
         (["--horizons", "0.3"], "0.3"),
         (["--jobs", "-1"], "jobs is -1"),
         (["--epochs", "0"], "epochs is 0"),
+        (["--patience", "2"], "patience is 2 with the budget epochs"),
+        (["--budget", "cpu", "--ablations", "long"], "unknown ablation 'long'"),
+        (["--budget", "cpu", "--cpu-reference", "dkn"], "did you mean 'dkm'"),
+        (["--ablations", "nearest"], "unknown ablation 'nearest'"),
         (["--validation", "DATA"], "nothing is left to evaluate on; give --test too"),
         (["--test", "DATA", "DATA"], "--test: 2 given, expected one for each of the 1 DATA"),
         (["--test", "DATA"], "evaluate on recordings that are neither trained nor selected on"),
@@ -312,6 +412,10 @@ def test_folders_of_other_tables_are_refused(
     """A table with other options, and a folder with something else."""
     assert main(["table", data, "--out", str(table), *OPTIONS, "--epochs", "2"]) == 2
     assert "contains a table with other epochs" in capsys.readouterr().err
+    assert main(["table", data, "--out", str(table), *OPTIONS, "--budget", "converged"]) == 2
+    assert "contains a table with other budget;" in capsys.readouterr().err
+    assert main(["table", data, "--out", str(table), *OPTIONS, "--parked"]) == 2
+    assert "contains a table with other parked" in capsys.readouterr().err
     (tmp_path / "letter.txt").write_text("dear")
     assert main(["table", data, "--out", str(tmp_path), *OPTIONS]) == 2
     assert "contains something that is no table" in capsys.readouterr().err

@@ -40,6 +40,7 @@ class Known(NamedTuple):
     """The part of a variant that a table uses."""
 
     horizons_s: tuple[float, ...] = (3.0,)
+    segment_s: float | None = None
 
 
 VARIANTS = {
@@ -123,6 +124,33 @@ def test_ablations_run_at_the_first_site_for_their_horizons() -> None:
         f"{place}-causal/6s/seed0": f"{place}-causal/3s/seed0",
     }
     assert any(cell.label == "constant-velocity-causal" for cell in cells)
+
+
+def test_other_segments_start_from_runs_for_one_segment() -> None:
+    """At 3 and 6 s from the same run for 1 s, which is not evaluated itself."""
+    ablation = Ablation(
+        predictor="ssp-asp",
+        name="segment-1s",
+        horizons_s=(3.0, 6.0),
+        warm_starts_from_3s=True,
+        segment_s=1.0,
+    )
+    cells = plan_cells(
+        sites=["a"],
+        models=[SSP],
+        views=["vectors"],
+        horizons_s=[3.0, 6.0],
+        seeds=[0],
+        ablations=[ablation],
+        ablation_view="vectors",
+    )
+    place = "a/vectors/ssp-asp-segment-1s"
+    starts = {each.name: each.start and each.start.name for each in cells if each.variant}
+    assert starts == {
+        f"{place}/1s/seed0": None,
+        f"{place}/3s/seed0": f"{place}/1s/seed0",
+        f"{place}/6s/seed0": f"{place}/1s/seed0",
+    }
 
 
 def test_ablations_by_name() -> None:

@@ -14,9 +14,12 @@ import torch
 from safetensors.torch import load_file, save_file
 
 from asp_env.data.predictor import load_predictor
+from asp_env.data.scene import Scene
 from asp_env.data.snippets import gather_scene, index_snippets
 from asp_env.errors import AspEnvError, CheckpointError
 from asp_env.views import make_view
+from predictors.inference.checkpoint import load_trained
+from predictors.plugs import SSPASP
 from predictors.training.trainer import SafetensorsIO
 from tests.builders import make_recording
 from tests.predictors.tiny import make_network, save_random, tiny_network, tiny_shape
@@ -187,6 +190,54 @@ def test_chaining_of_a_single_segment_is_refused(predictor: str, tmp_path: Path)
     run = save_random(tmp_path / "run", predictor)
     with pytest.raises(AspEnvError, match=f"nothing to chain: .* as {predictor}:{run}$"):
         load_predictor(f"{predictor}:{run}@top1", horizon=15, dt_s=0.2)
+
+
+def test_configurations_without_newer_options_have_their_defaults(tmp_path: Path) -> None:
+    """Segments of 3 s, read past actions and a view of 15 past ticks: the same forecasts."""
+    run = save_random(tmp_path / "run", "ssp-asp", "vectors", horizon=30)
+    config = json.loads((run / "config.json").read_text())
+    before = load_trained(SSPASP, str(run)).predict(whole_scene())
+    for name in ("segment_s", "decoder"):
+        del config["network"][name]
+    del config["view"]["history"]
+    (run / "config.json").write_text(json.dumps(config))
+    after = load_trained(SSPASP, str(run)).predict(whole_scene())
+    np.testing.assert_array_equal(after.states, before.states)
+    np.testing.assert_array_equal(after.log_probs, before.log_probs)
+
+
+@pytest.mark.parametrize("history", [5, 20])
+def test_other_histories_read_the_last_ticks(history: int, tmp_path: Path) -> None:
+    """Of a scene with 25 past ticks; targets observed for fewer than `history` are not valid."""
+    run = save_random(
+        tmp_path / "run", "ssp-asp", "vectors", horizon=15, history=history, segment_s=1.0
+    )
+    predictor = load_trained(SSPASP, str(run))
+    assert predictor.history == predictor.view.history == history
+    scene = whole_scene(history_s=5.0)
+    index = (scene.targets[:, 0], scene.targets[:, 1])
+    scene.valid[index[0], index[1], : 25 - history] = False
+    forecast = predictor.predict(scene)
+    assert forecast.valid.all()
+    scene.states[:, :, : 25 - history] = 7.0
+    np.testing.assert_array_equal(predictor.predict(scene).states, forecast.states)
+    scene.valid[index[0], index[1], 25 - history] = False
+    assert not predictor.predict(scene).valid.any()
+
+
+def whole_scene(history_s: float = 3.0) -> Scene:
+    """Five situations of the synthetic crossing."""
+    recordings = [make_recording()]
+    index = index_snippets(recordings, dt_s=0.2, horizon_s=3.0, history_s=history_s)
+    return gather_scene(recordings, index.select(np.linspace(0, len(index) - 1, 5).astype(int)))
+
+
+def test_too_many_chains_are_refused(tmp_path: Path) -> None:
+    """Six segments of three modes have 729 chains."""
+    run = save_random(tmp_path / "run", "ssp-asp", "vectors", horizon=30, segment_s=1.0)
+    assert load_trained(SSPASP, f"{run}@top1").metadata["chaining"] == "top1"
+    with pytest.raises(AspEnvError, match="6 segments of 3 modes: @full would forecast more"):
+        load_trained(SSPASP, f"{run}@full")
 
 
 def test_other_time_step_is_refused(run: Path) -> None:

@@ -30,11 +30,16 @@ from tests.predictors.tiny import save_random
 VIEWS = ("chauffeurnet", "vectors", "mtp")
 SEGMENT = 15
 CASES = [
-    *((name, view, SEGMENT, "cpu") for name, view in zip(sorted(RECIPES), itertools.cycle(VIEWS))),
-    *(("ssp-asp", "vectors", 2 * SEGMENT, preset) for preset in ("cpu", "ours")),
+    *(
+        (name, view, SEGMENT, "cpu", {})
+        for name, view in zip(sorted(RECIPES), itertools.cycle(VIEWS))
+    ),
+    *(("ssp-asp", "vectors", 2 * SEGMENT, preset, {}) for preset in ("cpu", "ours")),
+    ("ffw-asp", "vectors", SEGMENT, "ours", {"decoder": "unrolled"}),
+    ("ssp-asp", "vectors", SEGMENT, "cpu", {"decoder": "unrolled", "segment_s": 1.0}),
 ]
-"""Predictor, view, horizon and recipe: every trainable predictor and every kind of view, and chains
-of segments that are merged or not."""
+"""Predictor, view, horizon, recipe and changes of it: every trainable predictor and every kind of
+view, chains of segments that are merged or not, unrolled decoders, and segments of 1 s."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -53,12 +58,18 @@ class Exported:
         return outputs
 
 
-@pytest.fixture(scope="module", params=CASES, ids=["-".join(map(str, case)) for case in CASES])
+def _text(part: Any) -> str:
+    return "+".join(map(str, part.values())) if isinstance(part, dict) else str(part)
+
+
+@pytest.fixture(scope="module", params=CASES, ids=["-".join(map(_text, case)) for case in CASES])
 def exported(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory) -> Exported:
     """One export of each case."""
-    name, view, horizon, preset = request.param
+    name, view, horizon, preset, changes = request.param
     folder = tmp_path_factory.mktemp("exported")
-    run = save_random(folder / "run", name, view, horizon=horizon, preset=preset, temperature=1.7)
+    run = save_random(
+        folder / "run", name, view, horizon=horizon, preset=preset, temperature=1.7, **changes
+    )
     write_onnx(f"{name}:{run}", folder / "file.onnx")
     spec: PredictorSpec = registry.find("predictors", name)
     predictor = load_trained(spec, str(run))

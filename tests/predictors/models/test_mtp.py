@@ -12,6 +12,18 @@ from predictors.models.mtp import states_along
 from predictors.models.network import Modes, TrainingProgress
 from tests.predictors.tiny import draw_samples, make_network, tiny_network, tiny_shape
 
+FORWARDS = torch.zeros(1, dtype=torch.bool)
+
+
+def test_a_target_that_backs_up_keeps_its_heading() -> None:
+    """Steps of 0.2 m to the rear, then ahead: heading 0 throughout, at -1 and +1 m/s."""
+    positions = torch.tensor([[[[-0.2, 0.0], [-0.4, 0.0], [-0.2, 0.0]]]])
+    states = states_along(positions, torch.ones(1, dtype=torch.bool), 0.2)
+    assert states[0, 0, :, 2].abs().tolist() == [0, 0, 0]
+    assert states[0, 0, :, 3].tolist() == pytest.approx([-1, -1, 1])
+    forwards = states_along(positions, FORWARDS, 0.2)  # a target that turns on the spot
+    assert forwards[0, 0, :, 2].abs().tolist() == pytest.approx([math.pi, math.pi, 0])
+
 
 def test_states_along_by_hand() -> None:
     """2 m ahead, 2 m to the left, 5 cm back (too short for a heading of its own), 4 m back.
@@ -19,7 +31,7 @@ def test_states_along_by_hand() -> None:
     At ticks of 0.2 s the speeds are 10, 10, 0.25 and 20 m/s.
     """
     positions = torch.tensor([[[[2.0, 0.0], [2.0, 2.0], [1.95, 2.0], [-2.05, 2.0]]]])
-    states = states_along(positions, 0.2)
+    states = states_along(positions, FORWARDS, 0.2)
     assert torch.equal(states[..., :2], positions)
     half = math.pi / 2
     np.testing.assert_allclose(states[0, 0, :, 2], [0, half, half, math.pi], atol=1e-6)
@@ -30,13 +42,13 @@ def test_a_target_that_has_not_moved_has_heading_0() -> None:
     """Three steps of 1 cm to the left."""
     positions = torch.zeros(1, 1, 3, 2)
     positions[..., 1] = torch.tensor([0.01, 0.02, 0.03])
-    assert not states_along(positions, 0.2)[..., 2].any()
+    assert not states_along(positions, FORWARDS, 0.2)[..., 2].any()
 
 
 def test_gradients_pass_through_positions_only() -> None:
     """Positions have gradient 1; headings and speeds have none."""
     positions = torch.ones(1, 1, 2, 2, requires_grad=True)
-    states = states_along(positions, 0.2)
+    states = states_along(positions, FORWARDS, 0.2)
     (gradient,) = torch.autograd.grad(states.sum(), positions)
     assert torch.equal(gradient, torch.ones_like(positions))
 
@@ -116,8 +128,9 @@ def test_modes_do_not_collapse(seed: int, modes: int, changes: dict[str, Any]) -
     np.testing.assert_allclose(probabilities[nearest], [0.75, 0.25], atol=0.02)
 
 
-def test_modes_collapse_by_distance() -> None:
-    """By distance one mode wins both labels, with certainty: why other rules are needed."""
-    _, terms = train_on_bimodal(3, 1, assignment="distance")
+@pytest.mark.parametrize("assignment", ["angle", "distance"])
+def test_modes_collapse_without_random_choice(assignment: str) -> None:
+    """The nearest mode wins both labels, with certainty, where all inputs are equal."""
+    _, terms = train_on_bimodal(3, 1, assignment=assignment)
     assert terms["classification"] < 0.01
     assert terms["regression"] > 1

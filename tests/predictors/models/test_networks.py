@@ -36,7 +36,11 @@ OPTIONS: dict[str, tuple[str, dict[str, Any]]] = {
     "ffw-asp under Euler": ("ffw-asp", {"integrator": "euler"}),
     "ffw-asp with DKM's head": ("ffw-asp", {"head": "connected", "hidden": 8}),
     "ffw-asp with DKM's head and skip": ("ffw-asp", {"head": "connected", "skip": True}),
+    "ffw-asp unrolled": ("ffw-asp", {"decoder": "unrolled"}),
+    "ffw-asp unrolled with skip": ("ffw-asp", {"decoder": "unrolled", "skip": True, "hidden": 8}),
     "ssp-asp": ("ssp-asp", {}),
+    "ssp-asp unrolled": ("ssp-asp", {"decoder": "unrolled"}),
+    "ssp-asp unrolled with skip": ("ssp-asp", {"decoder": "unrolled", "skip": True, "hidden": 8}),
     "ssp-asp with skip": ("ssp-asp", {"skip": True, "hidden": 8}),
     "ssp-asp with two layers": ("ssp-asp", {"gru_layers": 2}),
     "ssp-asp normalised": ("ssp-asp", {"normalise": True, "stop_gradient": True}),
@@ -128,6 +132,24 @@ def test_states_follow_from_actions_by_hand(sample: tuple[Batch, Labels]) -> Non
         np.testing.assert_allclose(states[0, 0, :2, 0], expected, atol=1e-6)
         np.testing.assert_allclose(states[0, 0, :2, 3], [0.4, 0.8], atol=1e-6)
         assert not states[..., 1].any()
+
+
+def test_a_reversing_target_is_forecast_to_reverse(sample: tuple[Batch, Labels]) -> None:
+    """From -2 m/s without acceleration: -0.4 m every tick. Braking by 1 m/s² ends after 10 ticks.
+
+    A target at 1 m/s that brakes by 2 m/s² stands after 3 ticks and never reverses.
+    """
+    motion = torch.tensor([[-2.0], [-2.0], [1.0], [1.0]]) * torch.tensor([1.0, 0.0, 0.0])
+    batch = sample[0]._replace(motion=motion)
+    actions = torch.zeros(4, 3, 15, 2)
+    actions[1, :, :10, 0], actions[2, ..., 0] = 1.0, -2.0
+    for integrator in ("heun", "euler"):
+        named: Any = integrator
+        states = rollout_from_now(actions, batch, 0.2, named)
+        np.testing.assert_allclose(states[0, 0, :, 0], -0.4 * np.arange(1, 16), atol=1e-5)
+        np.testing.assert_allclose(states[1, 0, 9:, 3], 0.0, atol=1e-5)
+        assert not states[2, :, 2:, 3].any()
+        assert (states[2, :, :, 0].diff() >= 0).all()
 
 
 def test_motion_is_speed_acceleration_and_yaw_rate() -> None:

@@ -15,8 +15,8 @@ from predictors.inference.checkpoint import load_trained
 from predictors.models.batch import Batch, Labels, VectorTensors
 from predictors.models.chaining import Chains, merge
 from predictors.models.losses import best_mode, into_frame, mode_terms
-from predictors.models.network import Modes, TrainingProgress
-from predictors.models.ssp_asp import SSPASPConfig, SSPASPNetwork
+from predictors.models.network import Modes, TrainingProgress, start_states
+from predictors.models.ssp_asp import SegmentInput, SSPASPConfig, SSPASPNetwork
 from predictors.plugs import SSPASP
 from tests.predictors.tiny import (
     RANGE,
@@ -38,7 +38,8 @@ def ssp(*, horizon: int = 30, seed: int = 0, **changes: Any) -> SSPASPNetwork:
     network = make_network("ssp-asp", config, tiny_shape("vectors", horizon), seed=seed)
     assert isinstance(network, SSPASPNetwork)
     with torch.no_grad():  # modes and probabilities differ more
-        network.head.layers[-1].get_parameter("weight").mul_(8)
+        if network.head is not None:
+            network.head.layers[-1].get_parameter("weight").mul_(8)
     return network
 
 
@@ -272,6 +273,71 @@ def test_loss_is_the_weighted_sum(sample: tuple[Batch, Labels]) -> None:
         values = {name: float(value.detach()) for name, value in terms.items()}
         by_hand = sum(w * values[n] for n, w in zip(expected, weights.values(), strict=False))
         assert values["loss"] == pytest.approx(by_hand, rel=1e-5)
+
+
+@pytest.mark.parametrize("decoder", ["read", "unrolled"])
+@pytest.mark.parametrize("segment_s", [1.0, 6.0])
+def test_past_actions_of_a_segment_that_is_no_history(
+    segment_s: float, decoder: str, sample: tuple[Batch, Labels]
+) -> None:
+    """γ reads the last 15 actions: of recorded ones and those of the segments before, in order.
+
+    The modes of each segment are computed one after the other from the chain so far.
+    """
+    network = ssp(segment_s=segment_s, decoder=decoder, modes=1)
+    batch = sample[0]
+    with torch.no_grad():
+        modes = network(batch)
+        assert modes.actions is not None
+        z, start = network.encode(batch), start_states(batch)
+        done = batch.actions
+        for end in network.later_ticks:
+            inputs = SegmentInput(z, network.scaled_actions(done[:, -15:]), start, batch.length_m)
+            z = network.predict_features(inputs)
+            actions, states, _ = network.predict_actions(inputs, z)
+            first = end - round(segment_s / 0.2)
+            torch.testing.assert_close(modes.actions[:, :, first:end], actions)
+            torch.testing.assert_close(modes.states[:, :, first:end], states)
+            done, start = torch.cat([done, actions[:, 0]], dim=1), states[:, 0, -1]
+
+
+def regression(positions: torch.Tensor, truth: torch.Tensor) -> torch.Tensor:
+    """The regression term of a single mode."""
+    terms = mode_terms(
+        positions, torch.zeros(len(truth), 1), truth,
+        assignment="angle", classification="cross-entropy", share=None,
+    )  # fmt: skip
+    return terms["regression"]
+
+
+@pytest.mark.parametrize("decoder", ["read", "unrolled"])
+def test_training_chains_segments_of_1_s_as_inference_does(decoder: str) -> None:
+    """With one mode the regression in training is that of the forecast, segment by segment."""
+    network = ssp(
+        horizon=15, segment_s=1.0, decoder=decoder, modes=1, encoded_branch=False, skip=True
+    )
+    batch, labels = draw_samples(ROWS, view="vectors", later_ticks=network.later_ticks)
+    assert network.later_ticks == (5, 10, 15)
+    with torch.no_grad():
+        terms = network.training_loss(batch, labels, END)
+        positions = network(batch).states[..., :2]
+    truth, expected = labels.states, []
+    for first in (0, 5, 10):
+        part, label = positions[:, :, first : first + 5], truth[:, first : first + 5, :2]
+        if first:
+            origin = truth[:, first - 1]
+            part, label = into_frame(part, origin[:, None]), into_frame(label, origin)
+        expected.append(regression(part, label))
+    torch.testing.assert_close(terms["regression"], torch.stack(expected).mean())
+
+
+def test_chains_beyond_the_limit_are_cut(sample: tuple[Batch, Labels]) -> None:
+    """Six segments of three modes have 729 chains; the first five have 243."""
+    with torch.no_grad():
+        chains = ssp(segment_s=1.0).all_chains(sample[0])
+        few = ssp(segment_s=2.0).all_chains(sample[0])
+    assert chains.states.shape == (6, 243, 25, 4)
+    assert few.states.shape == (6, 27, 30, 4)
 
 
 def test_other_horizons_are_refused() -> None:

@@ -7,7 +7,7 @@ import torch
 from torch import Tensor
 
 from predictors.models.batch import Batch, Labels
-from predictors.models.network import TrainingProgress
+from predictors.models.network import Modes, TrainingProgress, Validation
 from predictors.models.ssp_asp import SSPASPNetwork
 from tests.predictors.tiny import draw_samples, make_network, tiny_network, tiny_shape
 
@@ -19,6 +19,15 @@ def ssp(view: str = "vectors", **changes: Any) -> SSPASPNetwork:
     network = make_network("ssp-asp", tiny_network("ssp-asp", view, **changes), tiny_shape(view))
     assert isinstance(network, SSPASPNetwork)
     return network
+
+
+def validate(
+    network: SSPASPNetwork, batch: Batch, labels: Labels, *, pretraining: bool = False
+) -> Validation:
+    """The validation of a forecast."""
+    with torch.no_grad():
+        modes: Modes = network(batch)
+        return network.validate(modes, batch, labels, TrainingProgress(pretraining=pretraining))
 
 
 @pytest.fixture(scope="module")
@@ -177,7 +186,7 @@ def _last_linear(module: torch.nn.Module) -> torch.nn.Module:
 
 def test_normalised_features_have_mean_0_and_variance_1(sample: tuple[Batch, Labels]) -> None:
     """Encoded and predicted features."""
-    features = ssp(normalise=True).features(*sample)
+    features = validate(ssp(normalise=True), *sample).features
     assert features is not None
     for z in features:
         torch.testing.assert_close(z.mean(dim=1), torch.zeros(4), atol=1e-5, rtol=0)
@@ -191,10 +200,39 @@ def test_features_are_those_at_the_end_of_the_segment(
     batch, labels = sample
     network = ssp()
     features, other = (
-        network.features(batch, each) for each in (labels, labels._replace(later=(batch,)))
+        validate(network, batch, each).features
+        for each in (labels, labels._replace(later=(batch,)))
     )
     assert features is not None
     assert other is not None
     assert torch.equal(features.encoded, network.encode(labels.later[0]))
     assert not torch.equal(features.encoded, other.encoded)
     assert torch.equal(features.predicted, other.predicted)
+
+
+def test_validation_loss_has_the_terms_and_weights_of_the_training(
+    sample: tuple[Batch, Labels],
+) -> None:
+    """w1 and w2 of the training, w3 and w4 of the forecast; in pre-training w1 and w2 alone."""
+    weights: Any = {
+        "action_weight": 2.0,
+        "feature_weight": 3.0,
+        "regression_weight": 5.0,
+        "classification_weight": 7.0,
+    }
+    network = ssp(**weights, assignment="distance")
+    with torch.no_grad():
+        trained = network.training_loss(*sample, END)
+        of_modes = network.loss(network(sample[0]), sample[1], END)
+    features = {name: trained[name] for name in ("actions", "features")}
+    modes = {name: of_modes[name] for name in ("regression", "classification")}
+    for pretraining, expected in ((True, features), (False, features | modes)):
+        terms = validate(network, *sample, pretraining=pretraining).terms
+        assert set(terms) == {"loss", *expected}
+        for name, value in expected.items():
+            torch.testing.assert_close(terms[name], value)
+        by_hand = sum(
+            weight * float(value)
+            for weight, value in zip(weights.values(), expected.values(), strict=False)
+        )
+        assert float(terms["loss"]) == pytest.approx(by_hand, rel=1e-5)

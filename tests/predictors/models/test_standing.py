@@ -47,7 +47,12 @@ def test_standing_is_a_further_mode(predictor: str, sample: tuple[Batch, Labels]
     network = make_network(predictor, tiny_network(predictor, standing=True), tiny_shape()).eval()
     with torch.no_grad():
         modes = network.calibrated(batch)
+        features = network(batch).features
     assert modes.states.shape == (4, 4, 15, 4)
+    assert features is not None
+    assert modes.features is not None
+    assert torch.equal(modes.features, features)
+    assert modes.standing is None
     np.testing.assert_allclose(modes.logits.exp().sum(dim=1), 1.0, atol=1e-5)
     assert float(modes.states[2:, -1, :, :2].abs().max()) <= 0.1 * 0.2
     assert not modes.states[2:, -1, 0:, 3].any()

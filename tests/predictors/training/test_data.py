@@ -15,6 +15,7 @@ from asp_env.dynamics import inverse
 from asp_env.errors import AspEnvError
 from asp_env.views import make_raster_view
 from predictors.training import data as training_data
+from predictors.training.command import Train
 from predictors.training.data import (
     Batches,
     action_range,
@@ -24,6 +25,7 @@ from predictors.training.data import (
     open_training_data,
 )
 from tests.builders import Drive, make_recording
+from tests.crossing_files import write_crossing
 from tests.predictors.tiny import tiny_config, write_data
 
 EAST = Drive(kind=AgentClass.CAR, start=(-50.0, 2.0, 0.0, 10.0))
@@ -203,3 +205,22 @@ def test_several_validation_data(tmp_path: Path) -> None:
     config = dataclasses.replace(tiny_config(), validation=(second, third))
     parts = open_training_data(config, first).trained_on.parts
     assert sorted(parts.values()) == ["train"] * 3 + ["validation"] * 6
+
+
+@pytest.mark.parametrize("parked", [False, True])
+def test_parked_vehicles_are_trained_on_if_asked_for(tmp_path: Path, parked: bool) -> None:
+    """Both cars have 14 snippets, see `tests/evaluation/open_loop/test_open_loop.py`."""
+    drives = (
+        Drive(kind=AgentClass.CAR, start=(-95.0, -1.75, 0.0, 8.0)),
+        Drive(kind=AgentClass.CAR, start=(25.0, -6.0, 0.0, 0.0)),
+    )
+    for name in ("training", "validation"):
+        (tmp_path / name).mkdir()
+    write_crossing(tmp_path / "training", drives=(drives,), seconds=14.0)
+    write_crossing(tmp_path / "validation", drives=(drives[::-1],), seconds=14.0)
+    given = Train(predictor="dkm", data=(), out=tmp_path, view="vectors", parked=parked)
+    config = dataclasses.replace(
+        given.config_for(3.0), validation=(str(tmp_path / "validation"),), standing_share=1.0
+    )
+    data = open_training_data(config, str(tmp_path / "training"))
+    assert len(data.training.snippets) == len(data.validation.snippets) == 14 + 14 * parked

@@ -1,5 +1,6 @@
 """A training run: its files, its result, and its errors."""
 
+import csv
 import dataclasses
 import json
 from pathlib import Path
@@ -16,13 +17,16 @@ from asp_env.data.split import Split, snippet_parts
 from asp_env.errors import AspEnvError
 from predictors.inference.calibration import fit_temperature
 from predictors.inference.trained import TrainedPredictor
+from predictors.models.batch import Batch, Labels
 from predictors.models.chaining import Chaining
 from predictors.models.losses import best_mode
+from predictors.models.network import TrainingProgress
 from predictors.models.ssp_asp import SSPASPNetwork
 from predictors.training import data as training_data
 from predictors.training.data import VALIDATION_BATCH, open_training_data
 from predictors.training.fitting import train
-from predictors.training.lightning_parts import one_cycle
+from predictors.training.lightning_parts import SELECTED_BY, VALIDATION_LOSS, one_cycle
+from predictors.training.trainer import stage_of
 from tests.predictors.tiny import tiny_config, tiny_network, write_data
 
 
@@ -100,6 +104,60 @@ def test_network_that_merges_has_two_temperatures(data: str, tmp_path: Path) -> 
         expected = fit_temperature(np.concatenate(logits), np.concatenate(best))
         assert temperature == pytest.approx(expected, rel=1e-3)
         assert abs(temperature - 1) > 1e-2
+
+
+def test_epochs_are_named_by_their_stage() -> None:
+    """Two epochs of pre-training and three prediction epochs, each counted from 1."""
+    config = tiny_config(pretraining_epochs=2, epochs=3)
+    assert [stage_of(config, epoch) for epoch in range(5)] == [
+        "pre-training 1/2", "pre-training 2/2", "epoch 1/3", "epoch 2/3", "epoch 3/3",
+    ]  # fmt: skip
+    limited = dataclasses.replace(config, schedule="plateau", patience=1)
+    assert stage_of(limited, 4) == "epoch 3/at most 3"
+
+
+def test_pretraining_has_no_validation_error(
+    data: str, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Neither in the messages nor in the log; annealing begins after it.
+
+    Of two epochs of two steps the second is half over at its second step.
+    """
+    shares: list[tuple[float, bool]] = []
+    loss = SSPASPNetwork.training_loss
+
+    def recorded(
+        self: SSPASPNetwork, batch: Batch, labels: Labels, progress: TrainingProgress
+    ) -> dict[str, torch.Tensor]:
+        shares.append((progress.share, progress.pretraining))
+        return loss(self, batch, labels, progress)
+
+    monkeypatch.setattr(SSPASPNetwork, "training_loss", recorded)
+    config = tiny_config(
+        "ssp-asp", "vectors", pretraining_epochs=1, epochs=1, snippets_per_epoch=16
+    )
+    run = train(config, data, tmp_path / "run")
+    assert shares == [(0.0, True), (0.0, True), (0.0, False), (0.5, False)]
+    lines = [line for line in capsys.readouterr().err.splitlines() if "training loss" in line]
+    assert [line.partition(":")[0] for line in lines] == ["pre-training 1/1", "epoch 1/1"]
+    assert [f"{SELECTED_BY} n/a" in line for line in lines] == [True, False]
+    with (run / "logs" / "from-epoch-00" / "metrics.csv").open(newline="") as file:
+        rows = [row for row in csv.DictReader(file) if row[VALIDATION_LOSS]]
+    assert [bool(row[SELECTED_BY]) for row in rows] == [False, True]
+    provenance = json.loads((run / "config.json").read_text())["provenance"]
+    assert (provenance["trained_epochs"], provenance["best_epoch"]) == (1, 1)
+
+
+def test_progress_bar_names_the_stage(
+    data: str, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """On a terminal the bar stands in for the lines; it counts pre-training apart, too."""
+    monkeypatch.setattr("sys.stderr.isatty", lambda: True)
+    config = tiny_config("ssp-asp", "vectors", pretraining_epochs=1, epochs=1, snippets_per_epoch=8)
+    train(config, data, tmp_path / "run")
+    shown = "".join(capsys.readouterr())
+    assert "pre-training 1/1" in shown
+    assert "epoch 1/1" in shown
 
 
 def test_finished_run_is_refused(data: str, finished: Path) -> None:

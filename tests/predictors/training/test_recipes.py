@@ -7,7 +7,9 @@ import pytest
 
 from asp_env.errors import AspEnvError
 from predictors.models.ffw_asp import FFWASPConfig
+from predictors.models.losses import DEFAULT_ASSIGNMENT
 from predictors.models.ssp_asp import SSPASPConfig
+from predictors.training.augmentation import Augmentation
 from predictors.training.recipes import RECIPES, TrainingConfig, recipe
 from tests.predictors.tiny import tiny_config
 
@@ -15,14 +17,14 @@ from tests.predictors.tiny import tiny_config
 @pytest.mark.parametrize("predictor", RECIPES)
 @pytest.mark.parametrize("horizon_s", [3.0, 6.0])
 def test_recipes_paper_have_the_numbers_of_the_paper(predictor: str, horizon_s: float) -> None:
-    """ResNet18 of 512, 3 modes by angle or at random, Euler; Adam 1e-4, batches of 32, 10 epochs.
+    """ResNet18 of 512, 3 modes by the common rule, Euler; Adam 1e-4, batches of 32, 10 epochs.
 
     SSP-ASP has three more epochs of pre-training, unless its run for 6 s starts from 3 s.
     """
     config = recipe(predictor, "paper", view="chauffeurnet", horizon_s=horizon_s)
     network = config.network
     assert (network.encoder, network.features, network.modes) == ("resnet18", 512, 3)
-    assert (network.assignment, network.annealed) == ("angle-random", False)
+    assert (network.assignment, network.annealed) == (DEFAULT_ASSIGNMENT, False)
     assert network.classification == "cross-entropy"
     assert getattr(network, "integrator", "euler") == "euler"
     assert (config.learning_rate, config.batch_size, config.epochs) == (1e-4, 32, 10)
@@ -58,8 +60,15 @@ CASES = [(predictor, name) for predictor, names in RECIPES.items() for name in n
 
 @pytest.mark.parametrize(("predictor", "name"), CASES)
 def test_every_recipe_is_for_every_view(predictor: str, name: str) -> None:
-    """The encoder fits the view; small rasters have 90x60 pixels, or 90x90 in the square view."""
+    """The encoder fits the view; small rasters have 90x60 pixels, or 90x90 in the square view.
+
+    The recipe `robust` refuses rasters, which it cannot augment.
+    """
     for view, pixels in (("chauffeurnet", (90, 60)), ("mtp", (90, 90)), ("vectors", None)):
+        if name == "robust" and view != "vectors":
+            with pytest.raises(AspEnvError, match="give --view vectors"):
+                recipe(predictor, name, view=view, horizon_s=3.0)
+            continue
         config = recipe(predictor, name, view=view, horizon_s=3.0)
         assert (config.predictor, config.preset, config.view) == (predictor, name, view)
         if name == "paper":
@@ -69,22 +78,30 @@ def test_every_recipe_is_for_every_view(predictor: str, name: str) -> None:
         assert config.network.encoder == ("vector" if view == "vectors" else encoder)
 
 
-def test_small_pretraining_is_part_of_the_epochs() -> None:
-    """Two of SSP-ASP's epochs, which are as many as those of DKM."""
-    ssp, dkm = (
-        recipe(predictor, "cpu", view="vectors", horizon_s=3.0) for predictor in ("ssp-asp", "dkm")
-    )
-    assert ssp.all_epochs == dkm.all_epochs == dkm.epochs
-    assert ssp.pretraining_epochs == 2
+@pytest.mark.parametrize(("name", "epochs", "pretraining"), [("cpu", 8, 2), ("paper", 10, 3)])
+def test_pretraining_is_additional(name: str, epochs: int, pretraining: int) -> None:
+    """All predictors have equal prediction epochs at 3 s; SSP-ASP's pre-training comes before."""
+    for predictor in RECIPES:
+        config = recipe(predictor, name, view="vectors", horizon_s=3.0)
+        own = pretraining if predictor == "ssp-asp" else 0
+        assert (config.epochs, config.pretraining_epochs) == (epochs, own)
+        assert config.all_epochs == epochs + own
 
 
-def test_small_runs_for_6_s_have_equal_budgets() -> None:
+@pytest.mark.parametrize(("predictor", "name"), CASES)
+def test_the_rule_for_the_best_mode_is_one_constant(predictor: str, name: str) -> None:
+    """Every recipe has it but `ours`, which was chosen with `distance`, and `robust`."""
+    network = recipe(predictor, name, view="vectors", horizon_s=3.0).network
+    assert network.assignment == ("distance" if name in ("ours", "robust") else DEFAULT_ASSIGNMENT)
+
+
+def test_small_runs_for_6_s_have_equal_prediction_epochs() -> None:
     """16 epochs each: SSP-ASP has 8 for 3 s and 8 for 6 s, the others have 16 at once."""
     small = [case for case in CASES if case[1] != "paper"]
-    assert len(small) == 6
+    assert len(small) == 8
     for predictor, name in small:
         short, long = (
-            recipe(predictor, name, view="vectors", horizon_s=horizon_s).all_epochs
+            recipe(predictor, name, view="vectors", horizon_s=horizon_s).epochs
             for horizon_s in (3.0, 6.0)
         )
         assert (short + long if predictor == "ssp-asp" else long) == 16
@@ -94,13 +111,16 @@ def test_unknown_names_list_the_known_ones() -> None:
     """The error suggests the nearest name and lists all."""
     with pytest.raises(AspEnvError, match="did you mean 'ffw-asp'"):
         recipe("ffw", "cpu", view="chauffeurnet", horizon_s=3.0)
-    with pytest.raises(AspEnvError, match="known are cpu, ours, paper"):
+    with pytest.raises(AspEnvError, match="known are cpu, ours, paper, robust"):
         recipe("ffw-asp", "gpu", view="chauffeurnet", horizon_s=3.0)
 
 
 @pytest.mark.parametrize(
     "field",
-    ["epochs", "batch_size", "snippets_per_epoch", "max_snippets", "max_validation_snippets"],
+    [
+        *("epochs", "patience", "progress_epochs", "batch_size"),
+        *("snippets_per_epoch", "max_snippets", "max_validation_snippets"),
+    ],
 )
 def test_numbers_of_zero_are_refused(field: str) -> None:
     zero: Any = {field: 0}
@@ -109,9 +129,13 @@ def test_numbers_of_zero_are_refused(field: str) -> None:
 
 
 def test_numbers_out_of_range_are_refused() -> None:
-    """A share of standing targets above one, or negative epochs."""
+    """A share of standing targets above one, negative epochs, or patience with `one-cycle`."""
+    with pytest.raises(AspEnvError, match="patience is 2 with the schedule one-cycle"):
+        tiny_config(patience=2)
     with pytest.raises(AspEnvError, match=r"standing_share is 1\.5"):
         tiny_config(standing_share=1.5)
+    with pytest.raises(AspEnvError, match="augmentation infers past actions from changed states"):
+        tiny_config(augmentation=Augmentation(), history="accelerations")
     with pytest.raises(AspEnvError, match="pretraining_epochs is -1"):
         tiny_config(pretraining_epochs=-1)
     assert isinstance(tiny_config(), TrainingConfig)

@@ -9,14 +9,26 @@ import lightning.pytorch as pl
 import pytest
 import torch
 from lightning.pytorch.core.optimizer import LightningOptimizer
-from safetensors.torch import load_file
+from safetensors.torch import load_file, save_file
 
 from asp_env.errors import AspEnvError
 from predictors.training import lightning_parts
 from predictors.training.fitting import train, train_stages
-from predictors.training.lightning_parts import EpochLogger, TrainingModule
+from predictors.training.initial_weights import file_hash
+from predictors.training.lightning_parts import (
+    SELECTED_BY,
+    BestCheckpoint,
+    EpochLogger,
+    TrainingModule,
+)
 from predictors.training.recipes import TrainingConfig
-from tests.predictors.tiny import tiny_config, tiny_network, write_data
+from tests.predictors.tiny import (
+    make_network,
+    tiny_config,
+    tiny_network,
+    tiny_shape,
+    write_data,
+)
 
 
 @pytest.fixture(scope="module")
@@ -54,6 +66,7 @@ KILLS = {
 RUNS: dict[str, dict[str, Any]] = {
     "one-cycle": {"schedule": "one-cycle"},
     "plateau": {"schedule": "plateau"},
+    "until converged": {"schedule": "plateau", "patience": 2, "epochs": 50},
     "pre-training and a second encoder": {
         "predictor": "ssp-asp",
         "view": "vectors",
@@ -70,7 +83,7 @@ CASES = [("one-cycle", "between epochs"), *((run, "within an epoch") for run in 
 def test_interrupted_run_ends_with_the_same_weights(
     run: str, kill: str, data: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Two epochs, an interruption and two more have the weights of four epochs, bit for bit.
+    """A run with an interruption after two epochs has the weights of one without, bit for bit.
 
     With `plateau` no epoch counts as an improvement: from the second on, each divides the rate by
     5.
@@ -94,7 +107,7 @@ def test_interrupted_run_ends_with_the_same_weights(
     resumed_rates = rates.copy()
     rates.clear()
     train(config, data, tmp_path / "whole")
-    if config.schedule == "plateau":
+    if run == "plateau":
         assert rates == pytest.approx([0.01, 0.01, 0.002, 0.0004])
     assert resumed_rates == rates
     of_run = [load_file(tmp_path / each / "weights.safetensors") for each in ("killed", "whole")]
@@ -169,3 +182,67 @@ def test_training_data_of_the_start_are_included(data: str, tmp_path: Path) -> N
     run = train(config, data, tmp_path / "run", start=start)
     parts = json.loads((run / "config.json").read_text())["provenance"]["trained_on"]["parts"]
     assert parts == content["provenance"]["trained_on"]["parts"]
+
+
+def test_converged_run_ends_after_its_patience(
+    data: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Two epochs after the best one, also if it is interrupted when its last epoch is stored."""
+    config = tiny_config(
+        "dkm", "vectors", schedule="plateau", patience=2, epochs=50, snippets_per_epoch=8
+    )
+    errors = iter([5.0, 4.0, 4.0, 3.0, 3.5, 3.0, 1.0])
+    ended = BestCheckpoint.on_train_epoch_end
+
+    def with_errors(
+        self: BestCheckpoint, trainer: pl.Trainer, pl_module: pl.LightningModule
+    ) -> None:
+        trainer.callback_metrics[SELECTED_BY] = torch.tensor(next(errors))
+        ended(self, trainer, pl_module)
+
+    def killed_at_the_end(
+        self: EpochLogger, trainer: pl.Trainer, pl_module: pl.LightningModule
+    ) -> None:
+        del self, pl_module
+        if trainer.current_epoch == 5:
+            raise Killed
+
+    monkeypatch.setattr(BestCheckpoint, "on_train_epoch_end", with_errors)
+    with monkeypatch.context() as patched:
+        patched.setattr(EpochLogger, "on_train_epoch_end", killed_at_the_end)
+        with pytest.raises(Killed):
+            train(config, data, tmp_path / "run")
+    train(config, data, tmp_path / "run")
+    provenance = json.loads((tmp_path / "run" / "config.json").read_text())["provenance"]
+    assert (provenance["best_epoch"], provenance["best_value"]) == (3, 3.0)
+    assert provenance["trained_epochs"] == 6
+    assert next(errors) == 1.0
+
+
+def test_resnet_weights_start_the_first_stage(data: str, tmp_path: Path) -> None:
+    """The run for 3 s starts from the file and has its pre-training; that for 6 s starts from 3 s.
+
+    Another file is refused for a finished first stage.
+    """
+    network = tiny_network("ssp-asp", encoder="resnet18")
+    source = make_network("ssp-asp", network, tiny_shape(), seed=1)
+    paths = [tmp_path / f"{name}.safetensors" for name in ("one", "other")]
+    for path, scale in zip(paths, (1.0, 2.0), strict=True):
+        body = source.get_submodule("encoder.body").state_dict()
+        save_file({name: scale * value for name, value in body.items()}, path)
+
+    def config_for(horizon_s: float) -> TrainingConfig:
+        config = tiny_config("ssp-asp", network=network, epochs=1, snippets_per_epoch=8)
+        first = horizon_s == 3.0
+        return dataclasses.replace(config, horizon_s=horizon_s, pretraining_epochs=int(first))
+
+    out = train_stages(config_for, 6.0, data, tmp_path / "run", start=paths[0])
+    first, second = (
+        json.loads((f / "config.json").read_text())["provenance"] for f in (out / "3s", out)
+    )
+    assert first["start"] == file_hash(paths[0])
+    assert first["config"]["pretraining_epochs"] == 1
+    assert second["start"] == file_hash(out / "3s" / "weights.safetensors")
+    (out / "config.json").unlink()
+    with pytest.raises(AspEnvError, match="3s holds a finished run of another start"):
+        train_stages(config_for, 6.0, data, out, start=paths[1])

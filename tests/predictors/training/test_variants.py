@@ -1,4 +1,4 @@
-"""Variants: each changes the recipe, but not the number of steps, except `long`."""
+"""Variants: each changes the recipe, but not the prediction epochs, except `long`."""
 
 import dataclasses
 from pathlib import Path
@@ -6,11 +6,23 @@ from pathlib import Path
 import pytest
 
 from asp_env.errors import AspEnvError
+from predictors.models.losses import DEFAULT_ASSIGNMENT
 from predictors.training.command import Train
-from predictors.training.recipes import TrainingConfig, recipe
-from predictors.training.variants import VARIANTS, variant, warm_starts_from_3s
+from predictors.training.recipes import RECIPES, TrainingConfig, recipe
+from predictors.training.variants import (
+    ASSIGNMENTS,
+    VARIANTS,
+    ablations,
+    variant,
+    warm_starts_from_3s,
+)
 
-EVERY = [(predictor, name) for predictor, names in VARIANTS.items() for name in names]
+EVERY = [
+    (predictor, name)
+    for predictor, names in VARIANTS.items()
+    for name in names
+    if ASSIGNMENTS.get(name) != DEFAULT_ASSIGNMENT
+]
 
 
 def both(
@@ -30,22 +42,102 @@ def both(
 def test_variant_changes_the_recipe_but_not_the_time(
     predictor: str, name: str, recipe_name: str
 ) -> None:
-    """A different configuration with as many epochs in total; `long` has three times as many.
+    """A different configuration with equal prediction epochs; `long` has three times as many.
 
-    The epochs of a run for 3 s that the run starts from count, too. With the recipe `paper`,
-    `staged` has 20 in total, 6 s at once have 10.
+    The epochs of a run for 3 s that the run starts from count, too, and those of the run for one
+    segment. With the recipe `paper`, `staged` has 20 in total, 6 s at once have 10. Pre-training
+    is that of the recipe, or of the run for 3 s that is left out, or it comes before the run for
+    one shorter segment; two variants omit it.
     """
     base, changed = both(predictor, name, recipe_name=recipe_name)
     assert changed.preset == f"{recipe_name}+{name}"
     if (recipe_name, name) not in (("paper", "euler"), ("paper", "staged")):  # equal but for start
         assert dataclasses.replace(changed, preset=base.preset) != base
-    epochs = base.all_epochs * (3 if name == "long" else 1)
-    before = recipe(predictor, recipe_name, view="chauffeurnet", horizon_s=3.0).all_epochs
+    epochs, pretraining = base.epochs * (3 if name == "long" else 1), base.pretraining_epochs
+    first = recipe(predictor, recipe_name, view="chauffeurnet", horizon_s=3.0)
     if name == "from-scratch":
-        epochs += before
+        epochs, pretraining = epochs + first.epochs, first.pretraining_epochs
+    segment_s = VARIANTS[predictor][name].segment_s
+    if segment_s is not None:  # 6 s: from scratch, without a run for 3 s
+        epochs = first.epochs if base.horizon_s == 3.0 else first.epochs + base.epochs
+        pretraining = first.pretraining_epochs
+        if segment_s < base.horizon_s:
+            stage = first_segment(predictor, name, recipe_name)
+            assert (2 * stage.epochs, stage.pretraining_epochs) == (first.epochs, pretraining)
+            epochs, pretraining = epochs - stage.epochs, 0
     if name == "staged":
-        epochs = (16 if recipe_name == "cpu" else 20) - before
-    assert changed.all_epochs == epochs
+        epochs = (16 if recipe_name == "cpu" else 20) - first.epochs
+    if name in ("no-pretraining", "no-future-loss"):
+        pretraining = 0
+    assert (changed.epochs, changed.pretraining_epochs) == (epochs, pretraining)
+
+
+RECIPES_OF = [(predictor, name) for predictor, names in RECIPES.items() for name in names]
+
+
+@pytest.mark.parametrize(("predictor", "recipe_name"), RECIPES_OF)
+def test_every_recipe_has_the_other_rules_for_the_best_mode(
+    predictor: str, recipe_name: str
+) -> None:
+    """`nearest` is `angle`; a variant equal to the recipe's own rule is refused and no ablation."""
+    own = recipe(predictor, recipe_name, view="vectors", horizon_s=3.0).network.assignment
+    offered = ablations(predictor, recipe_name)
+    for name, rule in {
+        "nearest": "angle", "distance": "distance", "angle-random": "angle-random",
+    }.items():  # fmt: skip
+        assert (name in offered) == (rule != own)
+        if rule == own:
+            with pytest.raises(AspEnvError, match=f"has the assignment '{rule}' without a variant"):
+                both(predictor, name, recipe_name=recipe_name, view="vectors")
+        else:
+            network = both(predictor, name, recipe_name=recipe_name, view="vectors")[1].network
+            assert network.assignment == rule
+
+
+def test_long_is_no_ablation_where_the_budget_sets_the_epochs() -> None:
+    """The other variants stay."""
+    offered = ablations("dkm", "cpu"), ablations("dkm", "cpu", budget="cpu")
+    assert set(offered[0]) - set(offered[1]) == {"long"}
+
+
+def first_segment(predictor: str, name: str, recipe_name: str) -> TrainingConfig:
+    """The configuration of the run for one segment that longer runs of a variant start from."""
+    segment_s = VARIANTS[predictor][name].segment_s
+    assert segment_s is not None
+    command = Train(
+        predictor=predictor, data=("",), out=Path(), recipe=recipe_name, variant=name,
+        horizon=segment_s,
+    )  # fmt: skip
+    return command.config_for(segment_s)
+
+
+@pytest.mark.parametrize(
+    ("horizon", "epochs"), [(1.0, 4), (3.0, 4), (6.0, 12), (9.0, 12), (12.0, 12)]
+)
+def test_segments_of_1_s_share_their_first_run(horizon: float, epochs: int) -> None:
+    """Prediction epochs of `segment-1s`: 4 of the recipe's 8 for 1 s; the rest for each horizon."""
+    command = Train(
+        predictor="ssp-asp", data=("",), out=Path(), variant="segment-1s", horizon=horizon
+    )
+    config = command.config_for(horizon)
+    assert (config.epochs, config.segment_s, config.first_stage_s) == (epochs, 1.0, 1.0)
+    assert config.pretraining_epochs == (2 if horizon == 1.0 else 0)
+
+
+def test_lengths_of_segments_that_are_refused() -> None:
+    """1.5 s are 7.5 ticks; two lengths at once; FFW-ASP chains no segments."""
+    fields = {"data": ("",), "out": Path(), "horizon": 6.0}
+    ssp = Train(predictor="ssp-asp", **fields)
+    with pytest.raises(AspEnvError, match=r"1\.5 s, they are no whole number of ticks of 0\.2 s"):
+        dataclasses.replace(ssp, segment_s=1.5).config_for(6.0)
+    with pytest.raises(AspEnvError, match=r"into segments of 0\.2, 0\.4, 0\.6, 1, 1\.2, 2, 3, 6 s"):
+        dataclasses.replace(ssp, segment_s=2.5).config_for(6.0)
+    with pytest.raises(AspEnvError, match="variant segment-1s has segments of 1 s: leave out"):
+        dataclasses.replace(ssp, segment_s=2.0, variant="segment-1s").config_for(6.0)
+    with pytest.raises(AspEnvError, match="ffw-asp forecasts the whole horizon at once"):
+        Train(predictor="ffw-asp", segment_s=1.0, **fields).config_for(6.0)
+    with pytest.raises(AspEnvError, match=r"0\.5 s is no whole number of ticks"):
+        Train(predictor="ffw-asp", history_s=0.5, **fields).config_for(6.0)
 
 
 @pytest.mark.parametrize(("recipe_name", "hidden"), [("cpu", 256), ("paper", 4096)])
@@ -77,7 +169,7 @@ def test_no_trail_changes_the_view() -> None:
 
 def test_unknown_variants_list_the_known_ones() -> None:
     """Variants of another predictor are unknown."""
-    with pytest.raises(AspEnvError, match=r"variant of dkm 'skip': known are .*causal, euler, "):
+    with pytest.raises(AspEnvError, match=r"variant of dkm 'skip': known are .*causal, distance, "):
         variant("dkm", "skip")
 
 

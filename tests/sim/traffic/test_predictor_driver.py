@@ -7,6 +7,7 @@ import pytest
 
 from asp_env.data.classes import AgentClass
 from asp_env.data.predictor import load_predictor, make_forecast
+from asp_env.dynamics import rollout
 from asp_env.errors import AspEnvError
 from asp_env.sim.traffic.predictor import PredictorDriver
 from tests.builders import DRIVES, Drive, make_recording
@@ -66,6 +67,57 @@ def test_the_most_probable_mode_is_followed(actions):
     simulation = simulate(on_road(car(-50, 8)), scenario(), driver)
     replay(simulation, 5)
     assert now(simulation, 2) == pytest.approx([-50 + 24 + 7, -1.75, 0, 6], abs=1e-3)
+
+
+class Turning:
+    """Forecasts one mode, the rollout of 1.5 m/s² and 0.1 rad by an integrator."""
+
+    name = "turning"
+    privileged = False
+    dt_s = DT_S
+    history = 15
+    horizon = STEPS
+    trained_on = None
+    metadata = MappingProxyType[str, str]({})
+
+    def __init__(self, integrator) -> None:
+        self.integrator = integrator
+
+    def predict(self, scene, future=None):
+        """The rollouts."""
+        assert future is None
+        at = (scene.targets[:, 0], scene.targets[:, 1])
+        actions = np.tile(np.array([1.5, 0.1], dtype=np.float32), (len(at[0]), STEPS, 1))
+        states = rollout(
+            scene.target_states, actions, scene.sizes[at][:, 0], DT_S, integrator=self.integrator
+        )
+        return make_forecast(
+            scene,
+            states=states[:, None],
+            actions=actions[:, None],
+            log_probs=np.zeros((len(states), 1)),
+            valid=scene.predictable,
+        )
+
+
+@pytest.mark.parametrize("integrator", ["heun", "euler"])
+@pytest.mark.parametrize("speed_mps", [8, -2])
+@pytest.mark.parametrize("beside", ["alone", "in a table"])
+def test_forecast_states_are_reproduced(integrator, speed_mps, beside):
+    """To 1 mm over 1 s, with Heun's and with Euler's method, also driving backwards."""
+    driver = PredictorDriver(Turning(integrator))
+    traffic = driver if beside == "alone" else {"default": "log", "car": driver}
+    other = car(-20, 8, kind=AgentClass.TRUCK)
+    simulation = simulate(on_road(car(-50, speed_mps), other), scenario(), traffic)
+    start, lengths = simulation.world.scene().states[0, 1, -1], simulation.world.episodes.sizes
+    actions = np.tile(np.array([1.5, 0.1], dtype=np.float32), (5, 1))
+    expected = rollout(start, actions, lengths[0, 1, 0], DT_S, integrator=integrator)
+    for state in expected:
+        replay(simulation, 1)
+        assert now(simulation, 2) == pytest.approx(state, abs=1e-3)
+    other_integrator = "heun" if integrator == "euler" else "euler"
+    away = rollout(start, actions, lengths[0, 1, 0], DT_S, integrator=other_integrator)[-1, :2]
+    assert np.linalg.norm(away - expected[-1, :2]) > 0.1  # the wrong method would be off by this
 
 
 def test_actions_stay_within_the_limits():
