@@ -17,17 +17,18 @@ smaller angle.
 import dataclasses
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Protocol, runtime_checkable
 
 import numpy as np
 from jaxtyping import Float
 
 from asp_env import registry
 from asp_env.data.predictor import (
+    FeaturePredictor,
     Forecast,
     GuardablePlug,
     Predictor,
     constant_velocity,
+    feature_size,
     needs_simulation,
 )
 from asp_env.data.scene import Scene
@@ -43,15 +44,6 @@ FULL_AT = 1.5
 """Score from which a forecast is constant velocity alone. Chosen by hand: a smaller one makes
 forecasts jump between consecutive ticks, a larger one leaves forecasts unguarded that are far from
 all validation data."""
-
-
-@runtime_checkable
-class FeaturePredictor(Predictor, Protocol):
-    """A predictor that computes features of its targets."""
-
-    def features(self, scene: Scene) -> Float[np.ndarray, "t z"]:
-        """Features z of each target; any values where the target is not forecast."""
-        ...
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -84,6 +76,11 @@ class Guarded:
     def privileged(self) -> bool:
         """Whether the trained predictor is."""
         return self.inner.privileged
+
+    @property
+    def feature_size(self) -> int:
+        """Number of features in the trained predictor's forecasts."""
+        return feature_size(self.inner)
 
     @property
     def needs_simulation(self) -> bool:
@@ -142,7 +139,9 @@ class Guarded:
         share = np.zeros(len(forecast.valid), dtype=np.float32)
         rows = np.flatnonzero(forecast.valid)
         if len(rows):
-            score = self.distance.score(self.inner.features(scene)[rows])
+            assert forecast.features is not None
+            encoded = forecast.features[rows, : len(self.distance.mean)]  # ẑ may follow z
+            score = self.distance.score(encoded)
             share[rows] = fallback_share(score)
         guarded = blended(forecast, scene, share, self.integrator)
         stated = np.where(forecast.valid, share, np.float32(np.nan))

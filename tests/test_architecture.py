@@ -38,7 +38,10 @@ ARROWS = {
     "predictors": {"predictors.inference", "predictors.models", *FOR_PREDICTORS},
     "predictors.models": FOR_PREDICTORS,
     "predictors.inference": {"predictors", "predictors.models", *FOR_PREDICTORS},
-    "predictors.training": {"predictors.inference", "predictors.models", *FOR_PREDICTORS},
+    "predictors.training": {
+        *("predictors", "predictors.inference", "predictors.models"),
+        *FOR_PREDICTORS,
+    },
     "predictors.experiments": {
         *("predictors", "predictors.training", "predictors.inference", "predictors.models"),
         *("evaluation", "planning", "sim"),

@@ -9,7 +9,7 @@ import sys
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 import numpy as np
 import tyro
@@ -17,7 +17,7 @@ from jaxtyping import Bool, Float
 from rich.console import Console
 
 from asp_env import registry
-from asp_env.data.causal import causal_histories
+from asp_env.data.histories import histories
 from asp_env.data.recording import Recording
 from asp_env.data.snippets import SnippetIndex, gather_scene, index_snippets
 from asp_env.data.source import Recordings, join_data, open_data
@@ -98,10 +98,8 @@ def add_feature_distance(folder: Path, data: Sequence[str]) -> FeatureDistance:
         history_s=predictor.history * predictor.dt_s,
     )
     index = index.select(_not_trained_on(recordings, index, predictor.trained_on))
-    scenes: Sequence[Recording] = recordings
-    if predictor.metadata.get("history") == "causal":
-        scenes = causal_histories(recordings)
-    found = feature_distance_of(predictor, scenes, index)
+    history: Any = predictor.metadata.get("history", "recorded")
+    found = feature_distance_of(predictor, histories(recordings, history), index)
     if found is None:
         raise CheckpointError(
             f"{', '.join(data)}: {len(index)} targets that {folder} was not trained on, expected "
@@ -135,7 +133,9 @@ def _features(
     parts = [np.zeros((0, predictor.network.config.features), dtype=np.float32)]
     for first in range(0, len(index), CHUNK):
         rows = np.arange(first, min(first + CHUNK, len(index)))
-        parts.append(predictor.features(gather_scene(scenes, index.select(rows))))
+        features = predictor.predict(gather_scene(scenes, index.select(rows))).features
+        assert features is not None
+        parts.append(features[:, : predictor.network.config.features])
     return np.concatenate(parts)
 
 

@@ -6,7 +6,6 @@ from types import MappingProxyType
 from typing import final
 
 import numpy as np
-import torch
 from jaxtyping import Bool, Float
 from torch import Tensor
 
@@ -120,22 +119,6 @@ class TrainedPredictor:
             features=features,
         )
 
-    @torch.inference_mode()
-    def features(self, scene: Scene) -> Float[np.ndarray, "t z"]:
-        """Features z of the present scene, which the encoder returns for each target.
-
-        Args:
-            scene: The scene. Targets that are not forecast have zeros.
-        """
-        valid = predictable_targets(scene, self.history)
-        rows = np.flatnonzero(valid)
-        parts = []
-        for first in range(0, max(len(rows), 1), self._chunk):
-            chosen = scene.with_targets(scene.targets[rows[first : first + self._chunk]])
-            batch = make_batch(chosen, self.view, self.history)
-            parts.append(encoded(self.network, batch).float().numpy())
-        return _scatter(parts, valid)
-
     def modes(self, batch: Batch) -> Modes:
         """Returns the calibrated modes in the targets' frames, log-probabilities for logits."""
         return self.network.calibrated(batch, temperature=self._temperature, chaining=self.chaining)
@@ -163,12 +146,6 @@ class TrainedPredictor:
             chaining=self.chaining,
             label=None if label is None else label[part],
         )
-
-
-def encoded(network: AbstractNetwork, batch: Batch) -> Float[Tensor, "n z"]:
-    """Features z of the observation: those of `network.encode`, or the encoder's output."""
-    encode = getattr(network, "encode", None)
-    return network.get_submodule("encoder")(batch.observation) if encode is None else encode(batch)
 
 
 def _scatter(parts: Sequence[np.ndarray], valid: Bool[np.ndarray, " t"]) -> np.ndarray:

@@ -279,7 +279,8 @@ class AbstractNetwork(nn.Module, ABC):
         fast = modes.standing <= FAST_LOGIT
         logit = torch.where(fast, modes.standing, slope * modes.standing + shift)[:, None]
         stops = stopping_actions(batch, modes.states.shape[2], self.shape.dt_s)[:, None]
-        states = rollout_from_now(stops, batch, self.shape.dt_s, "heun")
+        integrator: Integrator = getattr(self.config, "integrator", "heun")
+        states = rollout_from_now(stops, batch, self.shape.dt_s, integrator)
         log_probs = torch.cat(
             [modes.logits + functional.logsigmoid(-logit), functional.logsigmoid(logit)], dim=1
         )

@@ -41,7 +41,7 @@ class SiteRanges:
     median_m: Range = (0.4, 4.0)
     corner_m: Range = (4.0, 15.0)
     """Radius of an intersection's corners."""
-    limits_kmh: tuple[float, ...] = (10.0, 20.0, 30.0, 30.0, 40.0, 50.0, 50.0, 60.0)
+    limits_kmh: tuple[float, ...] = (10, 20, 30, 30, 40, 50, 50, 50, 60, 60)
     """Speed limits of a location, all equally probable."""
     limit_differs_kmh: float = 20.0
     """Largest deviation of an arm's limit; all limits lie within those above."""
@@ -54,9 +54,9 @@ class SiteRanges:
     crossing: Range = (0.0, 0.9)
     """Share of arms with a zebra crossing, at a location."""
     controls: tuple[tuple[Control, float], ...] = (
-        ("priority", 0.55),
-        ("right_before_left", 0.2),
-        ("traffic_light", 0.25),
+        ("priority", 0.4),
+        ("right_before_left", 0.15),
+        ("traffic_light", 0.45),
     )
     """Rules of the right of way with their shares; signals are not part of the recording."""
     split_m: Range = (22.0, 34.0)
@@ -87,7 +87,7 @@ class TrafficRanges:
     Chosen by hand: from almost empty to jams, and no class is rare at every location.
     """
 
-    vehicles_per_hour: Range = (200.0, 2000.0)
+    vehicles_per_hour: Range = (500.0, 2200.0)
     """Drawn on a logarithmic scale."""
     no_pedestrians: float = 0.25
     """Share of locations without pedestrians."""
@@ -98,17 +98,17 @@ class TrafficRanges:
     """Odds of a left turn, relative to those in normal traffic."""
     dense_drivers: float = 0.45
     """Share of locations with the drivers of dense traffic, some of which do not yield."""
-    speed_mean: Range = (0.75, 1.1)
+    speed_mean: Range = (0.85, 1.1)
     """Mean desired speed of a location, relative to the limit."""
     speed_spread: Range = (0.05, 0.2)
     """Standard deviation of the desired speed within a location."""
     speed_factor: Range = (0.5, 1.3)
     """Bounds of the desired speed, relative to the limit."""
-    slow: Range = (0.0, 0.08)
+    slow: Range = (0.0, 0.04)
     """Share of vehicles that are slow everywhere, as tractors and vehicles looking for a place."""
     slow_mps: Range = (2.0, 6.0)
     bicycle_mps: Range = (2.5, 7.5)
-    accel_factor: Range = (0.6, 1.4)
+    accel_factor: Range = (0.8, 1.6)
     """Factor on the accelerations of a location."""
     stops: Range = (0.0, 0.12)
     """Share of vehicles that stop on their lane: a passenger, a parcel, a place that gets free."""
