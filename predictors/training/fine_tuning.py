@@ -52,6 +52,7 @@ from predictors.inference.checkpoint import (
 )
 from predictors.inference.trained import TrainedPredictor
 from predictors.models.network import AbstractNetwork, TrainingProgress
+from predictors.training.augmentation import Augmentation
 from predictors.training.data import (
     VALIDATION_BATCH,
     Batches,
@@ -253,13 +254,11 @@ def config_from(predictor: str, start: Path, options: FineTuning) -> TrainingCon
     network = load_trained(spec, str(start)).network
     stored = read_config(start)["provenance"].get("config", {})
     known = {field.name for field in dataclasses.fields(TrainingConfig)}
-    fields: dict[str, Any] = {  # JSON has lists for tuples
-        name: tuple(value) if isinstance(value, list) else value
-        for name, value in stored.items()
-        if name in known
-    }
+    fields = {name: value for name, value in _with_tuples(stored).items() if name in known}
     fields["network"] = network.config
     try:
+        if fields.get("augmentation") is not None:
+            fields["augmentation"] = Augmentation(**fields["augmentation"])
         config = TrainingConfig(**fields)
     except TypeError as error:
         raise CheckpointError(
@@ -275,8 +274,23 @@ def config_from(predictor: str, start: Path, options: FineTuning) -> TrainingCon
         max_snippets=options.max_snippets,
         epochs=options.epochs,
         pretraining_epochs=0,
+        budget="epochs",
+        patience=None,
+        progress_epochs=None,
         learning_rate=LEARNING_RATE_SHARE * config.learning_rate,
     )
+
+
+def _with_tuples(fields: dict[str, Any]) -> dict[str, Any]:
+    """Fields of a stored configuration; JSON has lists for tuples."""
+    return {
+        name: tuple(value)
+        if isinstance(value, list)
+        else _with_tuples(value)
+        if isinstance(value, dict)
+        else value
+        for name, value in fields.items()
+    }
 
 
 def _open(
@@ -522,13 +536,15 @@ def validation_errors(
     for sample in batches:
         batch, labels = move_data_to_device(sample, device)
         modes = network(batch)
+        modes = modes._replace(logits=modes.logits.float().log_softmax(dim=-1))
+        modes = network.with_standing(batch, modes)
         truth = labels.states[..., :2].cpu().numpy()
         valid = np.ones(truth.shape[:2], dtype=bool)
         now = np.zeros((len(truth), 4), dtype=np.float32)
         now[:, 3] = batch.motion[:, 0].cpu().numpy()
         found = open_loop_errors(
             modes.states[..., :2].float().cpu().numpy(),
-            modes.logits.float().log_softmax(dim=-1).cpu().numpy(),
+            modes.logits.cpu().numpy(),
             truth,
             valid,
             "most-probable",

@@ -202,11 +202,12 @@ def _cut(lanelet: Lanelet, piece_m: float) -> list[Lanelet]:
     Two opposite lanes with a common border are cut at the same points of it.
     """
     count = max(1, round(float(arc_lengths(lanelet.left_line)[-1]) / piece_m))
-    if count == 1 or len(lanelet.left) > 1 or len(lanelet.right) > 1:
+    if count == 1 or len(lanelet.left) != 1 or len(lanelet.right) != 1:
         return [lanelet]
-    sides = [_cut_line(side[0], count) for side in (lanelet.left, lanelet.right)]
+    lefts, rights = _cut_line(lanelet.left[0], count), _cut_line(lanelet.right[0], count)
     return [
-        replace(lanelet, left=(left,), right=(right,)) for left, right in zip(*sides, strict=True)
+        replace(lanelet, left=(left,), right=(right,))
+        for left, right in zip(lefts, rights, strict=True)
     ]
 
 

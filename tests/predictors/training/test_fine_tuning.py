@@ -14,6 +14,7 @@ from asp_env.data.source import open_data
 from asp_env.errors import AspEnvError, CheckpointError
 from asp_env.evaluation.selection import ticks_to_evaluate
 from predictors.training import fine_tuning
+from predictors.training.augmentation import Augmentation
 from predictors.training.command import Train
 from predictors.training.fine_tuning import (
     ValidationErrors,
@@ -23,7 +24,7 @@ from predictors.training.fine_tuning import (
 )
 from predictors.training.fitting import train
 from tests.data.levelx_files import write_map, write_recording
-from tests.predictors.tiny import save_random, tiny_config, write_data
+from tests.predictors.tiny import save_random, tiny_config, tiny_network, write_data
 
 
 @pytest.fixture(scope="module")
@@ -75,6 +76,28 @@ def test_everything_but_the_weights_is_the_run_s(start: Path, tuned: Path) -> No
     assert schedules[1]["learning_rate"] == pytest.approx(0.1 * schedules[0]["learning_rate"])
     assert schedules[1]["preset"] == "cpu+fine-tuned"
     assert schedules[1]["batch_size"] == schedules[0]["batch_size"]
+
+
+def test_a_run_with_augmentation_until_convergence_continues_with_it(
+    before: str, own: str, tmp_path: Path
+) -> None:
+    """The stored ranges are those of the start; its budget is not that of the fine-tuning."""
+    config = tiny_config(
+        "ffw-asp",
+        "vectors",
+        epochs=1,
+        schedule="plateau",
+        budget="converged",
+        patience=1,
+        augmentation=Augmentation(largest_scale=1.1),
+        network=tiny_network("ffw-asp", "vectors", standing=True),
+    )
+    start = train(config, before, tmp_path / "start")
+    command(start, own, tmp_path / "tuned", epochs=1).run()
+    one, other = (config_of(tmp_path / each)["provenance"]["config"] for each in ("start", "tuned"))
+    assert other["augmentation"] == one["augmentation"]
+    assert other["augmentation"]["largest_scale"] == 1.1
+    assert (other["budget"], other["patience"]) == ("epochs", None)
 
 
 def test_recordings_of_both_are_not_evaluated_on(
