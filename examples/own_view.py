@@ -20,8 +20,11 @@ class SignalView:
 
     traffic: ChauffeurNet = field(default_factory=ChauffeurNet)
     name: ClassVar[str] = "chauffeurnet-signals"  # also the name of the entry point
-    history: ClassVar[int] = ChauffeurNet.history
     channels: ClassVar = (*ChauffeurNet.channels, "signal_red", "signal_amber", "signal_green")
+
+    @property
+    def history(self) -> int:
+        return self.traffic.history  # an option of `config()`, which --history-s changes
 
     @property
     def shape(self) -> tuple[int, int, int]:
@@ -32,20 +35,17 @@ class SignalView:
         return cls(ChauffeurNet.make(pixels))
 
     def config(self) -> dict[str, Any]:
-        """The name and all options, which a run stores in its config.json."""
         return {**self.traffic.config(), "name": self.name}
 
     @classmethod
     def from_config(cls, config: dict[str, Any]) -> "SignalView":
-        """The view that `config()` describes."""
         return cls(ChauffeurNet.from_config({**config, "name": "chauffeurnet"}))
 
     def render(self, scene: RenderInput, out: np.ndarray | None = None) -> np.ndarray:
         """One raster of 0 and 255 per target, (targets, 15, height, width) uint8."""
         out = raster_memory((len(scene.targets), *self.shape), out)
         added, viewport = out[:, len(ChauffeurNet.channels) :], self.traffic.viewport
-        out[:, : len(ChauffeurNet.channels)] = self.traffic.render(scene)
-        added[:] = 0
+        out[:, : len(ChauffeurNet.channels)], added[:] = self.traffic.render(scene), 0
         if scene.signals is not None:
             placed = place_targets(scene, viewport, history=self.history, view_name=self.name)
             situation, matrix = placed.targets[:, 0], placed.pixels_from_world[:, None]
@@ -56,8 +56,7 @@ class SignalView:
         return out
 
     def render_packed(self, scene: RenderInput) -> np.ndarray:
-        """The rasters as bits. Optional: saves memory if all values are 0 and 255."""
-        return np.packbits(self.render(scene), axis=-1)
+        return np.packbits(self.render(scene), axis=-1)  # optional, saves memory
 
 
 @njit(cache=True)

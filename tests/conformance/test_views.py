@@ -23,6 +23,7 @@ from asp_env.views import (
     make_view,
     view_from_config,
     view_names,
+    with_history,
 )
 from tests.views.own_view import OWN, register_own_view
 from tests.views.scenes import busy_scene
@@ -217,6 +218,24 @@ def test_a_short_history_is_rejected(view: SceneView) -> None:
     with pytest.raises(AspEnvError, match=f"needs {view.history} past ticks") as caught:
         view.render(short)
     assert "\n" not in str(caught.value)
+
+
+def test_another_history_is_shown_and_stored(view: SceneView) -> None:
+    """12 of 15 past ticks, unless the view shows fewer: the earlier ones have no effect."""
+    other = with_history(view, 12)
+    assert other.history <= 12
+    assert view_from_config(json.loads(json.dumps(other.config()))) == other
+    scene = scene_with_signals()
+    signals = scene.signals
+    assert signals is not None
+    short = dataclasses.replace(
+        scene,
+        states=scene.states[:, :, 3:],
+        actions=scene.actions[:, :, 3:],
+        valid=scene.valid[:, :, 3:],
+        signals=dataclasses.replace(signals, states=signals.states[..., 3:]),
+    )
+    assert_same(arrays(other, short), arrays(other, scene))
 
 
 def test_copies_contain_only_the_configuration(view: SceneView) -> None:
