@@ -1,11 +1,13 @@
 """The weights that ship with this package: `python -m predictors.experiments.pretrained OUT`.
 
 The command generates traffic of SUMO with measurement errors, trains a predictor on it, selects
-the epoch on other locations, and rounds the weights to half precision. The content of
+the epoch and calibrates on other locations and on traffic of highway-env, and rounds the weights to
+half precision. The content of
 `OUT/pretrained` belongs in `predictors/pretrained`. The same OUT can be given again, and what is
 finished is not made again.
 """
 
+import json
 import shlex
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -128,7 +130,7 @@ class Pretrain:
                 ).run()
             shipped = self.out / PRETRAINED / name
             if not shipped.exists():
-                ship(run, shipped)
+                ship(run, shipped, made_in=self.out)
                 add_feature_distance(shipped, familiar)
             self._complete_card(name, shipped, {"familiar": familiar, "other traffic": validation})
 
@@ -156,14 +158,15 @@ _HEADING = "## Pretrained weights\n"
 _TERMS = "license: other\nlicense_name: terms-of-the-training-data\n"
 
 
-def ship(run: Path, shipped: Path) -> None:
+def ship(run: Path, shipped: Path, *, made_in: Path) -> None:
     """Copies a finished run with its weights in half precision, which halves their size.
 
-    The name of the training data becomes `SOURCE`.
+    The name of the training data becomes `SOURCE`, and the folder that all was made in `OUT`.
 
     Args:
         run: The folder of the run.
         shipped: The folder to create.
+        made_in: The folder that the training data are in.
 
     Raises:
         CheckpointError: The run's weights are missing or damaged.
@@ -171,10 +174,11 @@ def ship(run: Path, shipped: Path) -> None:
     with atomic_folder(shipped) as folder:
         config = read_config(run)
         config["provenance"]["trained_on"]["source"] = SOURCE
+        config = json.loads(json.dumps(config).replace(f"{made_in}/", "OUT/"))
         write_json(config, folder / CONFIG)
         weights = read_weights(run / WEIGHTS)
         save_weights({n: each.to(torch.float16) for n, each in weights.items()}, folder / WEIGHTS)
-        card = (run / CARD).read_text()
+        card = (run / CARD).read_text().replace(f"{made_in}/", "OUT/")
         (folder / CARD).write_text(card.replace(weights_hash(run), weights_hash(folder)))
 
 
@@ -203,17 +207,19 @@ def _errors(name: str, shipped: Path, data: str, note: str) -> str:
 
 
 def _section(name: str, held_out: Sequence[str], rows: Sequence[str]) -> str:
-    data = f" --held-out {shlex.join(held_out)}" if held_out else ""
+    names = [Path(each).name for each in held_out]
+    data = f" --held-out {shlex.join(names)}" if names else ""
     lines = [
         "",
         "```",
         f"python -m {MODULE} OUT --predictors {name}{data}",
         "```",
         "",
-        "makes this folder (`OUT/pretrained`): it generates traffic of SUMO with measurement "
-        "errors, trains, and rounds the weights to half precision; the network computes in single "
-        "precision. Training and validation have locations of their own. The epoch was selected on "
-        "the validation data alone. All traffic is generated, so no terms of recordings apply.",
+        "makes this folder (`OUT/pretrained`): it generates normal, dense and varied traffic of "
+        "SUMO with measurement errors, trains with augmentation, and rounds the weights to half "
+        "precision; the network computes in single precision. The epoch, the probabilities and the "
+        "factor on accelerations were chosen on varied traffic at other locations and on traffic "
+        "of highway-env. All traffic is generated, so no terms of recordings apply.",
         "",
         "Displacement at 3 s of moving targets, m, and its ratio to constant velocity's, with the "
         "shipped weights; 95 % intervals from a bootstrap over recordings:",
@@ -222,7 +228,7 @@ def _section(name: str, held_out: Sequence[str], rows: Sequence[str]) -> str:
         "|---|---|---|---|---|---|",
         *rows,
         "",
-        "Trained on SUMO's traffic alone, they need not be better than constant velocity "
+        "Trained on generated traffic alone, they need not be better than constant velocity "
         "elsewhere.",
     ]
     return "\n".join(lines) + "\n"

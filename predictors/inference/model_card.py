@@ -110,12 +110,13 @@ def _facts(config: dict[str, Any], weights: str) -> dict[str, object]:
     dt_s, history = config["dt_s"], config["history"]
     training = config["provenance"].get("config", {})
     classes = [kind.name.lower() for kind in AgentClass if kind in PREDICTED]
+    standing = " and one that stands" if config["network"].get("standing") else ""
     return {
         "recipe": training.get("preset"),
         "view": f"`{json.dumps(config['view'], sort_keys=True)}`",
         "history": f"{history * dt_s:g} s: {history} ticks of {dt_s:g} s",
-        "forecast": f"{config['network'].get('modes')} modes of {config['horizon']} ticks of "
-        f"{dt_s:g} s ({config['horizon'] * dt_s:g} s) and their probabilities",
+        "forecast": f"{config['network'].get('modes')} modes{standing} of {config['horizon']} "
+        f"ticks of {dt_s:g} s ({config['horizon'] * dt_s:g} s) and their probabilities",
         "agent classes": ", ".join(classes),
         "network": f"`{json.dumps(config['network'], sort_keys=True)}`",
         "weights": f"SHA-256 `{weights}…`",

@@ -16,7 +16,7 @@ from tests.predictors.tiny import save_random
 def test_shipped_weights_are_the_run_s_rounded(tmp_path: Path) -> None:
     """To the nearest float16; positions differ by less than 3 cm."""
     run, shipped = save_random(tmp_path / "run"), tmp_path / "shipped"
-    ship(run, shipped)
+    ship(run, shipped, made_in=tmp_path)
     before, after = (load_file(each / "weights.safetensors") for each in (run, shipped))
     assert before.keys() == after.keys()
     for name, weights in before.items():
@@ -33,7 +33,7 @@ def test_shipped_weights_are_the_run_s_rounded(tmp_path: Path) -> None:
 def test_card_of_shipped_weights_has_their_hash(tmp_path: Path) -> None:
     """The rest of the card is unchanged."""
     run, shipped = save_random(tmp_path / "run"), tmp_path / "shipped"
-    ship(run, shipped)
+    ship(run, shipped, made_in=tmp_path)
     cards = [(each / "README.md").read_text() for each in (run, shipped)]
     hashes = [weights_hash(each) for each in (run, shipped)]
     assert hashes[0] != hashes[1]

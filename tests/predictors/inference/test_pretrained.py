@@ -31,11 +31,12 @@ def test_predictors_that_are_shipped() -> None:
 
 @every
 def test_files_that_ship(name: str) -> None:
-    """The three files of a run; the weights have less than 2 MB, and the card has their hash."""
+    """The files of a run; the weights have less than 2 MB, and the card has their hash."""
     folder = pretrained_folder(name)
     assert {path.name for path in folder.iterdir()} == {
         "README.md",
         "config.json",
+        "features.safetensors",
         "weights.safetensors",
     }
     assert (folder / "weights.safetensors").stat().st_size < MOST_BYTES
@@ -138,17 +139,17 @@ predictor = asp_env.data.predictor.load_predictor("ssp-asp:pretrained", horizon=
 print(json.dumps(predictor.predict(scene).states.shape))
 """
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
-    assert json.loads(done.stdout) == [4, 3, 15, 4]
+    assert json.loads(done.stdout) == [4, 4, 15, 4]  # the last mode stands
 
 
 def test_forecasts_as_observation() -> None:
     """A learned predictor's forecasts in an environment, without any training."""
     env = asp_env.PredictionFeatures(
-        gymnasium.make("asp_env/Replay-v0", observations=("state",)), "ffw-asp:pretrained"
+        gymnasium.make("asp_env/Replay-v0", observations=("state",)), "ffw-asp:pretrained", modes=4
     )
     observation, _ = env.reset(seed=0)
     assert observation["forecast_valid"].sum() > 0
-    probabilities = observation["forecast_probabilities"].reshape(8, 3)
+    probabilities = observation["forecast_probabilities"].reshape(8, 4)
     present = observation["forecast_valid"] == 1
     np.testing.assert_allclose(probabilities[present].sum(axis=1), 1, atol=1e-5)
     assert (probabilities[present].max(axis=1) < 1).any()
