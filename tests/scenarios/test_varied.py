@@ -111,11 +111,12 @@ def test_sites_differ_within_the_ranges(tmp_path: Path, name: str) -> None:
 
 
 def test_mixes_differ_within_the_ranges() -> None:
-    """Of 200 locations some are almost empty, some have many bicycles; tight ones no buses."""
+    """Of 200 locations some are quiet, some have many bicycles; tight ones no buses."""
     rng = np.random.default_rng(0)
     mixes = [varied_mix(rng, narrowest_m=3.0, tight=True) for _ in range(200)]
     rates = np.array([mix.vehicles_per_hour[0] for mix in mixes])
-    assert rates.min() < 300.0 < 1500.0 < rates.max() <= RANGES.traffic.vehicles_per_hour[1]
+    low, high = RANGES.traffic.vehicles_per_hour
+    assert low <= rates.min() < 1.2 * low < 0.8 * high < rates.max() <= high
     assert all(mix.shares["bus"] == mix.shares["truck"] == 0.0 for mix in mixes)
     bicycles = [mix.shares["bicycle"] / sum(mix.shares.values()) for mix in mixes]
     assert min(bicycles) < 0.03 < 0.2 < max(bicycles)

@@ -152,7 +152,7 @@ def test_pixels_that_are_not_square_are_rejected(
 
 @pytest.mark.parametrize("view", RASTER_VIEWS, ids=lambda view: view.name)
 def test_configurations_contain_every_field(view: RasterView) -> None:
-    fields = {field.name for field in dataclasses.fields(Viewport)} | {"name"}
+    fields = {field.name for field in dataclasses.fields(Viewport)} | {"name", "history"}
     extra = {"ego_trail"} if isinstance(view, ChauffeurNet) else set()
     assert set(view.config()) == fields | extra
 

@@ -175,6 +175,7 @@ def make_dense_recording(recording: Recording, *, agents: int, duration_s: float
         first_frames=np.array(first_frames, dtype=recording.first_frames.dtype),
         starts=np.concatenate([[0], np.cumsum([len(each) for each in tracks])]),
         states=np.concatenate(tracks),
+        accelerations=None,
         background=None,
     )
 

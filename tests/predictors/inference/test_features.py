@@ -59,7 +59,10 @@ def test_features_are_those_that_the_network_encodes(run: str) -> None:
         batch = make_batch(scene(), predictor.view, predictor.history)
         if isinstance(network, SSPASPNetwork):
             _, labels = draw_samples(
-                range(len(batch.motion)), view="vectors", later_ticks=network.later_ticks[:1]
+                range(len(batch.motion)),
+                view="vectors",
+                horizon_s=predictor.horizon * predictor.dt_s,
+                later_ticks=network.later_ticks,
             )
             _, features = network.validate(network(batch), batch, labels, TrainingProgress())
             assert features is not None

@@ -14,12 +14,12 @@ from safetensors.torch import load_file
 from torch.utils._pytree import tree_flatten
 
 from asp_env.data.causal import causal_histories
-from asp_env.data.snippets import index_snippets
+from asp_env.data.snippets import SnippetIndex, index_snippets
 from asp_env.data.source import open_data
 from asp_env.errors import AspEnvError
 from asp_env.views import make_view
 from predictors.training.data import Batches
-from predictors.training.data_loading import BatchWorkers, Sample, batch_workers
+from predictors.training.data_loading import BatchRequest, BatchWorkers, Sample, batch_workers
 from predictors.training.fitting import train
 from predictors.training.trainer import Hardware
 from tests.builders import make_recording
@@ -39,6 +39,11 @@ def opened(folder: str) -> Batches:
         later_ticks=(15,),
         histories=causal_histories(recordings),
     )
+
+
+def request(snippets: SnippetIndex) -> BatchRequest:
+    """A batch of the first snippets of a run."""
+    return BatchRequest(snippets, np.arange(len(snippets)))
 
 
 def in_memory() -> Batches:
@@ -83,8 +88,9 @@ def test_error_in_a_process_is_raised(both: tuple[BatchWorkers, list[Batches]]) 
     workers, batches = both
     index = index_snippets(batches[1].source.recordings, dt_s=0.2, horizon_s=3.0, history_s=1.0)
     with pytest.raises(ValueError, match="needs 15 past ticks"):
-        workers.submit(1, index).result()
-    assert len(workers.submit(1, batches[1].snippets.select(np.arange(3))).result()[1].states) == 3
+        workers.submit(1, request(index)).result()
+    few = request(batches[1].snippets.select(np.arange(3)))
+    assert len(workers.submit(1, few).result()[1].states) == 3
 
 
 def test_processes_do_not_change_the_weights(tmp_path: Path) -> None:
@@ -108,12 +114,12 @@ def test_negative_number_of_processes_is_refused() -> None:
 KILLED = """
 import os, signal
 from predictors.training.data_loading import BatchWorkers
-from tests.predictors.training.test_data_loading import in_memory
+from tests.predictors.training.test_data_loading import in_memory, request
 
 if __name__ == "__main__":
     batches = in_memory()
     workers = BatchWorkers([batches.source], 2)
-    workers.submit(0, batches.snippets).result()
+    workers.submit(0, request(batches.snippets)).result()
     os.kill(os.getpid(), signal.SIGKILL)
 """
 
