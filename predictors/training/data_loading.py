@@ -75,16 +75,15 @@ class BatchSource:
         snippets, keys = request.snippets, sample_keys(self.seed, request.visits)
         recorded = one_situation_each(gather_scene(self.histories, snippets))
         about = recorded.target_states[:, :2].astype(np.float64)
+        scenes = [measured_again(recorded, keys, ranges)]
+        for part, ticks in enumerate(self.later_ticks, start=1):
+            later = one_situation_each(gather_scene(self.histories, snippets.shifted(ticks)))
+            scenes.append(measured_again(later, keys, ranges, part=part))
+        labels = make_labels(scenes[0], gather_future(self.recordings, snippets))
         batches = []
-        for part, ticks in enumerate((0, *self.later_ticks)):
-            scene = recorded
-            if ticks:
-                scene = one_situation_each(gather_scene(self.histories, snippets.shifted(ticks)))
-            scene = measured_again(scene, keys, ranges, part=part)
-            if not ticks:
-                labels = make_labels(scene, gather_future(self.recordings, snippets))
-            scene = off_the_map(scene, about, keys, ranges)
-            batches.append(reshaped(make_batch(scene, self.view, snippets.history), keys, ranges))
+        for scene in scenes:
+            moved = off_the_map(scene, about, keys, ranges)
+            batches.append(reshaped(make_batch(moved, self.view, snippets.history), keys, ranges))
         states = reshaped_labels(labels.states, keys, ranges)
         return batches[0], Labels(states=states, later=tuple(batches[1:]))
 
