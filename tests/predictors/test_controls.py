@@ -1,6 +1,7 @@
 """Controls, against numbers derived by hand and the forecasts that they lie between."""
 
 import math
+from typing import Any
 
 import numpy as np
 import pytest
@@ -58,7 +59,7 @@ def forecast_by(name: str, scene: Scene, future: Future) -> Forecast:
 
 def copies(scene: Scene, future: Future, count: int) -> tuple[Scene, Future]:
     """A scene of one agent as several situations, in which it has the ids 1 to `count`."""
-    many = {
+    many: dict[str, Any] = {
         name: np.repeat(getattr(scene, name), count, axis=0)
         for name in ("states", "actions", "valid", "sizes", "classes", "tick", "route")
     }
