@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 from asp_env.dynamics import MAX_ACCELERATION_MPS2
 from predictors.models.batch import Batch, Labels
 from predictors.models.losses import STANDS_M, mode_terms, standing_loss, stands
-from predictors.models.network import TrainingProgress, stopping_actions
+from predictors.models.network import TrainingProgress, log_sigmoid, stopping_actions
 from tests.predictors.tiny import draw_samples, make_network, tiny_network, tiny_shape
 
 TRAINABLE = ("mtp", "dkm", "ffw-asp", "ssp-asp")
@@ -101,3 +101,9 @@ def test_terms_of_the_learned_targets_by_hand() -> None:
     )
     assert float(terms["regression"]) == pytest.approx(0.0025)
     assert float(terms["classification"]) == 0.0
+
+
+@given(x=st.floats(-40, 40))
+def test_log_sigmoid(x: float) -> None:
+    expected = float(torch.nn.functional.logsigmoid(torch.tensor(x, dtype=torch.float64)))
+    assert float(log_sigmoid(torch.tensor(x))) == pytest.approx(expected, rel=1e-5, abs=1e-7)
