@@ -8,6 +8,7 @@ from asp_env.data.scenarios.scenario import ScenarioFilter, ScenarioSet
 from asp_env.envs.options import suggest_options
 from asp_env.envs.vector import ReplayVectorEnv
 from asp_env.errors import MissingExtraError
+from asp_env.sim.action_types import ActionType
 from asp_env.sim.traffic.assignment import TrafficSpec
 
 if TYPE_CHECKING:
@@ -28,6 +29,7 @@ def parallel_env(
     raster_px: tuple[int, int] | None = None,
     traffic: TrafficSpec | None = None,
     dt_s: float = DEFAULT_DT_S,
+    action_type: ActionType = "direct",
     reward_weights: Mapping[str, float] | None = None,
     scenarios: ScenarioSet | ScenarioFilter | str = "",
 ) -> "ParallelReplayEnv":
@@ -44,6 +46,7 @@ def parallel_env(
         raster_px: height and width of the `raster` in pixels.
         traffic: the driver of the uncontrolled agents, or a table of drivers.
         dt_s: length of a tick in seconds.
+        action_type: what actions mean: `direct`, `jerk` or `route`.
         reward_weights: weights of reward terms that differ from the defaults.
         scenarios: the scenarios to draw from, or a filter.
 
@@ -66,6 +69,7 @@ def parallel_env(
         raster_px=raster_px,
         traffic=traffic,
         dt_s=dt_s,
+        action_type=action_type,
         reward_weights=reward_weights,
         scenarios=scenarios,
     )
@@ -82,6 +86,7 @@ def sb3_vec_env(
     raster_px: tuple[int, int] | None = None,
     traffic: TrafficSpec | None = None,
     dt_s: float = DEFAULT_DT_S,
+    action_type: ActionType = "direct",
     reward_weights: Mapping[str, float] | None = None,
     scenarios: ScenarioSet | ScenarioFilter | str = "",
 ) -> "ReplayVecEnv":
@@ -96,6 +101,7 @@ def sb3_vec_env(
         raster_px: height and width of the `raster` in pixels.
         traffic: the driver of the uncontrolled agents, or a table of drivers.
         dt_s: length of a tick in seconds.
+        action_type: what actions mean: `direct`, `jerk` or `route`.
         reward_weights: weights of reward terms that differ from the defaults.
         scenarios: the scenarios to draw from, or a filter.
 
@@ -117,6 +123,7 @@ def sb3_vec_env(
         raster_px=raster_px,
         traffic=traffic,
         dt_s=dt_s,
+        action_type=action_type,
         reward_weights=reward_weights,
         scenarios=scenarios,
     )

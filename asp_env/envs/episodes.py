@@ -19,9 +19,15 @@ from asp_env.data.scenarios.scenario import Scenario, ScenarioFilter, ScenarioSe
 from asp_env.data.scenarios.selection import choose_scenarios, scenario_of
 from asp_env.data.snippets import HISTORY_S
 from asp_env.data.source import Recordings, open_data
-from asp_env.dynamics import denormalize_actions
+from asp_env.data.scene import EGO, infer_actions
 from asp_env.envs.options import ReplayOptions
 from asp_env.errors import AspEnvError, unknown_name
+from asp_env.sim.action_types import (
+    check_action_type,
+    following_steering,
+    from_physical,
+    to_physical,
+)
 from asp_env.sim.observation import Observation, Observer, ego_context
 from asp_env.sim.reward import reward_terms, weighted_sum, weights_from
 from asp_env.sim.simulation import Simulation, ending
@@ -200,6 +206,8 @@ class ReplayEpisodes:
             history=history,
             world_class=kind,
         )
+        check_action_type(options.action_type)
+        self._action_type = options.action_type
         self._weights = weights_from(options.reward_weights or {})
         self._names = np.full(num_episodes, None, dtype=object)
         self._tags = np.full(num_episodes, None, dtype=object)
@@ -255,12 +263,12 @@ class ReplayEpisodes:
         self.events = self.simulation.world.events()
 
     def step(self, actions: Float[np.ndarray, "b 2"]) -> StepResult:
-        """Steps all episodes by one tick; the egos' actions lie in [-1, 1]."""
+        """Steps all episodes by one tick; the egos' actions are of the action type, in [-1, 1]."""
         world, before = self.simulation.world, self.events
         assert before is not None
         states_before = world.ego_states()
         controlled = np.ones(len(world), dtype=bool)
-        self.simulation.step(denormalize_actions(actions), controlled)
+        self.simulation.step(self.physical_actions(actions), controlled)
         self.events = after = world.events()
         terms = reward_terms(before, after, states_before, world.ego_states(), world.dt_s)
         endings = ending(after)
@@ -271,6 +279,36 @@ class ReplayEpisodes:
             truncated=endings == Ending.OUT_OF_DATA,
             ending=_ENDING_NAMES[endings],
         )
+
+    def physical_actions(self, actions: Float[np.ndarray, "b 2"]) -> Float[np.ndarray, "b 2"]:
+        """Converts the egos' actions in [-1, 1] to [acceleration m/s², steering rad]."""
+        return to_physical(self._action_type, actions, *self._action_context())
+
+    def actions_from(self, physical: Float[np.ndarray, "b 2"]) -> Float[np.ndarray, "b 2"]:
+        """Converts [acceleration m/s², steering rad] to actions, possibly beyond [-1, 1]."""
+        return from_physical(self._action_type, physical, *self._action_context())
+
+    def _action_context(self) -> tuple[np.ndarray, np.ndarray, float]:
+        """The last actions of the egos, their steering along the route, and the time step."""
+        world = self.simulation.world
+        episodes, count = world.episodes, len(world)
+        last, following = np.zeros((count, 2), dtype=np.float32), np.zeros(count)
+        lengths = episodes.sizes[:, EGO, 0]
+        if self._action_type == "jerk":
+            rows = np.arange(count)
+            before = np.stack([episodes.states[rows, world.now - k, EGO] for k in (1, 0)], axis=1)
+            seen = np.stack([episodes.valid[rows, world.now - k, EGO] for k in (1, 0)], axis=1)
+            last = infer_actions(before, seen, lengths, world.dt_s)[:, 0]
+        if self._action_type == "route":
+            assert self.events is not None
+            following = following_steering(
+                world.ego_states(),
+                np.maximum(lengths, 0.1),
+                episodes.route,
+                episodes.route_valid,
+                self.events.route_m,
+            )
+        return last, following, world.dt_s
 
     def observe(
         self, rows: Int[np.ndarray, " n"] | None = None, out: Observation | None = None

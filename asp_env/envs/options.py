@@ -10,6 +10,7 @@ from typing import Any, TypeVar, cast
 from asp_env.data.recording import DEFAULT_DT_S
 from asp_env.data.scenarios.scenario import ScenarioFilter, ScenarioSet
 from asp_env.errors import AspEnvError
+from asp_env.sim.action_types import ActionType
 from asp_env.sim.traffic.assignment import TrafficSpec
 
 Function = TypeVar("Function", bound=Callable[..., Any])
@@ -35,6 +36,8 @@ class ReplayOptions:
     world moves them."""
     dt_s: float = DEFAULT_DT_S
     """Length of a tick in seconds."""
+    action_type: ActionType = "direct"
+    """What the two numbers of an action mean, see `asp_env.sim.action_types`."""
     reward_weights: Mapping[str, float] | None = None
     """Weights of reward terms by name, where they differ from the defaults."""
     scenarios: ScenarioSet | ScenarioFilter | str = ""

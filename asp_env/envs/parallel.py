@@ -20,13 +20,13 @@ from asp_env.data.classes import PREDICTED, AgentClass
 from asp_env.data.recording import DEFAULT_DT_S, Recording, frames_per_tick
 from asp_env.data.scenarios.scenario import Scenario, ScenarioFilter, ScenarioSet
 from asp_env.data.scene import EGO, Scene
-from asp_env.dynamics import denormalize_actions
 from asp_env.envs.episodes import RESET_OPTIONS, ReplayEpisodes, StepResult, valid_actions
 from asp_env.envs.options import ReplayOptions, suggest_options
 from asp_env.errors import AspEnvError, unknown_name
 from asp_env.render.frames import draw_frame
 from asp_env.sim.reward import MIN_GOAL_M
 from asp_env.sim.traffic import Control, Driver
+from asp_env.sim.action_types import ActionType
 from asp_env.sim.traffic.assignment import TrafficSpec
 from asp_env.sim.traffic.driver import controllable_agents
 from asp_env.sim.world import World
@@ -248,6 +248,7 @@ all |
         raster_px: tuple[int, int] | None = None,
         traffic: TrafficSpec | None = None,
         dt_s: float = DEFAULT_DT_S,
+        action_type: ActionType = "direct",
         reward_weights: Mapping[str, float] | None = None,
         scenarios: ScenarioSet | ScenarioFilter | str = "",
     ) -> None:
@@ -266,6 +267,7 @@ all |
             raster_px=raster_px,
             traffic=traffic,
             dt_s=dt_s,
+            action_type=action_type,
             reward_weights=reward_weights,
             scenarios=scenarios,
         )
@@ -348,7 +350,7 @@ all |
             joint[self._rows[name]] = valid_actions(actions[name], (2,))
         driver = self._episodes.simulation.driver
         assert isinstance(driver, JointPolicyDriver)
-        driver.actions = denormalize_actions(joint)
+        driver.actions = self._episodes.physical_actions(joint)
         result = self._episodes.step(joint)
         over = result.terminated | result.truncated
         returned = (

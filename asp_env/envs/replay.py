@@ -18,6 +18,7 @@ from asp_env.data.source import Recordings
 from asp_env.envs.episodes import ReplayEpisodes, StepResult, valid_actions
 from asp_env.envs.options import ReplayOptions, suggest_options
 from asp_env.render.live import MODES, LiveRenderer
+from asp_env.sim.action_types import ActionType
 from asp_env.sim.traffic.assignment import TrafficSpec
 from asp_env.sim.world import World, recorded_future
 
@@ -201,6 +202,7 @@ table of drivers; `log` by default, `own` in a world with reacting traffic |
         raster_px: tuple[int, int] | None = None,
         traffic: TrafficSpec | None = None,
         dt_s: float = DEFAULT_DT_S,
+        action_type: ActionType = "direct",
         reward_weights: Mapping[str, float] | None = None,
         scenarios: ScenarioSet | ScenarioFilter | str = "",
     ) -> None:
@@ -216,6 +218,7 @@ table of drivers; `log` by default, `own` in a world with reacting traffic |
             raster_px=raster_px,
             traffic=traffic,
             dt_s=dt_s,
+            action_type=action_type,
             reward_weights=reward_weights,
             scenarios=scenarios,
         )

@@ -21,6 +21,7 @@ from asp_env.envs.options import ReplayOptions, suggest_options
 from asp_env.errors import AspEnvError
 from asp_env.render.frames import draw_frame
 from asp_env.sim.observation import Observation
+from asp_env.sim.action_types import ActionType
 from asp_env.sim.traffic.assignment import TrafficSpec
 from asp_env.sim.world import recorded_future
 
@@ -95,6 +96,7 @@ class ReplayVectorEnv(VectorEnv[Observation, Any, np.ndarray]):
         raster_px: tuple[int, int] | None = None,
         traffic: TrafficSpec | None = None,
         dt_s: float = DEFAULT_DT_S,
+        action_type: ActionType = "direct",
         reward_weights: Mapping[str, float] | None = None,
         scenarios: ScenarioSet | ScenarioFilter | str = "",
     ) -> None:
@@ -113,6 +115,7 @@ class ReplayVectorEnv(VectorEnv[Observation, Any, np.ndarray]):
             raster_px=raster_px,
             traffic=traffic,
             dt_s=dt_s,
+            action_type=action_type,
             reward_weights=reward_weights,
             scenarios=scenarios,
         )

@@ -40,6 +40,9 @@ from asp_env.sim.episodes import (
 _AT_FAULT = np.array([kind in AT_FAULT for kind in Contact])
 """Whether the ego is at fault, by value of `Contact`."""
 
+GOAL_TOLERANCE_M = 0.01
+"""The goal counts as reached this far before it: allows for rounding."""
+
 
 class Ending(IntEnum):
     """Why an episode is over."""
@@ -77,6 +80,11 @@ class Events:
     """Ticks since the first observation."""
     length: Int[np.ndarray, " b"]
     """Ticks that the recording provides."""
+
+    @property
+    def reached_goal(self) -> Bool[np.ndarray, " b"]:
+        """Whether the ego is at its goal or beyond."""
+        return np.asarray(self.route_m >= self.goal_m - GOAL_TOLERANCE_M)
 
     @property
     def collision(self) -> Bool[np.ndarray, " b"]:
