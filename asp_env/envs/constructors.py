@@ -23,6 +23,8 @@ def parallel_env(
     classes: Sequence[str] | None = None,
     ids: Sequence[int] | None = None,
     max_agents: int | None = None,
+    pad_absent: bool = False,
+    flatten: bool = False,
     render_mode: str | None = None,
     observations: Sequence[str] = ("raster", "actions", "state"),
     view: str = "chauffeurnet",
@@ -40,6 +42,9 @@ def parallel_env(
         classes: names of the classes of vehicles that are agents, such as `car`; by default all.
         ids: track ids of the vehicles that are agents; by default all.
         max_agents: the largest number of agents; those nearest to `vehicle_0` are taken.
+        pad_absent: absent agents stay in `agents` for the whole episode, with zeros as observation
+            and reward, and the mask `present`.
+        flatten: the observation of an agent is one flat `Box` instead of a `Dict`.
         render_mode: `rgb_array` or None.
         observations: see `ReplayEnv`, as for the following arguments.
         view: the view that draws the `raster`.
@@ -63,6 +68,8 @@ def parallel_env(
         classes=classes,
         ids=ids,
         max_agents=max_agents,
+        pad_absent=pad_absent,
+        flatten=flatten,
         render_mode=render_mode,
         observations=observations,
         view=view,

@@ -1,0 +1,1 @@
+"""Agents that learn to drive in the environments, from rewards or from logged drivers."""
