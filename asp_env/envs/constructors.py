@@ -32,6 +32,7 @@ def parallel_env(
     traffic: TrafficSpec | None = None,
     dt_s: float = DEFAULT_DT_S,
     action_type: ActionType = "direct",
+    action_repeat: int = 1,
     reward_weights: Mapping[str, float] | None = None,
     scenarios: ScenarioSet | ScenarioFilter | str = "",
 ) -> "ParallelReplayEnv":
@@ -52,6 +53,7 @@ def parallel_env(
         traffic: the driver of the uncontrolled agents, or a table of drivers.
         dt_s: length of a tick in seconds.
         action_type: what actions mean: `direct`, `jerk` or `route`.
+        action_repeat: number of ticks for which each action is held.
         reward_weights: weights of reward terms that differ from the defaults.
         scenarios: the scenarios to draw from, or a filter.
 
@@ -77,6 +79,7 @@ def parallel_env(
         traffic=traffic,
         dt_s=dt_s,
         action_type=action_type,
+        action_repeat=action_repeat,
         reward_weights=reward_weights,
         scenarios=scenarios,
     )
@@ -94,6 +97,7 @@ def sb3_vec_env(
     traffic: TrafficSpec | None = None,
     dt_s: float = DEFAULT_DT_S,
     action_type: ActionType = "direct",
+    action_repeat: int = 1,
     reward_weights: Mapping[str, float] | None = None,
     scenarios: ScenarioSet | ScenarioFilter | str = "",
 ) -> "ReplayVecEnv":
@@ -109,6 +113,7 @@ def sb3_vec_env(
         traffic: the driver of the uncontrolled agents, or a table of drivers.
         dt_s: length of a tick in seconds.
         action_type: what actions mean: `direct`, `jerk` or `route`.
+        action_repeat: number of ticks for which each action is held.
         reward_weights: weights of reward terms that differ from the defaults.
         scenarios: the scenarios to draw from, or a filter.
 
@@ -131,6 +136,7 @@ def sb3_vec_env(
         traffic=traffic,
         dt_s=dt_s,
         action_type=action_type,
+        action_repeat=action_repeat,
         reward_weights=reward_weights,
         scenarios=scenarios,
     )

@@ -208,6 +208,9 @@ class ReplayEpisodes:
         )
         check_action_type(options.action_type)
         self._action_type = options.action_type
+        if options.action_repeat < 1:
+            raise AspEnvError(f"action_repeat {options.action_repeat}: expected at least 1")
+        self._action_repeat = options.action_repeat
         self._weights = weights_from(options.reward_weights or {})
         self._names = np.full(num_episodes, None, dtype=object)
         self._tags = np.full(num_episodes, None, dtype=object)
@@ -217,8 +220,7 @@ class ReplayEpisodes:
     def restrict(self, scenarios: ScenarioSet, num_episodes: int) -> None:
         """Replaces the scenarios to draw from and the number of episodes, and ends all episodes."""
         world = self.simulation.world
-        self.scenarios = scenarios
-        self._sampler = dataclasses.replace(self._sampler, scenarios=scenarios)
+        self.draw_from(scenarios)
         self.simulation = Simulation(
             self.recordings,
             self.simulation.driver,
@@ -230,6 +232,11 @@ class ReplayEpisodes:
         self._names = np.full(num_episodes, None, dtype=object)
         self._tags = np.full(num_episodes, None, dtype=object)
         self.events = None
+
+    def draw_from(self, scenarios: ScenarioSet) -> None:
+        """Replaces the scenarios to draw from; episodes under way go on."""
+        self.scenarios = scenarios
+        self._sampler = dataclasses.replace(self._sampler, scenarios=scenarios)
 
     def draw(
         self, np_random: np.random.Generator, options: Mapping[str, Any]
@@ -263,15 +270,21 @@ class ReplayEpisodes:
         self.events = self.simulation.world.events()
 
     def step(self, actions: Float[np.ndarray, "b 2"]) -> StepResult:
-        """Steps all episodes by one tick; the egos' actions are of the action type, in [-1, 1]."""
-        world, before = self.simulation.world, self.events
-        assert before is not None
-        states_before = world.ego_states()
-        controlled = np.ones(len(world), dtype=bool)
-        self.simulation.step(self.physical_actions(actions), controlled)
-        self.events = after = world.events()
-        terms = reward_terms(before, after, states_before, world.ego_states(), world.dt_s)
+        """Steps all episodes by `action_repeat` ticks, or up to the tick at which they end.
+
+        Args:
+            actions: the egos' actions of the action type, in [-1, 1].
+        """
+        terms, after = self._tick(actions)
         endings = ending(after)
+        for _ in range(self._action_repeat - 1):
+            running = endings == Ending.RUNNING
+            if not running.any():
+                break
+            more, later = self._tick(actions)
+            terms = {name: terms[name] + value * running for name, value in more.items()}
+            self.events = after = _merge_events(later, after, running)
+            endings = np.where(running, ending(later), endings)
         return StepResult(
             reward=weighted_sum(terms, self._weights),
             terms=terms,
@@ -279,6 +292,19 @@ class ReplayEpisodes:
             truncated=endings == Ending.OUT_OF_DATA,
             ending=_ENDING_NAMES[endings],
         )
+
+    def _tick(
+        self, actions: Float[np.ndarray, "b 2"]
+    ) -> tuple[dict[str, Float[np.ndarray, " b"]], Events]:
+        """Steps by one tick; returns the terms of the reward, and the events after it."""
+        world, before = self.simulation.world, self.events
+        assert before is not None
+        states_before = world.ego_states()
+        controlled = np.ones(len(world), dtype=bool)
+        self.simulation.step(self.physical_actions(actions), controlled)
+        self.events = after = world.events()
+        terms = reward_terms(before, after, states_before, world.ego_states(), world.dt_s)
+        return terms, after
 
     def physical_actions(self, actions: Float[np.ndarray, "b 2"]) -> Float[np.ndarray, "b 2"]:
         """Converts the egos' actions in [-1, 1] to [acceleration m/s², steering rad]."""
@@ -349,6 +375,15 @@ class ReplayEpisodes:
             self._names[b] = None if scenario is None else scenario.name
             self._tags[b] = None if scenario is None else scenario.tags
         self.events = world.events()
+
+
+def _merge_events(new: Events, old: Events, rows: Bool[np.ndarray, " b"]) -> Events:
+    """The new events in the rows of a mask, the old ones in the others."""
+    merged = {}
+    for field in dataclasses.fields(Events):
+        left, right = getattr(new, field.name), getattr(old, field.name)
+        merged[field.name] = np.where(rows.reshape(-1, *[1] * (left.ndim - 1)), left, right)
+    return Events(**merged)
 
 
 def _events_of(events: Events, rows: Int[np.ndarray, " n"]) -> Events:

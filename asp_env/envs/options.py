@@ -38,6 +38,8 @@ class ReplayOptions:
     """Length of a tick in seconds."""
     action_type: ActionType = "direct"
     """What the two numbers of an action mean, see `asp_env.sim.action_types`."""
+    action_repeat: int = 1
+    """Number of ticks for which each action is held; rewards are summed over them."""
     reward_weights: Mapping[str, float] | None = None
     """Weights of reward terms by name, where they differ from the defaults."""
     scenarios: ScenarioSet | ScenarioFilter | str = ""

@@ -274,6 +274,7 @@ all |
         traffic: TrafficSpec | None = None,
         dt_s: float = DEFAULT_DT_S,
         action_type: ActionType = "direct",
+        action_repeat: int = 1,
         reward_weights: Mapping[str, float] | None = None,
         scenarios: ScenarioSet | ScenarioFilter | str = "",
     ) -> None:
@@ -293,6 +294,7 @@ all |
             traffic=traffic,
             dt_s=dt_s,
             action_type=action_type,
+            action_repeat=action_repeat,
             reward_weights=reward_weights,
             scenarios=scenarios,
         )

@@ -203,6 +203,7 @@ table of drivers; `log` by default, `own` in a world with reacting traffic |
         traffic: TrafficSpec | None = None,
         dt_s: float = DEFAULT_DT_S,
         action_type: ActionType = "direct",
+        action_repeat: int = 1,
         reward_weights: Mapping[str, float] | None = None,
         scenarios: ScenarioSet | ScenarioFilter | str = "",
     ) -> None:
@@ -219,6 +220,7 @@ table of drivers; `log` by default, `own` in a world with reacting traffic |
             traffic=traffic,
             dt_s=dt_s,
             action_type=action_type,
+            action_repeat=action_repeat,
             reward_weights=reward_weights,
             scenarios=scenarios,
         )

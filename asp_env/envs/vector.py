@@ -97,6 +97,7 @@ class ReplayVectorEnv(VectorEnv[Observation, Any, np.ndarray]):
         traffic: TrafficSpec | None = None,
         dt_s: float = DEFAULT_DT_S,
         action_type: ActionType = "direct",
+        action_repeat: int = 1,
         reward_weights: Mapping[str, float] | None = None,
         scenarios: ScenarioSet | ScenarioFilter | str = "",
     ) -> None:
@@ -116,6 +117,7 @@ class ReplayVectorEnv(VectorEnv[Observation, Any, np.ndarray]):
             traffic=traffic,
             dt_s=dt_s,
             action_type=action_type,
+            action_repeat=action_repeat,
             reward_weights=reward_weights,
             scenarios=scenarios,
         )
@@ -281,8 +283,12 @@ class ReplayVectorEnv(VectorEnv[Observation, Any, np.ndarray]):
 
     @property
     def scenarios(self) -> ScenarioSet:
-        """The scenarios to draw from."""
+        """The scenarios to draw from; others of the same data can be set, for a curriculum."""
         return self._episodes.scenarios
+
+    @scenarios.setter
+    def scenarios(self, scenarios: ScenarioSet) -> None:
+        self._episodes.draw_from(scenarios)
 
     @property
     def np_random(self) -> tuple[np.random.Generator, ...]:  # pyright: ignore[reportIncompatibleMethodOverride]
