@@ -5,6 +5,7 @@ from typing import TYPE_CHECKING
 
 from asp_env.data.recording import DEFAULT_DT_S
 from asp_env.data.scenarios.scenario import ScenarioFilter, ScenarioSet
+from asp_env.envs.forecasts import ForecastSpec, PredictorSpec
 from asp_env.envs.options import suggest_options
 from asp_env.envs.vector import ReplayVectorEnv
 from asp_env.errors import MissingExtraError
@@ -30,6 +31,8 @@ def parallel_env(
     dt_s: float = DEFAULT_DT_S,
     reward_weights: Mapping[str, float] | None = None,
     scenarios: ScenarioSet | ScenarioFilter | str = "",
+    predictor: PredictorSpec | None = None,
+    forecast: ForecastSpec | None = None,
 ) -> "ParallelReplayEnv":
     """Makes a PettingZoo parallel environment that controls many vehicles of a recording.
 
@@ -46,6 +49,9 @@ def parallel_env(
         dt_s: length of a tick in seconds.
         reward_weights: weights of reward terms that differ from the defaults.
         scenarios: the scenarios to draw from, or a filter.
+        predictor: the predictor whose forecasts the observation shows, or several.
+        forecast: `ForecastOptions` or a mapping of its fields, such as `every_ticks` and
+            `latency_ticks`, in ticks.
 
     Raises:
         AspEnvError: an argument is invalid, or no scenario fits.
@@ -68,6 +74,8 @@ def parallel_env(
         dt_s=dt_s,
         reward_weights=reward_weights,
         scenarios=scenarios,
+        predictor=predictor,
+        forecast=forecast,
     )
 
 
@@ -84,6 +92,8 @@ def sb3_vec_env(
     dt_s: float = DEFAULT_DT_S,
     reward_weights: Mapping[str, float] | None = None,
     scenarios: ScenarioSet | ScenarioFilter | str = "",
+    predictor: PredictorSpec | None = None,
+    forecast: ForecastSpec | None = None,
 ) -> "ReplayVecEnv":
     """Makes a vector environment for stable-baselines3, batched like `ReplayVectorEnv`.
 
@@ -98,6 +108,9 @@ def sb3_vec_env(
         dt_s: length of a tick in seconds.
         reward_weights: weights of reward terms that differ from the defaults.
         scenarios: the scenarios to draw from, or a filter.
+        predictor: the predictor whose forecasts the observation shows, or several.
+        forecast: `ForecastOptions` or a mapping of its fields, such as `every_ticks` and
+            `latency_ticks`, in ticks.
 
     Raises:
         AspEnvError: an argument is invalid, or the data hold no scenario.
@@ -119,5 +132,7 @@ def sb3_vec_env(
         dt_s=dt_s,
         reward_weights=reward_weights,
         scenarios=scenarios,
+        predictor=predictor,
+        forecast=forecast,
     )
     return ReplayVecEnv(envs)

@@ -22,6 +22,7 @@ from asp_env.data.scenarios.scenario import Scenario, ScenarioFilter, ScenarioSe
 from asp_env.data.scene import EGO, Scene
 from asp_env.dynamics import denormalize_actions
 from asp_env.envs.episodes import RESET_OPTIONS, ReplayEpisodes, StepResult, valid_actions
+from asp_env.envs.forecasts import ForecastSpec, PredictorSpec
 from asp_env.envs.options import ReplayOptions, suggest_options
 from asp_env.errors import AspEnvError, unknown_name
 from asp_env.render.frames import draw_frame
@@ -250,6 +251,8 @@ all |
         dt_s: float = DEFAULT_DT_S,
         reward_weights: Mapping[str, float] | None = None,
         scenarios: ScenarioSet | ScenarioFilter | str = "",
+        predictor: PredictorSpec | None = None,
+        forecast: ForecastSpec | None = None,
     ) -> None:
         """Makes the environment; the arguments are those of the class documentation.
 
@@ -268,6 +271,8 @@ all |
             dt_s=dt_s,
             reward_weights=reward_weights,
             scenarios=scenarios,
+            predictor=predictor,
+            forecast=forecast,
         )
         self.metadata = {"name": "asp_env/ParallelReplay-v0", "render_modes": ["rgb_array"]}
         self.render_mode = render_mode
@@ -284,7 +289,7 @@ all |
         self.possible_agents = [f"vehicle_{row}" for row in range(self._max_agents)]
         self.agents: list[str] = []
         self._rows = {name: row for row, name in enumerate(self.possible_agents)}
-        space: spaces.Space[Any] = self._episodes.observer.space
+        space: spaces.Space[Any] = self._episodes.space
         self.observation_spaces: dict[str, Any] = dict.fromkeys(self._rows, space)
         self.action_spaces: dict[str, spaces.Space[Any]] = {
             name: spaces.Box(-1.0, 1.0, (2,), dtype=np.float32) for name in self._rows
@@ -374,7 +379,7 @@ all |
         world = self._episodes.simulation.world
         if world.scenarios[0] is None:
             raise gymnasium.error.ResetNeeded("no episode has begun: call reset first")
-        return world.scene().situation(self._rows[agent])
+        return self._episodes.scene().situation(self._rows[agent])
 
     def state(self) -> Float[np.ndarray, "agents 7"]:
         """Returns the states of all possible agents in the recording's frame.
