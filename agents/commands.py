@@ -72,7 +72,9 @@ class RLTrain:
     """Learning rate at the start; it falls linearly."""
     width: int = 64
     """Width of the layers of the network."""
-    hyperparameters: Annotated[tuple[str, ...], tyro.conf.arg(name="set", metavar="NAME=VALUE …")] = ()
+    hyperparameters: Annotated[
+        tuple[str, ...], tyro.conf.arg(name="set", metavar="NAME=VALUE …")
+    ] = ()
     """Arguments of the algorithm in stable-baselines3, such as n_steps=64."""
     curriculum: Annotated[str | None, tyro.conf.arg(metavar="COLUMN")] = None
     """Column of the scenarios by which easy ones come first,
@@ -126,7 +128,9 @@ class RLTrain:
         settings, console = self.settings(), Console()
         columns = (TextColumn("{task.description}"), BarColumn(), TimeRemainingColumn())
         with Progress(*columns, console=console) as bar:
-            task = bar.add_task(f"{settings.algorithm}, {settings.steps:,} steps", total=settings.steps)
+            task = bar.add_task(
+                f"{settings.algorithm}, {settings.steps:,} steps", total=settings.steps
+            )
             train_agent(
                 settings,
                 self.out,

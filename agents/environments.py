@@ -1,6 +1,5 @@
 """Vector environments for training and evaluating agents with stable-baselines3."""
 
-from collections.abc import Sequence
 from typing import Any
 
 import numpy as np

@@ -62,9 +62,7 @@ def evaluate_policy(
     Raises:
         AspEnvError: a setting is invalid, or no scenario fits.
     """
-    envs = make_environments(
-        settings, data, NUM_ENVS, scenarios=scenarios, privileged=privileged
-    )
+    envs = make_environments(settings, data, NUM_ENVS, scenarios=scenarios, privileged=privileged)
     chosen: ScenarioSet = envs.get_attr("scenarios", 0)[0]
     if max_scenarios is not None:
         chosen = chosen.evenly_spaced(max_scenarios)

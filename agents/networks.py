@@ -134,9 +134,7 @@ class ForecastTokens(nn.Module):
             points = observations[f"{self.prefix}forecast"]
             points = points.reshape(batch, self.agents, self.positions, 2)
             parts += [points.flatten(2) / POSITION_SCALE_M, route_coordinates(points, route)]
-        parts += [
-            observations[name].reshape(batch, self.agents, size) for name, size in self.parts
-        ]
+        parts += [observations[name].reshape(batch, self.agents, size) for name, size in self.parts]
         tokens = torch.cat(parts, dim=-1)[:, :count]
         return nn.functional.pad(tokens, (0, 0, 0, count - tokens.shape[1]))
 
@@ -166,7 +164,9 @@ class Attention(nn.Module):
 class RasterFeatures(BaseFeaturesExtractor):
     """The ego's state and route, and a convolutional encoding of its raster."""
 
-    def __init__(self, space: spaces.Dict, width: int = 64, encoder: nn.Module | None = None) -> None:
+    def __init__(
+        self, space: spaces.Dict, width: int = 64, encoder: nn.Module | None = None
+    ) -> None:
         """Creates the network.
 
         Args:

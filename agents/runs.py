@@ -317,4 +317,3 @@ def restore_optimizer(
     full = optimizer.state_dict()
     full["state"] = state
     optimizer.load_state_dict(full)
-

@@ -110,9 +110,7 @@ def train_agent(
     envs.close()
 
 
-def check_environment(
-    folder: Path, settings: AgentSettings, data: str, privileged: bool
-) -> None:
+def check_environment(folder: Path, settings: AgentSettings, data: str, privileged: bool) -> None:
     """Checks that an environment shows a trained agent the forecasts of its own predictor.
 
     Args:
@@ -124,9 +122,7 @@ def check_environment(
     Raises:
         AspEnvError: the predictor is another one, or has other weights.
     """
-    envs = make_environments(
-        settings.environment, data, 1, scenarios="", privileged=privileged
-    )
+    envs = make_environments(settings.environment, data, 1, scenarios="", privileged=privileged)
     check_predictor(folder, predictor_of(envs))
     envs.close()
 

@@ -5,6 +5,7 @@ from typing import TYPE_CHECKING
 
 from asp_env.data.recording import DEFAULT_DT_S
 from asp_env.data.scenarios.scenario import ScenarioFilter, ScenarioSet
+from asp_env.envs.forecasts import ForecastSpec, PredictorSpec
 from asp_env.envs.options import suggest_options
 from asp_env.envs.vector import ReplayVectorEnv
 from asp_env.errors import MissingExtraError
@@ -35,6 +36,8 @@ def parallel_env(
     action_repeat: int = 1,
     reward_weights: Mapping[str, float] | None = None,
     scenarios: ScenarioSet | ScenarioFilter | str = "",
+    predictor: PredictorSpec | None = None,
+    forecast: ForecastSpec | None = None,
 ) -> "ParallelReplayEnv":
     """Makes a PettingZoo parallel environment that controls many vehicles of a recording.
 
@@ -56,6 +59,9 @@ def parallel_env(
         action_repeat: number of ticks for which each action is held.
         reward_weights: weights of reward terms that differ from the defaults.
         scenarios: the scenarios to draw from, or a filter.
+        predictor: the predictor whose forecasts the observation shows, or several.
+        forecast: `ForecastOptions` or a mapping of its fields, such as `every_ticks` and
+            `latency_ticks`, in ticks.
 
     Raises:
         AspEnvError: an argument is invalid, or no scenario fits.
@@ -82,6 +88,8 @@ def parallel_env(
         action_repeat=action_repeat,
         reward_weights=reward_weights,
         scenarios=scenarios,
+        predictor=predictor,
+        forecast=forecast,
     )
 
 
@@ -100,6 +108,8 @@ def sb3_vec_env(
     action_repeat: int = 1,
     reward_weights: Mapping[str, float] | None = None,
     scenarios: ScenarioSet | ScenarioFilter | str = "",
+    predictor: PredictorSpec | None = None,
+    forecast: ForecastSpec | None = None,
 ) -> "ReplayVecEnv":
     """Makes a vector environment for stable-baselines3, batched like `ReplayVectorEnv`.
 
@@ -116,6 +126,9 @@ def sb3_vec_env(
         action_repeat: number of ticks for which each action is held.
         reward_weights: weights of reward terms that differ from the defaults.
         scenarios: the scenarios to draw from, or a filter.
+        predictor: the predictor whose forecasts the observation shows, or several.
+        forecast: `ForecastOptions` or a mapping of its fields, such as `every_ticks` and
+            `latency_ticks`, in ticks.
 
     Raises:
         AspEnvError: an argument is invalid, or the data hold no scenario.
@@ -139,5 +152,7 @@ def sb3_vec_env(
         action_repeat=action_repeat,
         reward_weights=reward_weights,
         scenarios=scenarios,
+        predictor=predictor,
+        forecast=forecast,
     )
     return ReplayVecEnv(envs)

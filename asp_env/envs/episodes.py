@@ -17,9 +17,10 @@ from jaxtyping import Bool, Float, Int, Shaped
 from asp_env.data.recording import ticks
 from asp_env.data.scenarios.scenario import Scenario, ScenarioFilter, ScenarioSet
 from asp_env.data.scenarios.selection import choose_scenarios, scenario_of
-from asp_env.data.snippets import HISTORY_S
+from asp_env.data.scene import EGO, Scene, infer_actions
+from asp_env.data.snippets import HISTORY_S, Future
 from asp_env.data.source import Recordings, open_data
-from asp_env.data.scene import EGO, infer_actions
+from asp_env.envs.forecasts import Present, extended_space, forecast_observers
 from asp_env.envs.options import ReplayOptions
 from asp_env.errors import AspEnvError, unknown_name
 from asp_env.sim.action_types import (
@@ -32,7 +33,7 @@ from asp_env.sim.observation import Observation, Observer, ego_context
 from asp_env.sim.reward import reward_terms, weighted_sum, weights_from
 from asp_env.sim.simulation import Simulation, ending
 from asp_env.sim.traffic.assignment import make_traffic
-from asp_env.sim.world import Ending, Events, world_class
+from asp_env.sim.world import Ending, Events, recorded_future, world_class
 from asp_env.views import make_raster_view
 
 RESET_OPTIONS = ("scenario", "start_tick", "ego")
@@ -212,8 +213,13 @@ class ReplayEpisodes:
             raise AspEnvError(f"action_repeat {options.action_repeat}: expected at least 1")
         self._action_repeat = options.action_repeat
         self._weights = weights_from(options.reward_weights or {})
-        self._names = np.full(num_episodes, None, dtype=object)
-        self._tags = np.full(num_episodes, None, dtype=object)
+        self._forecasts = forecast_observers(options.predictor, options.forecast, options.dt_s)
+        self.space: spaces.Space[Any] = self.observer.space
+        for each in self._forecasts:
+            self.space = extended_space(self.space, each.spaces)
+        self._num_begun = 0
+        """Number of episodes begun or restored so far."""
+        self._allocate(num_episodes)
         self.action_space = spaces.Box(-1.0, 1.0, (2,), dtype=np.float32)
         self.events: Events | None = None
 
@@ -229,9 +235,15 @@ class ReplayEpisodes:
             history=world.history,
             world_class=type(world),
         )
+        self._allocate(num_episodes)
+        self.events = None
+
+    def _allocate(self, num_episodes: int) -> None:
         self._names = np.full(num_episodes, None, dtype=object)
         self._tags = np.full(num_episodes, None, dtype=object)
-        self.events = None
+        self._seeds = np.zeros(num_episodes, dtype=np.uint64)
+        self._serials = np.full(num_episodes, -1)
+        self._rows = np.arange(num_episodes)
 
     def draw_from(self, scenarios: ScenarioSet) -> None:
         """Replaces the scenarios to draw from; episodes under way go on."""
@@ -267,6 +279,8 @@ class ReplayEpisodes:
         self.simulation.reset(scenarios, rngs, reset_mask)
         for b in np.flatnonzero(reset_mask).tolist():
             self._names[b], self._tags[b] = scenarios[b].name, scenarios[b].tags
+            self._seeds[b] = _seed_from(rngs[b])
+        self._number(np.flatnonzero(reset_mask))
         self.events = self.simulation.world.events()
 
     def step(self, actions: Float[np.ndarray, "b 2"]) -> StepResult:
@@ -347,7 +361,63 @@ class ReplayEpisodes:
         """
         assert self.events is not None
         events = self.events if rows is None else _events_of(self.events, rows)
-        return self.observer.observe(ego_context(self.simulation.world, rows), events, out)
+        seen = self.observer.observe(ego_context(self.simulation.world, rows), events, out)
+        for each in self._forecasts:
+            seen |= each.observe(self, self._rows if rows is None else rows)
+        return seen
+
+    def make_forecasts(self) -> None:
+        """Makes the forecasts that are due now, as `observe` does, without observing."""
+        for each in self._forecasts:
+            each.make(self, self._rows)
+
+    def __len__(self) -> int:
+        """The number of episodes."""
+        return len(self._rows)
+
+    @property
+    def dt_s(self) -> float:
+        """Length of a tick in seconds."""
+        return self.simulation.world.dt_s
+
+    def present(self, rows: Int[np.ndarray, " r"]) -> Present:
+        """Returns the present tick of some episodes, for forecasts."""
+        world, episodes = self.simulation.world, self.simulation.world.episodes
+        at = rows, world.now[rows]
+        return Present(
+            states=episodes.states[at],
+            valid=episodes.valid[at],
+            ids=episodes.ids[rows],
+            elapsed=episodes.elapsed[rows],
+            serials=self._serials[rows],
+        )
+
+    def scene(
+        self,
+        rows: Int[np.ndarray, " r"] | None = None,
+        targets: Int[np.ndarray, "t 2"] | None = None,
+    ) -> Scene:
+        """Returns the scene of some episodes, by default of all, with the seeds of predictors.
+
+        Args:
+            rows: numbers of the episodes, which are the situations in this order.
+            targets: (situation, slot) of the targets; by default all present agents but the egos.
+        """
+        scene = self.simulation.world.scene(rows, targets)
+        seeds = self._seeds.copy() if rows is None else self._seeds[rows]
+        return dataclasses.replace(scene, seeds=seeds)
+
+    def recorded_future(
+        self, scene: Scene, horizon: int, rows: Int[np.ndarray, " r"] | None = None
+    ) -> Future:
+        """Returns the recorded future of a scene's targets, for privileged predictors.
+
+        Args:
+            scene: a present scene.
+            horizon: number of ticks.
+            rows: numbers of the episodes that are its situations; all by default.
+        """
+        return recorded_future(self.simulation.world, scene, horizon, rows)
 
     def info(self) -> dict[str, Shaped[np.ndarray, " b"]]:
         """Returns the present infos in new arrays."""
@@ -365,16 +435,34 @@ class ReplayEpisodes:
 
     def snapshot(self) -> Any:
         """Returns the whole state for `restore`; it holds no recordings and no rasters."""
-        return self.simulation.snapshot()
+        forecasts = [each.snapshot() for each in self._forecasts]
+        return self.simulation.snapshot(), self._seeds.copy(), forecasts
 
     def restore(self, snapshot: Any) -> None:
         """Restores the state of a snapshot, bit for bit."""
-        self.simulation.restore(snapshot)
+        simulation, seeds, forecasts = snapshot
+        self.simulation.restore(simulation)
+        self._seeds = seeds.copy()
+        self._number(self._rows)
+        for each, stored in zip(self._forecasts, forecasts, strict=True):
+            each.restore(stored, self._serials)
         world = self.simulation.world
         for b, scenario in enumerate(world.scenarios):
             self._names[b] = None if scenario is None else scenario.name
             self._tags[b] = None if scenario is None else scenario.tags
         self.events = world.events()
+
+    def _number(self, rows: Int[np.ndarray, " n"]) -> None:
+        """Gives episodes serial numbers, so that forecasts of earlier ones are not shown."""
+        self._serials[rows] = self._num_begun + np.arange(len(rows))
+        self._num_begun += len(rows)
+
+
+def _seed_from(rng: np.random.Generator) -> int:
+    """A number of 64 bits from the state of a generator, which stays unchanged."""
+    state = rng.bit_generator.state["state"]
+    bits = state["state"] ^ state["inc"]
+    return (bits ^ (bits >> 64)) & (2**64 - 1)
 
 
 def _merge_events(new: Events, old: Events, rows: Bool[np.ndarray, " b"]) -> Events:

@@ -23,12 +23,13 @@ from asp_env.data.recording import DEFAULT_DT_S, Recording, frames_per_tick
 from asp_env.data.scenarios.scenario import Scenario, ScenarioFilter, ScenarioSet
 from asp_env.data.scene import EGO, Scene
 from asp_env.envs.episodes import RESET_OPTIONS, ReplayEpisodes, StepResult, valid_actions
+from asp_env.envs.forecasts import ForecastSpec, PredictorSpec
 from asp_env.envs.options import ReplayOptions, suggest_options
 from asp_env.errors import AspEnvError, unknown_name
 from asp_env.render.frames import draw_frame
+from asp_env.sim.action_types import ActionType
 from asp_env.sim.reward import MIN_GOAL_M
 from asp_env.sim.traffic import Control, Driver
-from asp_env.sim.action_types import ActionType
 from asp_env.sim.traffic.assignment import TrafficSpec
 from asp_env.sim.traffic.driver import controllable_agents
 from asp_env.sim.world import World
@@ -277,6 +278,8 @@ all |
         action_repeat: int = 1,
         reward_weights: Mapping[str, float] | None = None,
         scenarios: ScenarioSet | ScenarioFilter | str = "",
+        predictor: PredictorSpec | None = None,
+        forecast: ForecastSpec | None = None,
     ) -> None:
         """Makes the environment; the arguments are those of the class documentation.
 
@@ -297,6 +300,8 @@ all |
             action_repeat=action_repeat,
             reward_weights=reward_weights,
             scenarios=scenarios,
+            predictor=predictor,
+            forecast=forecast,
         )
         self.metadata = {"name": "asp_env/ParallelReplay-v0", "render_modes": ["rgb_array"]}
         self.render_mode = render_mode
@@ -317,10 +322,10 @@ all |
         self._in_episode: list[str] = []
         """The agents of the episode: those that were present after `reset`."""
         self._present: list[str] = []
-        space: spaces.Space[Any] = self._episodes.observer.space
+        space = self._episodes.space
         if pad_absent:
             mask = spaces.Box(0, 1, (1,), dtype=np.int8)
-            space = spaces.Dict([*self._episodes.observer.space.items(), (PRESENT, mask)])
+            space = spaces.Dict([*self._episodes.space.items(), (PRESENT, mask)])
         if flatten:
             space = flatten_space(space)
         self.observation_spaces: dict[str, Any] = dict.fromkeys(self._rows, space)
@@ -439,7 +444,7 @@ all |
                 f"{agent} is absent from this episode: expected one of "
                 f"{', '.join(self._in_episode)}"
             )
-        return self._episodes.simulation.world.scene().situation(self._rows[agent])
+        return self._episodes.scene().situation(self._rows[agent])
 
     def state(self) -> Float[np.ndarray, "agents 7"]:
         """Returns the states of all possible agents in the recording's frame.

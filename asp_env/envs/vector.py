@@ -17,13 +17,14 @@ from asp_env.data.scene import Scene
 from asp_env.data.snippets import Future
 from asp_env.data.source import Recordings
 from asp_env.envs.episodes import ObservationBuffers, ReplayEpisodes, StepResult, valid_actions
+from asp_env.envs.forecasts import ForecastSpec, PredictorSpec
 from asp_env.envs.options import ReplayOptions, suggest_options
+from asp_env.envs.shared_in_spec import SharedInSpec
 from asp_env.errors import AspEnvError
 from asp_env.render.frames import draw_frame
-from asp_env.sim.observation import Observation
 from asp_env.sim.action_types import ActionType
+from asp_env.sim.observation import Observation
 from asp_env.sim.traffic.assignment import TrafficSpec
-from asp_env.sim.world import recorded_future
 
 Infos = dict[str, Any]
 
@@ -39,7 +40,7 @@ class VectorSnapshot:
     over: Bool[np.ndarray, " n"]
 
 
-class ReplayVectorEnv(VectorEnv[Observation, Any, np.ndarray]):
+class ReplayVectorEnv(SharedInSpec, VectorEnv[Observation, Any, np.ndarray]):
     """`asp_env/Replay-v0` as a vector environment: one world of arrays for all episodes.
 
     ## Description
@@ -100,6 +101,8 @@ class ReplayVectorEnv(VectorEnv[Observation, Any, np.ndarray]):
         action_repeat: int = 1,
         reward_weights: Mapping[str, float] | None = None,
         scenarios: ScenarioSet | ScenarioFilter | str = "",
+        predictor: PredictorSpec | None = None,
+        forecast: ForecastSpec | None = None,
     ) -> None:
         """Makes the environment; the arguments are those of the class documentation.
 
@@ -120,13 +123,15 @@ class ReplayVectorEnv(VectorEnv[Observation, Any, np.ndarray]):
             action_repeat=action_repeat,
             reward_weights=reward_weights,
             scenarios=scenarios,
+            predictor=predictor,
+            forecast=forecast,
         )
         self.num_envs = num_envs
         self._mode = _parse_autoreset_mode(autoreset_mode)
         self.metadata = {**self.metadata, "autoreset_mode": self._mode}
         self.render_mode = render_mode
         self._episodes = ReplayEpisodes(data, options, num_envs)
-        self.single_observation_space = self._episodes.observer.space
+        self.single_observation_space = self._episodes.space
         self.single_action_space = self._episodes.action_space
         self.observation_space = batch_space(self.single_observation_space, num_envs)
         self.action_space = batch_space(self.single_action_space, num_envs)
@@ -219,7 +224,7 @@ class ReplayVectorEnv(VectorEnv[Observation, Any, np.ndarray]):
             gymnasium.error.ResetNeeded: an episode has not begun.
         """
         self._check_begun()
-        return self._episodes.simulation.world.scene()
+        return self._episodes.scene()
 
     def recorded_future(self, scene: Scene, horizon: int) -> Future:
         """Returns the recorded future of a scene's targets, for privileged predictors.
@@ -232,7 +237,7 @@ class ReplayVectorEnv(VectorEnv[Observation, Any, np.ndarray]):
             gymnasium.error.ResetNeeded: an episode has not begun.
         """
         self._check_begun()
-        return recorded_future(self._episodes.simulation.world, scene, horizon)
+        return self._episodes.recorded_future(scene, horizon)
 
     def render(self) -> tuple[Any, ...] | None:
         """Returns the image of each environment, see `ReplayEnv.render`; None without a mode.
@@ -270,6 +275,11 @@ class ReplayVectorEnv(VectorEnv[Observation, Any, np.ndarray]):
         self._seeds = list(snapshot.seeds)
         self._begun[:] = True
         self._over = snapshot.over.copy()
+
+    @property
+    def episodes(self) -> ReplayEpisodes:
+        """The episodes, for wrappers."""
+        return self._episodes
 
     @property
     def dt_s(self) -> float:
