@@ -14,6 +14,7 @@ import numpy as np
 from gymnasium import spaces
 from jaxtyping import Bool, Float, Int, Shaped
 
+from asp_env.data.predictor import Predictor
 from asp_env.data.recording import ticks
 from asp_env.data.scenarios.scenario import Scenario, ScenarioFilter, ScenarioSet
 from asp_env.data.scenarios.selection import choose_scenarios, scenario_of
@@ -295,6 +296,7 @@ class ReplayEpisodes:
             running = endings == Ending.RUNNING
             if not running.any():
                 break
+            self.make_forecasts()
             more, later = self._tick(actions)
             terms = {name: terms[name] + value * running for name, value in more.items()}
             self.events = after = _merge_events(later, after, running)
@@ -319,6 +321,11 @@ class ReplayEpisodes:
         self.events = after = world.events()
         terms = reward_terms(before, after, states_before, world.ego_states(), world.dt_s)
         return terms, after
+
+    @property
+    def predictors(self) -> tuple[Predictor, ...]:
+        """The predictors whose forecasts are part of the observation."""
+        return tuple(each.predictor for each in self._forecasts)
 
     def physical_actions(self, actions: Float[np.ndarray, "b 2"]) -> Float[np.ndarray, "b 2"]:
         """Converts the egos' actions in [-1, 1] to [acceleration m/s², steering rad]."""

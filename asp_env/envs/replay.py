@@ -9,7 +9,7 @@ import gymnasium
 import numpy as np
 from jaxtyping import Float, Shaped
 
-from asp_env.data.predictor import Forecast
+from asp_env.data.predictor import Forecast, Predictor
 from asp_env.data.recording import DEFAULT_DT_S, Background
 from asp_env.data.scenarios.scenario import Scenario, ScenarioFilter, ScenarioSet
 from asp_env.data.scene import Scene
@@ -393,6 +393,11 @@ name; several in a mapping with their prefixes |
     def recordings(self) -> Recordings:
         """The recordings of `data`."""
         return self._episodes.recordings
+
+    @property
+    def predictors(self) -> tuple[Predictor, ...]:
+        """The predictors whose forecasts are part of the observation."""
+        return self._episodes.predictors
 
     @property
     def scenarios(self) -> ScenarioSet:

@@ -11,6 +11,7 @@ from gymnasium.vector import AutoresetMode, VectorEnv
 from gymnasium.vector.utils import batch_space
 from jaxtyping import Bool, Shaped
 
+from asp_env.data.predictor import Predictor
 from asp_env.data.recording import DEFAULT_DT_S
 from asp_env.data.scenarios.scenario import ScenarioFilter, ScenarioSet
 from asp_env.data.scene import Scene
@@ -290,6 +291,11 @@ class ReplayVectorEnv(SharedInSpec, VectorEnv[Observation, Any, np.ndarray]):
     def recordings(self) -> Recordings:
         """The recordings of `data`."""
         return self._episodes.recordings
+
+    @property
+    def predictors(self) -> tuple[Predictor, ...]:
+        """The predictors whose forecasts are part of the observation."""
+        return self._episodes.predictors
 
     @property
     def scenarios(self) -> ScenarioSet:
