@@ -18,7 +18,8 @@ from agents.settings import (
     EnvironmentSettings,
 )
 from asp_env.data.recording import DEFAULT_DT_S
-from asp_env.errors import AspEnvError, MissingExtraError
+from asp_env.errors import AspEnvError, MissingExtraError, unknown_name
+from asp_env.files import write_text
 from asp_env.sim.action_types import ActionType
 
 
@@ -204,9 +205,92 @@ class RLEvaluate:
                 }
         console.print(table)
         if self.out is not None:
-            from agents.runs import write_text
-
             write_text(self.out, json.dumps({"data": self.data, "runs": results}, indent=1))
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class RLCompare:
+    """Train agents that observe other forecasts, and drive held-out scenarios with all of them."""
+
+    data: Annotated[tyro.conf.Positional[str], tyro.conf.arg(metavar="DATA")]
+    """Data that all agents are trained on."""
+    held_out: Annotated[str, tyro.conf.arg(metavar="DATA")]
+    """Data of other places, which all agents, planners and zero and random actions drive."""
+    out: Path
+    """Folder of the comparison. An interrupted one goes on where it was."""
+    learned: Annotated[str, tyro.conf.arg(metavar="NAME:RUN")] = "ssp-asp:pretrained"
+    """Trained predictor of the rows learned and latent."""
+    scenarios: Annotated[str, tyro.conf.arg(metavar="FILTER")] = "interactive"
+    """Tags and comparisons, for training and held-out data."""
+    max_scenarios: int | None = None
+    """Largest number of held-out scenarios, chosen at even spacing."""
+    rows: tuple[str, ...] = ()
+    """Rows by name; all by default. The first is the reference."""
+    seeds: int = 5
+    """Number of training seeds of each row."""
+    steps: int = 400_000
+    """Steps of every training."""
+    jobs: int = 1
+    """Number of processes."""
+
+    def run(self) -> None:
+        """Trains and drives, and writes comparison.json and curves.html.
+
+        Raises:
+            AspEnvError: an option is invalid.
+        """
+        _training()
+        from agents import comparison as c
+
+        rows = c.default_rows(self.learned)
+        names = self.rows or tuple(rows)
+        for name in names:
+            if name not in rows:
+                raise unknown_name("row", name, rows)
+        if self.seeds < 1 or self.jobs < 1:
+            raise AspEnvError(f"--seeds {self.seeds} --jobs {self.jobs}: expected at least 1")
+        console = Console()
+        held_out = c.HeldOut(
+            data=self.held_out, scenarios=self.scenarios, max_scenarios=self.max_scenarios
+        )
+        recording = held_out.choose(DEFAULT_DT_S).recording
+        cells = [self._cell(name, rows[name], seed) for seed in range(self.seeds) for name in names]
+        shared = {
+            "data": self.data,
+            "held_out": dataclasses.asdict(held_out),
+            "learned": self.learned,
+            "agent": dataclasses.asdict(cells[0].settings),
+        }
+        c.check_out(self.out, shared)
+        c.run_cells(cells, held_out, self.jobs, console)
+        values = c.baselines(held_out, cells[0].settings.environment)
+        by_row = {name: [each] for name, each in values.items()}
+        folders = {name: [cell.folder for cell in cells if cell.row == name] for name in names}
+        for name, seeds in folders.items():
+            by_row[name] = [c.read_values(folder) for folder in seeds]
+        compared = c.compare_rows(by_row, recording, names[0])
+        console.print(c.rendered(compared, names[0]))
+        content = {"settings": shared, "rows": c.as_json(compared)}
+        write_text(self.out / "comparison.json", json.dumps(content, indent=1))
+        figure = c.curves_figure(c.learning_curves(folders))
+        write_text(self.out / "curves.html", figure.to_html(include_plotlyjs=True))
+        console.print(f"wrote {self.out}/comparison.json and curves.html")
+
+    def _cell(self, name: str, observed: Any, seed: int) -> Any:
+        from agents.comparison import Cell
+
+        settings = AgentSettings(
+            data=self.data,
+            environment=EnvironmentSettings(
+                scenarios=self.scenarios,
+                predictor=observed.predictor,
+                forecast=observed.forecast,
+            ),
+            steps=self.steps,
+            seed=seed,
+        )
+        folder = self.out / name.replace(" ", "-") / str(seed)
+        return Cell(row=name, settings=settings, privileged=observed.privileged, folder=folder)
 
 
 def _cell(estimate: Any) -> str:

@@ -64,7 +64,9 @@ def make_environments(
     Raises:
         AspEnvError: a setting is invalid, or no scenario fits.
     """
-    forecast = {**settings.forecast, "privileged": True} if privileged else settings.forecast
+    forecast = None
+    if settings.predictor is not None:
+        forecast = {**settings.forecast, **({"privileged": True} if privileged else {})}
     raster: dict[str, Any] = {}
     if settings.view is not None:
         raster = {"view": settings.view, "raster_px": settings.raster_px}
@@ -79,7 +81,7 @@ def make_environments(
         reward_weights=dict(settings.reward_weights),
         scenarios=scenarios,
         predictor=settings.predictor,
-        forecast=dict(forecast),
+        forecast=forecast,
         **raster,
     )
     return AgentObservations(envs, settings)

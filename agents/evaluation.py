@@ -79,7 +79,7 @@ def evaluate_policy(
 
 
 def evaluate_agent(agent: Agent, data: str, **options: Any) -> DrivenScenarios:
-    """Drives every scenario once with a trained agent; the options are those of `evaluate_policy`."""
+    """Drives every scenario once with a trained agent; see `evaluate_policy`."""
     return evaluate_policy(agent.act, agent.settings.environment, data, **options)
 
 

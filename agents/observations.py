@@ -7,8 +7,8 @@ steps stores less:
 |---|---|---|
 | `state` | (7,) | the fields `STATE` of the environment's `state` |
 | `route` | (30, 2) | as in the environment |
-| `neighbours` | (K, 25) | the K nearest agents, nearest first: `AGENT_FIELDS` of `asp_env.views.vectors` \
-now and three ticks ago, then 1 where there is an agent |
+| `neighbours` | (K, 25) | the K nearest agents, nearest first: `AGENT_FIELDS` of \
+`asp_env.views.vectors` now and three ticks ago, then 1 where there is an agent |
 | `lines` | (L, 10, 9) | pieces of lines: `LINE_FIELDS`, then 1 where the point exists |
 | `forecast…` | | as in the environment |
 

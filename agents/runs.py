@@ -2,8 +2,8 @@
 
 | file | content |
 |---|---|
-| `config.json` | `settings` (`AgentSettings`), `observation` (shape, type and bounds of each entry), \
-`predictor` (name and hash of the weights), `steps` of training |
+| `config.json` | `settings` (`AgentSettings`), `observation` (shape, type and bounds of each \
+entry), `predictor` (name and hash of the weights), `steps` of training |
 | `policy.safetensors` | weights of the policy, written at the end of the training |
 | `checkpoint.safetensors` | during the training: weights, states of the optimizers, statistics of \
 the rewards |
@@ -32,7 +32,7 @@ from agents.networks import RasterFeatures, TrafficFeatures
 from agents.settings import CONFIG, AgentSettings, read_settings
 from asp_env.data.predictor import Predictor
 from asp_env.errors import AspEnvError, MissingExtraError
-from asp_env.files import atomic_file
+from asp_env.files import atomic_file, write_text
 
 POLICY = "policy.safetensors"
 CHECKPOINT = "checkpoint.safetensors"
@@ -120,9 +120,10 @@ class Agent:
         """
         for name, box in self.space.items():
             if name not in observations or observations[name].shape[1:] != box.shape:
+                given = getattr(observations.get(name), "shape", "none")
                 raise AspEnvError(
-                    f"observation {name!r}: expected shape (B, {', '.join(map(str, box.shape or ()))}) "
-                    f"as in training, got {getattr(observations.get(name), 'shape', 'none')}"
+                    f"observation {name!r}: expected shape (B, *{box.shape}) as in training, got "
+                    f"{given}"
                 )
         shown = {name: observations[name] for name in self.space.spaces}
         actions, self._memory = self._policy.predict(
@@ -273,12 +274,6 @@ def write_tensors(path: Path, tensors: Mapping[str, Tensor]) -> None:
     content = save({name: value.detach().contiguous().clone() for name, value in tensors.items()})
     with atomic_file(path) as partial:
         partial.write_bytes(content)
-
-
-def write_text(path: Path, text: str) -> None:
-    """Writes a text file atomically."""
-    with atomic_file(path) as partial:
-        partial.write_text(text)
 
 
 def flatten_state(state: Mapping[str, Any], prefix: str) -> dict[str, Tensor]:

@@ -17,7 +17,7 @@ ALGORITHMS: tuple[str, ...] = get_args(Algorithm)
 
 CONFIG = "config.json"
 
-REWARD_WEIGHTS = {"collision": 3.0, "comfort": 0.02, "goal": 1.0, "route": 0.1}
+REWARD_WEIGHTS = {"collision": 2.0, "comfort": 0.02, "goal": 1.0, "route": 0.1}
 """Weights of the reward in training, where they differ from those of the environment. Chosen by
 hand on the training and validation places of docs/rl.md: `goal` makes slow driving as bad as
 standing, and a collision costs more than the progress that it saves."""
@@ -85,7 +85,7 @@ class AgentSettings:
     encoder: str | None = None
     """Trained predictor whose encoder of rasters is reused, as `NAME:RUN`."""
     gamma: float = 0.9
-    learning_rate: float = 5e-4
+    learning_rate: float = 6e-4
     """At the start of the training; it falls linearly to a twentieth."""
     hyperparameters: Mapping[str, Any] = field(default_factory=dict)
     """Arguments of the algorithm's class that differ from `DEFAULTS`."""

@@ -3,9 +3,9 @@
 | type | first number | second number |
 |---|---|---|
 | `direct` | acceleration, ±5 m/s² | steering, ±π/4 |
-| `jerk` | change of the acceleration, ±2 m/s² per tick of 0.2 s (±10 m/s³) | change of the steering, \
-±0.2 rad per tick of 0.2 s (±1 rad/s) |
-| `route` | acceleration, ±5 m/s² | correction, ±0.15 rad, of the steering that follows the route |
+| `jerk` | change of the acceleration, ±2 m/s² per tick of 0.2 s (±10 m/s³) | change of the \
+steering, ±0.2 rad per tick of 0.2 s (±1 rad/s) |
+| `route` | acceleration, ±5 m/s² | correction, ±0.15 rad, of the steering along the route |
 
 The ego's last action, to which `jerk` adds, is inferred from its states; so no type has a memory.
 The steering that follows the route is pure pursuit (`asp_env.dynamics.car_following`). Commanded
