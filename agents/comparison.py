@@ -306,20 +306,21 @@ def _progress_of(folder: Path) -> Float[np.ndarray, "points 2"]:
 
 
 def _curve(seeds: Sequence[Float[np.ndarray, "_ 2"]]) -> Float[np.ndarray, "points 4"]:
-    """Means of twenty equal sections of the training."""
+    """Means of at most twenty equal sections of the training in which every seed has a value."""
     sections = 20
     last = max(each[-1, 0] for each in seeds)
     edges = np.linspace(0, last, sections + 1)
-    means = np.full((len(seeds), sections), np.nan)
+    sums, counts = np.zeros((2, len(seeds), sections))
     for row, each in enumerate(seeds):
         index = np.clip(np.searchsorted(edges, each[:, 0]) - 1, 0, sections - 1)
-        counts = np.bincount(index, minlength=sections)
-        with np.errstate(invalid="ignore"):
-            means[row] = np.bincount(index, weights=each[:, 1], minlength=sections) / counts
+        counts[row] = np.bincount(index, minlength=sections)
+        sums[row] = np.bincount(index, weights=each[:, 1], minlength=sections)
+    known = (counts > 0).all(axis=0)
+    means = sums[:, known] / counts[:, known]
     rng = np.random.default_rng(0)
     drawn = means[rng.integers(len(seeds), size=(2_000, len(seeds)))].mean(axis=1)
-    low, high = np.nanquantile(drawn, [0.025, 0.975], axis=0)
-    return np.stack([edges[1:], means.mean(axis=0), low, high], axis=-1)
+    low, high = np.quantile(drawn, [0.025, 0.975], axis=0)
+    return np.stack([edges[1:][known], means.mean(axis=0), low, high], axis=-1)
 
 
 def run_cells(cells: Sequence[Cell], held_out: HeldOut, jobs: int, console: Console) -> None:

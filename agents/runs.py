@@ -159,8 +159,8 @@ def load_agent(folder: Path) -> Agent:
     return Agent(settings, space, policy)
 
 
-def _no_learning(progress: float) -> float:
-    del progress
+def _no_learning(left: float | int) -> float:
+    del left
     return 0.0
 
 
@@ -276,7 +276,7 @@ def write_tensors(path: Path, tensors: Mapping[str, Tensor]) -> None:
         partial.write_bytes(content)
 
 
-def flatten_state(state: Mapping[str, Any], prefix: str) -> dict[str, Tensor]:
+def flatten_state(state: Mapping[Any, Any], prefix: str) -> dict[str, Tensor]:
     """Flattens nested state dictionaries of tensors and numbers; names are joined by `/`.
 
     Args:

@@ -10,7 +10,6 @@ from typing import Any, Literal, get_args
 
 from asp_env.data.recording import DEFAULT_DT_S
 from asp_env.errors import AspEnvError, unknown_name
-from asp_env.sim.action_types import ActionType
 
 Algorithm = Literal["ppo", "sac", "recurrent-ppo"]
 ALGORITHMS: tuple[str, ...] = get_args(Algorithm)
@@ -32,7 +31,7 @@ class EnvironmentSettings:
     traffic: str | None = None
     """Driver of the other agents; that of the world by default."""
     dt_s: float = DEFAULT_DT_S
-    action_type: ActionType = "route"
+    action_type: str = "route"
     action_repeat: int = 3
     """Ticks for which an action is held."""
     reward_weights: Mapping[str, float] = field(default_factory=lambda: dict(REWARD_WEIGHTS))
@@ -72,7 +71,8 @@ MAX_MAP_LINES = 64
 class AgentSettings:
     """An agent: an algorithm, its environment, and its numbers."""
 
-    algorithm: Algorithm = "ppo"
+    algorithm: str = "ppo"
+    """One of `ALGORITHMS`."""
     data: str = "sample:intersection"
     """The data that the agent is trained on."""
     environment: EnvironmentSettings = field(default_factory=EnvironmentSettings)

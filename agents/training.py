@@ -99,9 +99,11 @@ def train_agent(
         callbacks.append(Curriculum(settings.curriculum, settings.steps))
     if progress is not None:
         callbacks.append(_Report(progress))
-    with one_thread():
-        algorithm.learn(left, callback=CallbackList(callbacks), reset_num_timesteps=not done)
-    algorithm.logger.close()
+    try:
+        with one_thread():
+            algorithm.learn(left, callback=CallbackList(callbacks), reset_num_timesteps=not done)
+    finally:
+        algorithm.logger.close()
     write_tensors(out / POLICY, algorithm.policy.state_dict())
     space = envs.observation_space
     assert isinstance(space, spaces.Dict)

@@ -11,7 +11,6 @@ from asp_env.data.recording import DEFAULT_DT_S
 from asp_env.data.scenarios.scenario import ScenarioFilter, ScenarioSet
 from asp_env.envs.forecasts import ForecastSpec, PredictorSpec
 from asp_env.errors import AspEnvError
-from asp_env.sim.action_types import ActionType
 from asp_env.sim.traffic.assignment import TrafficSpec
 
 Function = TypeVar("Function", bound=Callable[..., Any])
@@ -37,7 +36,7 @@ class ReplayOptions:
     world moves them."""
     dt_s: float = DEFAULT_DT_S
     """Length of a tick in seconds."""
-    action_type: ActionType = "direct"
+    action_type: str = "direct"
     """What the two numbers of an action mean, see `asp_env.sim.action_types`."""
     action_repeat: int = 1
     """Number of ticks for which each action is held; rewards are summed over them."""

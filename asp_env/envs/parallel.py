@@ -27,7 +27,6 @@ from asp_env.envs.forecasts import ForecastSpec, PredictorSpec
 from asp_env.envs.options import ReplayOptions, suggest_options
 from asp_env.errors import AspEnvError, unknown_name
 from asp_env.render.frames import draw_frame
-from asp_env.sim.action_types import ActionType
 from asp_env.sim.reward import MIN_GOAL_M
 from asp_env.sim.traffic import Control, Driver
 from asp_env.sim.traffic.assignment import TrafficSpec
@@ -274,7 +273,7 @@ all |
         raster_px: tuple[int, int] | None = None,
         traffic: TrafficSpec | None = None,
         dt_s: float = DEFAULT_DT_S,
-        action_type: ActionType = "direct",
+        action_type: str = "direct",
         action_repeat: int = 1,
         reward_weights: Mapping[str, float] | None = None,
         scenarios: ScenarioSet | ScenarioFilter | str = "",

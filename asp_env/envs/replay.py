@@ -20,7 +20,6 @@ from asp_env.envs.forecasts import ForecastSpec, PredictorSpec
 from asp_env.envs.options import ReplayOptions, suggest_options
 from asp_env.envs.shared_in_spec import SharedInSpec
 from asp_env.render.live import MODES, LiveRenderer
-from asp_env.sim.action_types import ActionType
 from asp_env.sim.traffic.assignment import TrafficSpec
 from asp_env.sim.world import World
 
@@ -207,7 +206,7 @@ name; several in a mapping with their prefixes |
         raster_px: tuple[int, int] | None = None,
         traffic: TrafficSpec | None = None,
         dt_s: float = DEFAULT_DT_S,
-        action_type: ActionType = "direct",
+        action_type: str = "direct",
         action_repeat: int = 1,
         reward_weights: Mapping[str, float] | None = None,
         scenarios: ScenarioSet | ScenarioFilter | str = "",

@@ -23,7 +23,6 @@ from asp_env.envs.options import ReplayOptions, suggest_options
 from asp_env.envs.shared_in_spec import SharedInSpec
 from asp_env.errors import AspEnvError
 from asp_env.render.frames import draw_frame
-from asp_env.sim.action_types import ActionType
 from asp_env.sim.observation import Observation
 from asp_env.sim.traffic.assignment import TrafficSpec
 
@@ -98,7 +97,7 @@ class ReplayVectorEnv(SharedInSpec, VectorEnv[Observation, Any, np.ndarray]):
         raster_px: tuple[int, int] | None = None,
         traffic: TrafficSpec | None = None,
         dt_s: float = DEFAULT_DT_S,
-        action_type: ActionType = "direct",
+        action_type: str = "direct",
         action_repeat: int = 1,
         reward_weights: Mapping[str, float] | None = None,
         scenarios: ScenarioSet | ScenarioFilter | str = "",
