@@ -25,6 +25,7 @@ def parallel_env(
     max_agents: int | None = None,
     pad_absent: bool = False,
     flatten: bool = False,
+    numeric_infos: bool = False,
     render_mode: str | None = None,
     observations: Sequence[str] = ("raster", "actions", "state"),
     view: str = "chauffeurnet",
@@ -48,6 +49,7 @@ def parallel_env(
         pad_absent: absent agents stay in `agents` for the whole episode, with zeros as observation
             and reward, and the mask `present`.
         flatten: the observation of an agent is one flat `Box` instead of a `Dict`.
+        numeric_infos: infos are numbers only, with the same keys after `reset` and `step`.
         render_mode: `rgb_array` or None.
         observations: see `ReplayEnv`, as for the following arguments.
         view: the view that draws the `raster`.
@@ -77,6 +79,7 @@ def parallel_env(
         max_agents=max_agents,
         pad_absent=pad_absent,
         flatten=flatten,
+        numeric_infos=numeric_infos,
         render_mode=render_mode,
         observations=observations,
         view=view,

@@ -233,12 +233,12 @@ class ParallelReplayEnv(ParallelEnv[str, Any, Any]):
     `step({})` returns five empty dicts.
 
     With `pad_absent`, PettingZoo does not allow an agent to be terminated and to stay. Therefore
-    both flags are False until the last agent ends; then agents that end in this tick have their
-    own flags, and absent ones are terminated. `info["ending"]` names the reason in the tick in
-    which an agent ends, and `info["present"]` is False from the next tick on. An absent agent's
-    observations are all the same and its rewards are 0, so that a learned value of this state,
-    which is 0, ends its return. Infos of absent agents have the keys of the others, with zeros,
-    empty strings and empty tuples.
+    both flags are False until the last agent ends. In this tick the agents that end have their own
+    flags, and absent ones are terminated if all of these are, and truncated otherwise.
+    `info["ending"]` names the reason in the tick in which an agent ends, and `info["present"]` is
+    False from the next tick on. An absent agent's observations are all the same and its rewards are
+    0: an absorbing state, whose value is 0. Infos of absent agents have the keys of the others,
+    with zeros, empty strings and empty tuples.
 
     ## Arguments
     The arguments of `ReplayEnv` (as `render_mode` only `rgb_array`), and
@@ -252,6 +252,8 @@ all |
     | `max_agents` | `None` | the largest number of agents; those nearest to `vehicle_0` are taken |
     | `pad_absent` | `False` | absent agents stay in `agents`, with zeros and the mask `present` |
     | `flatten` | `False` | the observation of an agent is one flat `Box` instead of a `Dict` |
+    | `numeric_infos` | `False` | infos are numbers only, with the same keys after `reset` and \
+`step`; no `scenario`, `tags`, `reward_terms`, `ending` |
 
     ## Version History
     - v0: initial version
@@ -267,6 +269,7 @@ all |
         max_agents: int | None = None,
         pad_absent: bool = False,
         flatten: bool = False,
+        numeric_infos: bool = False,
         render_mode: str | None = None,
         observations: Sequence[str] = ("raster", "actions", "state"),
         view: str = "chauffeurnet",
@@ -317,6 +320,7 @@ all |
         self.possible_agents = [f"vehicle_{row}" for row in range(self._max_agents)]
         self.agents: list[str] = []
         self._pad_absent, self._flatten = pad_absent, flatten
+        self._numeric_infos = numeric_infos
         self._rows = {name: row for row, name in enumerate(self.possible_agents)}
         self._in_episode: list[str] = []
         """The agents of the episode: those that were present after `reset`."""
@@ -412,8 +416,9 @@ all |
         present = self._present_mask()
         terminated, truncated = result.terminated, result.truncated
         if self._pad_absent:
-            terminated = np.where(present, terminated, True) & (not remaining)
-            truncated = present & truncated & (not remaining)
+            all_terminated = terminated[present].all()
+            terminated = np.where(present, terminated, all_terminated) & (not remaining)
+            truncated = np.where(present, truncated, ~all_terminated) & (not remaining)
         returned = (
             self._observe(),
             self._by_agent(np.where(present, result.reward, 0.0)),
@@ -527,8 +532,12 @@ all |
         }
 
     def _infos(self, result: StepResult | None = None) -> dict[str, dict[str, Any]]:
-        columns = {name: self._by_agent(value) for name, value in self._episodes.info().items()}
-        if result is not None:
+        columns = {
+            name: self._by_agent(value)
+            for name, value in self._episodes.info().items()
+            if not (self._numeric_infos and value.dtype == object)
+        }
+        if result is not None and not self._numeric_infos:
             terms = {name: self._by_agent(value) for name, value in result.terms.items()}
             columns["reward_terms"] = {
                 agent: {name: value[agent] for name, value in terms.items()}

@@ -17,7 +17,10 @@ import asp_env.envs
 from asp_env.envs import ReplayOptions, UnknownOptionError
 from asp_env.envs.parallel import ParallelReplayEnv
 
-PARALLEL = ["data", "classes", "ids", "max_agents", "pad_absent", "flatten", "render_mode"]
+PARALLEL = [
+    *("data", "classes", "ids", "max_agents", "pad_absent", "flatten", "numeric_infos"),
+    "render_mode",
+]
 CONSTRUCTORS = {
     asp_env.ReplayEnv: ["data", "render_mode"],
     asp_env.ReplayVectorEnv: ["num_envs", "data", "autoreset_mode", "render_mode"],

@@ -119,7 +119,7 @@ def test_absent_agents_are_padded(queue):
     """A collides with B at its own fault at tick 17, its last tick; B alone lasts to the end.
 
     From tick 18 on, A's observation is zero with the mask 0, and its reward is 0. It stays in
-    `agents` and is terminated in the tick in which B ends.
+    `agents` and ends in the tick in which B ends, with B's flags.
     """
     env, plain = _make(queue, pad_absent=True), _make(queue)
     one, _ = env.reset(options={"scenario": 0})
@@ -137,10 +137,9 @@ def test_absent_agents_are_padded(queue):
         assert (infos["vehicle_0"]["ending"] == "COLLISION") is (tick == 17)
         assert set(infos["vehicle_0"]) == set(infos["vehicle_1"])
         assert env.agents == (["vehicle_0", "vehicle_1"] if plain.agents else [])
-        over = not plain.agents
-        assert terminated["vehicle_0"] is over
-        assert truncated["vehicle_0"] is False
-        assert (terminated["vehicle_1"] or truncated["vehicle_1"]) is over
+        flags = {(terminated[agent], truncated[agent]) for agent in ("vehicle_0", "vehicle_1")}
+        assert len(flags) == 1
+        assert any(flags.pop()) is not bool(plain.agents)
     assert tick > 17
 
 
@@ -174,6 +173,19 @@ def test_agents_that_the_scenario_lacks_are_absent_from_the_start(crossing):
             with pytest.raises(asp_env.AspEnvError, match="is absent from this episode: expected"):
                 env.scene(absent[-1])
     assert lacking > 0
+
+
+def test_numeric_infos_are_numbers_with_the_same_keys(crossing):
+    """In `reset` and in every step of an episode, of present and of absent agents."""
+    env = _make(crossing, pad_absent=True, numeric_infos=True)
+    _, infos = env.reset(seed=0)
+    keys = list(infos["vehicle_0"])
+    assert {"tick", "progress", "collision", "present"} <= set(keys)
+    while env.agents:
+        for info in infos.values():
+            assert list(info) == keys
+            assert all(np.asarray(value).dtype.kind in "bif" for value in info.values())
+        *_, infos = env.step(_zero_actions(env))
 
 
 @pytest.mark.parametrize("pad_absent", [False, True])
