@@ -19,9 +19,10 @@ from asp_env.data.scenarios.scenario import Scenario, ScenarioFilter, ScenarioSe
 from asp_env.data.scenarios.selection import choose_scenarios, scenario_of
 from asp_env.data.snippets import HISTORY_S
 from asp_env.data.source import Recordings, open_data
-from asp_env.dynamics import denormalize_actions
+from asp_env.dynamics import denormalize_actions, normalize_actions
 from asp_env.envs.options import ReplayOptions
 from asp_env.errors import AspEnvError, unknown_name
+from asp_env.sim.log_following import logged_actions
 from asp_env.sim.observation import Observation, Observer, ego_context
 from asp_env.sim.reward import reward_terms, weighted_sum, weights_from
 from asp_env.sim.simulation import Simulation, ending
@@ -298,6 +299,15 @@ class ReplayEpisodes:
             "at_fault": events.at_fault,
             "off_road_m": events.off_road_m.astype(np.float64),
         }
+
+    def logged_actions(self) -> tuple[Float[np.ndarray, "b 2"], Bool[np.ndarray, " b"]]:
+        """Returns the actions of the logged drivers in [-1, 1], and a mask of the clipped ones.
+
+        Raises:
+            AspEnvError: the world has no logged drivers.
+        """
+        actions, clipped = logged_actions(self.simulation.world)
+        return normalize_actions(actions), clipped
 
     def snapshot(self) -> Any:
         """Returns the whole state for `restore`; it holds no recordings and no rasters."""

@@ -1,0 +1,1 @@
+"""Agents that learn in the environments, and the demonstrations that they learn from."""
