@@ -30,6 +30,7 @@ from asp_env.sim.action_types import (
     from_physical,
     to_physical,
 )
+from asp_env.sim.log_following import logged_actions
 from asp_env.sim.observation import Observation, Observer, ego_context
 from asp_env.sim.reward import reward_terms, weighted_sum, weights_from
 from asp_env.sim.simulation import Simulation, ending
@@ -439,6 +440,17 @@ class ReplayEpisodes:
             "at_fault": events.at_fault,
             "off_road_m": events.off_road_m.astype(np.float64),
         }
+
+    def logged_actions(self) -> tuple[Float[np.ndarray, "b 2"], Bool[np.ndarray, " b"]]:
+        """Returns the actions of the logged drivers in [-1, 1], and a mask of the clipped ones.
+
+        Raises:
+            AspEnvError: the world has no logged drivers.
+        """
+        physical, clipped = logged_actions(self.simulation.world)
+        actions = self.actions_from(physical)
+        beyond = (np.abs(actions) > 1.0).any(axis=1)
+        return np.clip(actions, -1.0, 1.0), clipped | beyond
 
     def snapshot(self) -> Any:
         """Returns the whole state for `restore`; it holds no recordings and no rasters."""

@@ -9,7 +9,7 @@ import numpy as np
 from gymnasium.utils import seeding
 from gymnasium.vector import AutoresetMode, VectorEnv
 from gymnasium.vector.utils import batch_space
-from jaxtyping import Bool, Shaped
+from jaxtyping import Bool, Float, Shaped
 
 from asp_env.data.predictor import Predictor
 from asp_env.data.recording import DEFAULT_DT_S
@@ -238,6 +238,26 @@ class ReplayVectorEnv(SharedInSpec, VectorEnv[Observation, Any, np.ndarray]):
         """
         self._check_begun()
         return self._episodes.recorded_future(scene, horizon)
+
+    def logged_actions(self) -> Float[np.ndarray, "n 2"]:
+        """Returns the action of the logged driver of each environment, see `ReplayEnv`.
+
+        Raises:
+            gymnasium.error.ResetNeeded: an episode has not begun.
+            AspEnvError: the world has no logged drivers, as highway-env's.
+        """
+        self._check_begun()
+        return self._episodes.logged_actions()[0]
+
+    def logged_actions_clipped(self) -> Bool[np.ndarray, " n"]:
+        """Returns a mask of the environments whose `logged_actions()` were clipped.
+
+        Raises:
+            gymnasium.error.ResetNeeded: an episode has not begun.
+            AspEnvError: the world has no logged drivers, as highway-env's.
+        """
+        self._check_begun()
+        return self._episodes.logged_actions()[1]
 
     def render(self) -> tuple[Any, ...] | None:
         """Returns the image of each environment, see `ReplayEnv.render`; None without a mode.
