@@ -82,7 +82,7 @@ class RLTrain:
     such as density, or =-pet_behind_s for large gaps first."""
     demonstrations: int = 0
     """Epochs of behaviour cloning of the logged drivers before
-    the training."""
+    the training; with --algorithm bc they are all of it."""
     privileged: bool = False
     """Allow a predictor that uses the recorded future."""
     resume: bool = False

@@ -57,7 +57,7 @@ def algorithm_classes(name: str) -> AlgorithmClasses:
     """
     if name == "sac":
         return AlgorithmClasses(algorithm=SAC, policy=SACPolicy)
-    if name == "ppo":
+    if name in ("ppo", "bc"):
         return AlgorithmClasses(algorithm=PPO, policy=MultiInputActorCriticPolicy)
     try:
         from sb3_contrib import RecurrentPPO

@@ -11,7 +11,7 @@ from typing import Any, Literal, get_args
 from asp_env.data.recording import DEFAULT_DT_S
 from asp_env.errors import AspEnvError, unknown_name
 
-Algorithm = Literal["ppo", "sac", "recurrent-ppo"]
+Algorithm = Literal["ppo", "sac", "recurrent-ppo", "bc"]
 ALGORITHMS: tuple[str, ...] = get_args(Algorithm)
 
 CONFIG = "config.json"
@@ -95,7 +95,8 @@ class AgentSettings:
     """Column of the scenarios, such as `-pet_behind_s` for easy ones with a large time gap first;
     the share that is drawn grows from 0.3 to 1 over the first half of the training."""
     demonstrations: int = 0
-    """Epochs of behaviour cloning of the logged drivers before the training."""
+    """Epochs of behaviour cloning of the logged drivers before the training; for `bc` they are the
+    training."""
 
     def __post_init__(self) -> None:
         """Checks numbers and names.
@@ -108,6 +109,15 @@ class AgentSettings:
         for name, least in (("steps", 1), ("num_envs", 1), ("width", 1), ("demonstrations", 0)):
             if getattr(self, name) < least:
                 raise AspEnvError(f"{name} {getattr(self, name)}: expected at least {least}")
+        if self.algorithm == "bc" and not self.demonstrations:
+            raise AspEnvError(
+                "algorithm bc, behaviour cloning: give the number of epochs, such as "
+                "demonstrations=30"
+            )
+        if self.demonstrations and self.algorithm not in ("ppo", "bc"):
+            raise AspEnvError(
+                f"demonstrations {self.demonstrations}: only ppo can start from them, and bc"
+            )
         if not 0.0 <= self.gamma < 1.0:
             raise AspEnvError(f"gamma {self.gamma}: expected at least 0 and less than 1")
         if not (math.isfinite(self.learning_rate) and self.learning_rate > 0.0):
@@ -120,6 +130,7 @@ class AgentSettings:
 
 DEFAULTS: Mapping[str, Mapping[str, Any]] = {
     "ppo": {"n_steps": 32, "batch_size": 1024, "n_epochs": 10, "gae_lambda": 0.9},
+    "bc": {},
     "recurrent-ppo": {"n_steps": 32, "batch_size": 1024, "n_epochs": 5, "gae_lambda": 0.9},
     "sac": {
         "batch_size": 512,

@@ -13,8 +13,10 @@ from stable_baselines3.common.logger import configure
 from stable_baselines3.common.vec_env import VecMonitor, VecNormalize
 from torch import Tensor
 
+from agents.cloning import clone
 from agents.curriculum import Curriculum
 from agents.environments import AgentObservations, make_environments
+from agents.logged_steps import logged_steps
 from agents.runs import (
     CHECKPOINT,
     POLICY,
@@ -92,7 +94,7 @@ def train_agent(
         save_config(out, settings, space, predictor, 0)
         if settings.demonstrations:
             _clone_logged_drivers(settings, algorithm, privileged)
-    left = settings.steps - done
+    left = 0 if settings.algorithm == "bc" else settings.steps - done
     algorithm.set_logger(configure(str(out), ["csv", "tensorboard"]))
     callbacks: list[BaseCallback] = [EpisodeStatistics(), Checkpoints(out, normalized)]
     if settings.curriculum is not None:
@@ -166,17 +168,23 @@ def predictor_of(envs: AgentObservations) -> Predictor | None:
 def _clone_logged_drivers(
     settings: AgentSettings, algorithm: BaseAlgorithm, privileged: bool
 ) -> None:
-    from agents.cloning import clone, logged_steps
+    """Trains the policy to act as the logged drivers, before anything else."""
+    policy: Any = algorithm.policy
+    steps = logged_steps(settings, privileged=privileged)
+    with one_thread():
+        clone(
+            policy,
+            steps.observations,
+            steps.actions,
+            steps.recording if len(np.unique(steps.recording)) > 1 else _thirds(len(steps.actions)),
+            epochs=settings.demonstrations,
+            seed=settings.seed,
+        )
 
-    observations, actions, episodes = logged_steps(settings, privileged=privileged)
-    clone(
-        algorithm.policy,
-        observations,
-        actions,
-        episodes,
-        epochs=settings.demonstrations,
-        seed=settings.seed,
-    )
+
+def _thirds(count: int) -> np.ndarray:
+    """Three groups of steps one after the other, for data of a single recording."""
+    return np.arange(count) * 3 // count
 
 
 def _check_folder(settings: AgentSettings, out: Path, resume: bool) -> bool:

@@ -11,6 +11,7 @@ import torch
 
 from agents.curriculum import number_drawn, ordered
 from agents.evaluation import METRICS, evaluate_agent
+from agents.logged_steps import logged_steps
 from agents.runs import CHECKPOINT, POLICY, check_predictor, load_agent, read_tensors
 from agents.settings import CONFIG, AgentSettings, read_settings
 from agents.training import checkpoint_of, train_agent
@@ -152,10 +153,28 @@ class TestRefusals:
         with pytest.raises(AspEnvError, match=field if field != "algorithm" else "dqn"):
             AgentSettings(**{field: value})  # pyright: ignore[reportArgumentType]
 
+    def test_cloning(self) -> None:
+        with pytest.raises(AspEnvError, match="number of epochs"):
+            AgentSettings(algorithm="bc")
+        with pytest.raises(AspEnvError, match="only ppo"):
+            AgentSettings(algorithm="sac", demonstrations=2)
+
     def test_hyperparameters(self, tmp_path: Path) -> None:
         settings = dataclasses.replace(small_settings(), hyperparameters={"n_stepz": 3})
         with pytest.raises(AspEnvError, match="n_stepz"):
             train_agent(settings, tmp_path / "run")
+
+
+def test_cloned_actions_are_nearer_to_the_logged_ones(run: Path, tmp_path: Path) -> None:
+    settings = small_settings(algorithm="bc", demonstrations=3, num_envs=32)
+    train_agent(settings, tmp_path / "bc")
+    steps = logged_steps(settings)
+    assert len(steps.actions) == len(steps.recording)
+    errors = [
+        np.abs(load_agent(folder).act(steps.observations) - steps.actions).mean()
+        for folder in (tmp_path / "bc", run)
+    ]
+    assert errors[0] < 0.7 * errors[1]
 
 
 def test_curriculum_by_hand() -> None:
