@@ -60,7 +60,7 @@ ROUTE_STEP_M = 2.0
 Observation = dict[str, Shaped[np.ndarray, "t ..."]]
 """One array per part; the first axis is the targets."""
 
-Spaces = dict[str, spaces.Box[Any]]
+Spaces = dict[str, spaces.Box]
 """The space of each part, for one target."""
 
 
@@ -368,7 +368,7 @@ def _field_bounds(names: tuple[str, ...]) -> tuple[np.ndarray, np.ndarray]:
     return np.array(low), np.array([signed.get(name, sizes.get(name, 1.0)) for name in names])
 
 
-def _box(low: np.ndarray, high: np.ndarray, leading: tuple[int, ...]) -> spaces.Box[Any]:
+def _box(low: np.ndarray, high: np.ndarray, leading: tuple[int, ...]) -> spaces.Box:
     """A float32 space of shape (*leading, fields) with the given bounds of the fields."""
     shape = (*leading, len(low))
     return spaces.Box(
@@ -378,7 +378,7 @@ def _box(low: np.ndarray, high: np.ndarray, leading: tuple[int, ...]) -> spaces.
     )
 
 
-def _clip_to(box: spaces.Box[Any], values: np.ndarray) -> None:
+def _clip_to(box: spaces.Box, values: np.ndarray) -> None:
     _clip(values.reshape(len(values), -1), box.low.reshape(-1), box.high.reshape(-1))
 
 
