@@ -12,18 +12,19 @@ from typing import Any
 
 import numpy as np
 from gymnasium import spaces
-from jaxtyping import Bool, Float, Int, Shaped
+from jaxtyping import Bool, Float, Int
 
 from asp_env.data.recording import ticks
 from asp_env.data.scenarios.scenario import Scenario, ScenarioFilter, ScenarioSet
 from asp_env.data.scenarios.selection import choose_scenarios, scenario_of
+from asp_env.data.scenarios.tags import TAGS
 from asp_env.data.snippets import HISTORY_S
 from asp_env.data.source import Recordings, open_data
 from asp_env.dynamics import denormalize_actions
 from asp_env.envs.options import ReplayOptions
 from asp_env.errors import AspEnvError, unknown_name
 from asp_env.sim.observation import Observation, Observer, ego_context
-from asp_env.sim.reward import reward_terms, weighted_sum, weights_from
+from asp_env.sim.reward import REWARD_TERMS, reward_terms, weighted_sum, weights_from
 from asp_env.sim.simulation import Simulation, ending
 from asp_env.sim.traffic.assignment import make_traffic
 from asp_env.sim.world import Ending, Events, world_class
@@ -158,15 +159,11 @@ def _whole_number(name: str, value: Any) -> int:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class StepResult:
-    """Rewards and endings of one step of B episodes."""
+    """Rewards and ends of one step of B episodes; `ReplayEpisodes.info` has the details."""
 
     reward: Float[np.ndarray, " b"]
-    terms: dict[str, Float[np.ndarray, " b"]]
-    """The terms of the reward by name, unweighted."""
     terminated: Bool[np.ndarray, " b"]
     truncated: Bool[np.ndarray, " b"]
-    ending: Shaped[np.ndarray, " b"]
-    """Name of the `Ending` of each episode."""
 
 
 class ReplayEpisodes:
@@ -201,10 +198,18 @@ class ReplayEpisodes:
             world_class=kind,
         )
         self._weights = weights_from(options.reward_weights or {})
-        self._names = np.full(num_episodes, None, dtype=object)
-        self._tags = np.full(num_episodes, None, dtype=object)
+        self._clear(num_episodes)
         self.action_space = spaces.Box(-1.0, 1.0, (2,), dtype=np.float32)
+
+    def _clear(self, num_episodes: int) -> None:
+        """Describes episodes that have not begun."""
         self.events: Events | None = None
+        self._names = np.full(num_episodes, None, dtype=object)
+        self._tags = np.zeros((num_episodes, len(TAGS)), dtype=bool)
+        self._return = np.zeros(num_episodes)
+        """Sum of the rewards since the start of each episode."""
+        self._terms = {name: np.zeros(num_episodes) for name in REWARD_TERMS}
+        """The unweighted terms of the reward of each episode's last step; zeros at its start."""
 
     def restrict(self, scenarios: ScenarioSet, num_episodes: int) -> None:
         """Replaces the scenarios to draw from and the number of episodes, and ends all episodes."""
@@ -219,9 +224,7 @@ class ReplayEpisodes:
             history=world.history,
             world_class=type(world),
         )
-        self._names = np.full(num_episodes, None, dtype=object)
-        self._tags = np.full(num_episodes, None, dtype=object)
-        self.events = None
+        self._clear(num_episodes)
 
     def draw(
         self, np_random: np.random.Generator, options: Mapping[str, Any]
@@ -251,8 +254,14 @@ class ReplayEpisodes:
         """Starts the episodes of a mask; the other entries of the sequences are ignored."""
         self.simulation.reset(scenarios, rngs, reset_mask)
         for b in np.flatnonzero(reset_mask).tolist():
-            self._names[b], self._tags[b] = scenarios[b].name, scenarios[b].tags
+            self._describe(b, scenarios[b])
+        self._return[reset_mask] = 0.0
+        self._terms = {name: np.where(reset_mask, 0.0, term) for name, term in self._terms.items()}
         self.events = self.simulation.world.events()
+
+    def _describe(self, b: int, scenario: Scenario | None) -> None:
+        self._names[b] = None if scenario is None else scenario.name
+        self._tags[b] = [scenario is not None and tag in scenario.tags for tag in TAGS]
 
     def step(self, actions: Float[np.ndarray, "b 2"]) -> StepResult:
         """Steps all episodes by one tick; the egos' actions lie in [-1, 1]."""
@@ -263,13 +272,12 @@ class ReplayEpisodes:
         self.simulation.step(denormalize_actions(actions), controlled)
         self.events = after = world.events()
         terms = reward_terms(before, after, states_before, world.ego_states(), world.dt_s)
-        endings = ending(after)
+        reward, endings = weighted_sum(terms, self._weights), ending(after)
+        self._terms, self._return = terms, self._return + reward
         return StepResult(
-            reward=weighted_sum(terms, self._weights),
-            terms=terms,
+            reward=reward,
             terminated=_IS_TERMINAL[endings],
             truncated=endings == Ending.OUT_OF_DATA,
-            ending=_ENDING_NAMES[endings],
         )
 
     def observe(
@@ -285,10 +293,17 @@ class ReplayEpisodes:
         events = self.events if rows is None else _events_of(self.events, rows)
         return self.observer.observe(ego_context(self.simulation.world, rows), events, out)
 
-    def info(self) -> dict[str, Shaped[np.ndarray, " b"]]:
-        """Returns the present infos in new arrays."""
+    def info(self) -> dict[str, Any]:
+        """Returns the present infos in new arrays; keys, shapes and types never change.
+
+        The value of `tags` is (B, tags), that of `reward_terms` a dictionary of arrays (B,), and
+        all others are (B,).
+        """
         events = self.events
         assert events is not None
+        endings = ending(events)
+        # An episode has not ended before its first step, even where its goal is at its start.
+        endings[events.elapsed == 0] = Ending.RUNNING
         return {
             "scenario": self._names.copy(),
             "tags": self._tags.copy(),
@@ -297,20 +312,41 @@ class ReplayEpisodes:
             "collision": events.collision,
             "at_fault": events.at_fault,
             "off_road_m": events.off_road_m.astype(np.float64),
+            "reward_terms": {name: term.copy() for name, term in self._terms.items()},
+            "ending": _ENDING_NAMES[endings],
+            "is_success": endings == Ending.GOAL,
+            "episode_return": self._return.copy(),
         }
 
     def snapshot(self) -> Any:
         """Returns the whole state for `restore`; it holds no recordings and no rasters."""
-        return self.simulation.snapshot()
+        return self.simulation.snapshot(), self._return.copy(), dict(self._terms)
 
     def restore(self, snapshot: Any) -> None:
         """Restores the state of a snapshot, bit for bit."""
-        self.simulation.restore(snapshot)
+        simulation, returns, terms = snapshot
+        self.simulation.restore(simulation)
+        self._return, self._terms = returns.copy(), dict(terms)
         world = self.simulation.world
         for b, scenario in enumerate(world.scenarios):
-            self._names[b] = None if scenario is None else scenario.name
-            self._tags[b] = None if scenario is None else scenario.tags
+            self._describe(b, scenario)
         self.events = world.events()
+
+
+def info_of(infos: Mapping[str, Any], b: int) -> dict[str, Any]:
+    """Returns the info of one episode of `ReplayEpisodes.info`, with numbers as Python's own.
+
+    Args:
+        infos: the infos of all episodes.
+        b: number of the episode.
+    """
+    info: dict[str, Any] = {}
+    for name, values in infos.items():
+        if isinstance(values, Mapping):
+            info[name] = info_of(values, b)
+        else:
+            info[name] = values[b].copy() if values.ndim > 1 else values.tolist()[b]
+    return info
 
 
 def _events_of(events: Events, rows: Int[np.ndarray, " n"]) -> Events:

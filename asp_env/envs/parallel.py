@@ -21,10 +21,11 @@ from asp_env.data.recording import DEFAULT_DT_S, Recording, frames_per_tick
 from asp_env.data.scenarios.scenario import Scenario, ScenarioFilter, ScenarioSet
 from asp_env.data.scene import EGO, Scene
 from asp_env.dynamics import denormalize_actions
-from asp_env.envs.episodes import RESET_OPTIONS, ReplayEpisodes, StepResult, valid_actions
+from asp_env.envs.episodes import RESET_OPTIONS, ReplayEpisodes, info_of, valid_actions
 from asp_env.envs.options import ReplayOptions, suggest_options
 from asp_env.errors import AspEnvError, unknown_name
 from asp_env.render.frames import draw_frame
+from asp_env.render.live import render_fps
 from asp_env.sim.reward import MIN_GOAL_M
 from asp_env.sim.traffic import Control, Driver
 from asp_env.sim.traffic.assignment import TrafficSpec
@@ -269,10 +270,13 @@ all |
             reward_weights=reward_weights,
             scenarios=scenarios,
         )
-        self.metadata = {"name": "asp_env/ParallelReplay-v0", "render_modes": ["rgb_array"]}
+        self.metadata = {
+            "name": "asp_env/ParallelReplay-v0",
+            "render_modes": ["rgb_array"],
+            "render_fps": render_fps(dt_s),
+        }
         self.render_mode = render_mode
         self._episodes = ReplayEpisodes(data, options, 1)
-        self.metadata["render_fps"] = 1 / dt_s
         self.recordings = self._episodes.recordings
         selection = AgentSelection(classes=classes, ids=ids)
         self._selected = tuple(selection.mask(recording) for recording in self.recordings)
@@ -356,7 +360,7 @@ all |
             self._by_agent(result.reward),
             self._by_agent(result.terminated),
             self._by_agent(result.truncated),
-            self._infos(result),
+            self._infos(),
         )
         self._episodes.simulation.world.episodes.departed |= driver.slots_of(over)
         self.agents = [name for name in self.agents if not over[self._rows[name]]]
@@ -438,18 +442,9 @@ all |
             for row, name in enumerate(self.agents)
         }
 
-    def _infos(self, result: StepResult | None = None) -> dict[str, dict[str, Any]]:
-        columns = {name: self._by_agent(value) for name, value in self._episodes.info().items()}
-        if result is not None:
-            terms = {name: self._by_agent(value) for name, value in result.terms.items()}
-            columns["reward_terms"] = {
-                agent: {name: value[agent] for name, value in terms.items()}
-                for agent in self.agents
-            }
-            columns["ending"] = self._by_agent(result.ending)
-        return {
-            agent: {name: value[agent] for name, value in columns.items()} for agent in self.agents
-        }
+    def _infos(self) -> dict[str, dict[str, Any]]:
+        infos = self._episodes.info()
+        return {agent: info_of(infos, self._rows[agent]) for agent in self.agents}
 
     def _by_agent(self, values: np.ndarray) -> dict[str, Any]:
         plain = values.tolist()

@@ -15,14 +15,14 @@ from asp_env.data.scenarios.scenario import Scenario, ScenarioFilter, ScenarioSe
 from asp_env.data.scene import Scene
 from asp_env.data.snippets import Future
 from asp_env.data.source import Recordings
-from asp_env.envs.episodes import ReplayEpisodes, StepResult, valid_actions
+from asp_env.envs.episodes import ReplayEpisodes, StepResult, info_of, valid_actions
 from asp_env.envs.options import ReplayOptions, suggest_options
-from asp_env.render.live import MODES, LiveRenderer
+from asp_env.render.live import MODES, LiveRenderer, render_fps
 from asp_env.sim.traffic.assignment import TrafficSpec
 from asp_env.sim.world import World, recorded_future
 
 NOT_BEGUN = "no episode has begun: call reset first"
-METADATA = {"render_modes": [*MODES], "render_fps": 5}
+METADATA = {"render_modes": [*MODES], "render_fps": render_fps(DEFAULT_DT_S)}
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -227,7 +227,7 @@ table of drivers; `log` by default, `own` in a world with reacting traffic |
         self._start: tuple[Scenario, Mapping[str, Any]] | None = None
         """The scenario, and the state of its generator at the start."""
         self._actions: list[Float[np.ndarray, " 2"]] = []
-        self.metadata = {**METADATA, "render_fps": round(1 / dt_s, 6)}
+        self.metadata = {**METADATA, "render_fps": render_fps(dt_s)}
         self._live = LiveRenderer(render_mode, title=f"asp-env: {data}", dt_s=dt_s)
 
     def reset(
@@ -262,12 +262,8 @@ table of drivers; `log` by default, `own` in a world with reacting traffic |
         result = self._act(valid_actions(action, (2,)))
         terminated, truncated = bool(result.terminated[0]), bool(result.truncated[0])
         self._running = not (terminated or truncated)
-        info = self._info() | {
-            "reward_terms": {name: float(value[0]) for name, value in result.terms.items()},
-            "ending": result.ending[0],
-        }
         self._update_window()
-        return self._observe(), float(result.reward[0]), terminated, truncated, info
+        return self._observe(), float(result.reward[0]), terminated, truncated, self._info()
 
     def scene(self) -> Scene:
         """Returns everything that may be known now, for predictors and planners; the ego is slot 0.
@@ -389,7 +385,7 @@ table of drivers; `log` by default, `own` in a world with reacting traffic |
         return {name: value[0] for name, value in self._episodes.observe().items()}
 
     def _info(self) -> dict[str, Any]:
-        return {name: value.tolist()[0] for name, value in self._episodes.info().items()}
+        return info_of(self._episodes.info(), 0)
 
     def _world(self) -> World:
         if self._start is None:

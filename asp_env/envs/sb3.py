@@ -44,6 +44,10 @@ class ReplayVecEnv(VecEnv):
         self.envs = envs
         self._actions = np.zeros((envs.num_envs, 2), dtype=np.float32)
         super().__init__(envs.num_envs, envs.single_observation_space, envs.single_action_space)
+        # `VecVideoRecorder` takes its frame rate from here.
+        self.metadata = {
+            name: value for name, value in envs.metadata.items() if name.startswith("render_")
+        }
 
     def reset(self) -> Observations:
         """Starts all episodes with the seeds and options that were set, and clears these."""
@@ -69,6 +73,8 @@ class ReplayVecEnv(VecEnv):
             observations = self._restart(observations, over, infos)
         for info, limit in zip(infos, limits, strict=True):
             info["TimeLimit.truncated"] = limit
+        for b in np.flatnonzero(over).tolist():
+            infos[b]["episode"] = {"r": infos[b]["episode_return"], "l": infos[b]["tick"]}
         return observations, rewards.astype(np.float32), over, infos
 
     def _restart(self, observations: Observations, over: np.ndarray, infos: Infos) -> Observations:
@@ -174,7 +180,10 @@ def _unbatch_infos(infos: dict[str, Any], count: int) -> Infos:
         if not name.startswith("_"):
             continue
         values = infos[name[1:]]
-        plain = _unbatch_infos(values, count) if isinstance(values, dict) else values.tolist()
+        if isinstance(values, dict):
+            plain = _unbatch_infos(values, count)
+        else:
+            plain = list(values) if values.ndim > 1 else values.tolist()
         for b in np.flatnonzero(mask).tolist():
             unbatched[b][name[1:]] = plain[b]
     return unbatched

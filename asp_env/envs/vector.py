@@ -20,6 +20,7 @@ from asp_env.envs.episodes import ObservationBuffers, ReplayEpisodes, StepResult
 from asp_env.envs.options import ReplayOptions, suggest_options
 from asp_env.errors import AspEnvError
 from asp_env.render.frames import draw_frame
+from asp_env.render.live import render_fps
 from asp_env.sim.observation import Observation
 from asp_env.sim.traffic.assignment import TrafficSpec
 from asp_env.sim.world import recorded_future
@@ -117,8 +118,12 @@ class ReplayVectorEnv(VectorEnv[Observation, Any, np.ndarray]):
             scenarios=scenarios,
         )
         self.num_envs = num_envs
-        self._mode = _parse_autoreset_mode(autoreset_mode)
-        self.metadata = {**self.metadata, "autoreset_mode": self._mode}
+        self.autoreset_mode = _parse_autoreset_mode(autoreset_mode)
+        self.metadata = {
+            "render_modes": ["rgb_array"],
+            "render_fps": render_fps(dt_s),
+            "autoreset_mode": self.autoreset_mode,
+        }
         self.render_mode = render_mode
         self._episodes = ReplayEpisodes(data, options, num_envs)
         self.single_observation_space = self._episodes.observer.space
@@ -167,19 +172,18 @@ class ReplayVectorEnv(VectorEnv[Observation, Any, np.ndarray]):
         if not self._begun.all():
             raise gymnasium.error.ResetNeeded("call reset before step")
         restart = self._over.copy()
-        if restart.any() and self._mode is not AutoresetMode.NEXT_STEP:
+        if restart.any() and self.autoreset_mode is not AutoresetMode.NEXT_STEP:
             over = np.flatnonzero(restart).tolist()
             raise gymnasium.error.ResetNeeded(
                 f"the episodes {over} are over: reset them with options={{'reset_mask': mask}}"
             )
         result = self._episodes.step(valid_actions(actions, (self.num_envs, 2), restart))
-        if self._mode is AutoresetMode.SAME_STEP:
+        if self.autoreset_mode is AutoresetMode.SAME_STEP:
             return self._finish_same_step(result)
         if restart.any():
             self._begin(restart, [{}] * self.num_envs)
         stepped = ~restart
         infos = _mask_infos(self._episodes.info(), np.ones_like(restart))
-        infos |= _mask_infos(_step_infos(result), stepped)
         terminated, truncated = result.terminated & stepped, result.truncated & stepped
         self._over = terminated | truncated
         reward = np.where(stepped, result.reward, 0.0)
@@ -190,7 +194,7 @@ class ReplayVectorEnv(VectorEnv[Observation, Any, np.ndarray]):
     ) -> tuple[Observation, np.ndarray, np.ndarray, np.ndarray, Infos]:
         """Resets the finished episodes and moves their last observations to the infos."""
         over = result.terminated | result.truncated
-        observation, ended = self._observe(), self._episodes.info() | _step_infos(result)
+        observation, ended = self._observe(), self._episodes.info()
         if not over.any():
             infos = _mask_infos(ended, ~over)
             return observation, result.reward, result.terminated, result.truncated, infos
@@ -203,7 +207,6 @@ class ReplayVectorEnv(VectorEnv[Observation, Any, np.ndarray]):
             observation[name][rows] = value
         infos = _mask_infos({"final_obs": last, "final_info": ended}, over)
         infos |= _mask_infos(self._episodes.info(), np.ones_like(over))
-        infos |= _mask_infos(_step_infos(result), ~over)
         self._over = np.zeros_like(over)
         return observation, result.reward, result.terminated, result.truncated, infos
 
@@ -365,10 +368,6 @@ def _options_of(options: dict[str, Any], b: int, num_envs: int) -> dict[str, Any
     return chosen
 
 
-def _step_infos(result: StepResult) -> Infos:
-    return {"reward_terms": dict(result.terms), "ending": result.ending}
-
-
 def _mask_infos(infos: Infos, mask: Bool[np.ndarray, " n"]) -> Infos:
     """Adds the mask of each key as `_key`, as Gymnasium's vector environments do.
 
@@ -384,9 +383,9 @@ def _mask_infos(infos: Infos, mask: Bool[np.ndarray, " n"]) -> Infos:
     return masked
 
 
-def _mask_values(values: Shaped[np.ndarray, " n"], mask: Bool[np.ndarray, " n"]) -> np.ndarray:
+def _mask_values(values: Shaped[np.ndarray, "n ..."], mask: Bool[np.ndarray, " n"]) -> np.ndarray:
     if mask.all():
         return values
-    out = np.full(len(values), None if values.dtype == object else 0, dtype=values.dtype)
+    out = np.full(values.shape, None if values.dtype == object else 0, dtype=values.dtype)
     out[mask] = values[mask]
     return out
