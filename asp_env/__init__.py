@@ -19,6 +19,7 @@ if TYPE_CHECKING:
     from asp_env.dynamics import denormalize_actions, normalize_actions
     from asp_env.envs import (
         FlatParts,
+        ForecastOptions,
         PredictionFeatures,
         ReplayEnv,
         ReplayVectorEnv,
@@ -33,6 +34,7 @@ __all__ = [
     "AspEnvError",
     "FlatParts",
     "Forecast",
+    "ForecastOptions",
     "Plan",
     "Planner",
     "PredictionFeatures",
@@ -60,6 +62,7 @@ _MODULES = {
     "asp_env.dynamics": ("denormalize_actions", "normalize_actions"),
     "asp_env.envs": (
         "FlatParts",
+        "ForecastOptions",
         "PredictionFeatures",
         "ReplayEnv",
         "ReplayVectorEnv",

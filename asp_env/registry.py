@@ -13,7 +13,8 @@ The groups are:
 - `asp_env.sources`: data by `scheme:argument`, such as `synthetic:intersection`;
 - `asp_env.worlds`: simulate the data of a source that are not replayed, such as `highway:`;
 - `asp_env.views`: render scenes for networks;
-- `asp_env.commands`: sub-commands of `asp-env`.
+- `asp_env.commands`: sub-commands of `asp-env`. A name of two words, such as `"rl train"`, is a
+  command of a group: `asp-env rl train`.
 """
 
 from functools import cache

@@ -5,9 +5,11 @@ from typing import TYPE_CHECKING
 
 from asp_env.data.recording import DEFAULT_DT_S
 from asp_env.data.scenarios.scenario import ScenarioFilter, ScenarioSet
+from asp_env.envs.forecasts import ForecastSpec, PredictorSpec
 from asp_env.envs.options import suggest_options
 from asp_env.envs.vector import ReplayVectorEnv
 from asp_env.errors import MissingExtraError
+from asp_env.sim.action_types import ActionType
 from asp_env.sim.traffic.assignment import TrafficSpec
 
 if TYPE_CHECKING:
@@ -22,14 +24,20 @@ def parallel_env(
     classes: Sequence[str] | None = None,
     ids: Sequence[int] | None = None,
     max_agents: int | None = None,
+    pad_absent: bool = False,
+    flatten: bool = False,
     render_mode: str | None = None,
     observations: Sequence[str] = ("raster", "actions", "state"),
     view: str = "chauffeurnet",
     raster_px: tuple[int, int] | None = None,
     traffic: TrafficSpec | None = None,
     dt_s: float = DEFAULT_DT_S,
+    action_type: ActionType = "direct",
+    action_repeat: int = 1,
     reward_weights: Mapping[str, float] | None = None,
     scenarios: ScenarioSet | ScenarioFilter | str = "",
+    predictor: PredictorSpec | None = None,
+    forecast: ForecastSpec | None = None,
 ) -> "ParallelReplayEnv":
     """Makes a PettingZoo parallel environment that controls many vehicles of a recording.
 
@@ -38,14 +46,22 @@ def parallel_env(
         classes: names of the classes of vehicles that are agents, such as `car`; by default all.
         ids: track ids of the vehicles that are agents; by default all.
         max_agents: the largest number of agents; those nearest to `vehicle_0` are taken.
+        pad_absent: absent agents stay in `agents` for the whole episode, with zeros as observation
+            and reward, and the mask `present`.
+        flatten: the observation of an agent is one flat `Box` instead of a `Dict`.
         render_mode: `rgb_array` or None.
         observations: see `ReplayEnv`, as for the following arguments.
         view: the view that draws the `raster`.
         raster_px: height and width of the `raster` in pixels.
         traffic: the driver of the uncontrolled agents, or a table of drivers.
         dt_s: length of a tick in seconds.
+        action_type: what actions mean: `direct`, `jerk` or `route`.
+        action_repeat: number of ticks for which each action is held.
         reward_weights: weights of reward terms that differ from the defaults.
         scenarios: the scenarios to draw from, or a filter.
+        predictor: the predictor whose forecasts the observation shows, or several.
+        forecast: `ForecastOptions` or a mapping of its fields, such as `every_ticks` and
+            `latency_ticks`, in ticks.
 
     Raises:
         AspEnvError: an argument is invalid, or no scenario fits.
@@ -60,14 +76,20 @@ def parallel_env(
         classes=classes,
         ids=ids,
         max_agents=max_agents,
+        pad_absent=pad_absent,
+        flatten=flatten,
         render_mode=render_mode,
         observations=observations,
         view=view,
         raster_px=raster_px,
         traffic=traffic,
         dt_s=dt_s,
+        action_type=action_type,
+        action_repeat=action_repeat,
         reward_weights=reward_weights,
         scenarios=scenarios,
+        predictor=predictor,
+        forecast=forecast,
     )
 
 
@@ -82,8 +104,12 @@ def sb3_vec_env(
     raster_px: tuple[int, int] | None = None,
     traffic: TrafficSpec | None = None,
     dt_s: float = DEFAULT_DT_S,
+    action_type: ActionType = "direct",
+    action_repeat: int = 1,
     reward_weights: Mapping[str, float] | None = None,
     scenarios: ScenarioSet | ScenarioFilter | str = "",
+    predictor: PredictorSpec | None = None,
+    forecast: ForecastSpec | None = None,
 ) -> "ReplayVecEnv":
     """Makes a vector environment for stable-baselines3, batched like `ReplayVectorEnv`.
 
@@ -96,8 +122,13 @@ def sb3_vec_env(
         raster_px: height and width of the `raster` in pixels.
         traffic: the driver of the uncontrolled agents, or a table of drivers.
         dt_s: length of a tick in seconds.
+        action_type: what actions mean: `direct`, `jerk` or `route`.
+        action_repeat: number of ticks for which each action is held.
         reward_weights: weights of reward terms that differ from the defaults.
         scenarios: the scenarios to draw from, or a filter.
+        predictor: the predictor whose forecasts the observation shows, or several.
+        forecast: `ForecastOptions` or a mapping of its fields, such as `every_ticks` and
+            `latency_ticks`, in ticks.
 
     Raises:
         AspEnvError: an argument is invalid, or the data hold no scenario.
@@ -117,7 +148,11 @@ def sb3_vec_env(
         raster_px=raster_px,
         traffic=traffic,
         dt_s=dt_s,
+        action_type=action_type,
+        action_repeat=action_repeat,
         reward_weights=reward_weights,
         scenarios=scenarios,
+        predictor=predictor,
+        forecast=forecast,
     )
     return ReplayVecEnv(envs)

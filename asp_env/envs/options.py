@@ -9,7 +9,9 @@ from typing import Any, TypeVar, cast
 
 from asp_env.data.recording import DEFAULT_DT_S
 from asp_env.data.scenarios.scenario import ScenarioFilter, ScenarioSet
+from asp_env.envs.forecasts import ForecastSpec, PredictorSpec
 from asp_env.errors import AspEnvError
+from asp_env.sim.action_types import ActionType
 from asp_env.sim.traffic.assignment import TrafficSpec
 
 Function = TypeVar("Function", bound=Callable[..., Any])
@@ -35,10 +37,20 @@ class ReplayOptions:
     world moves them."""
     dt_s: float = DEFAULT_DT_S
     """Length of a tick in seconds."""
+    action_type: ActionType = "direct"
+    """What the two numbers of an action mean, see `asp_env.sim.action_types`."""
+    action_repeat: int = 1
+    """Number of ticks for which each action is held; rewards are summed over them."""
     reward_weights: Mapping[str, float] | None = None
     """Weights of reward terms by name, where they differ from the defaults."""
     scenarios: ScenarioSet | ScenarioFilter | str = ""
     """The scenarios to draw from: a set of them, or a filter such as `left,length>=8`."""
+    predictor: PredictorSpec | None = None
+    """The predictor whose forecasts the observation shows, or its name; several in a mapping with
+    the prefixes of their entries. None adds nothing."""
+    forecast: ForecastSpec | None = None
+    """`ForecastOptions` or a mapping of its fields; for several predictors also a mapping from
+    their prefixes to either."""
 
 
 class UnknownOptionError(AspEnvError, TypeError):

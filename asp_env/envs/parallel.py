@@ -5,6 +5,7 @@ agent v, which is the ego of that row; `JointPolicyDriver` moves the other agent
 same way as in their own rows. Each agent thus gets observations, rewards and infos of an ego.
 """
 
+import copy
 import dataclasses
 from collections.abc import Mapping, Sequence
 from typing import Any
@@ -12,6 +13,7 @@ from typing import Any
 import gymnasium
 import numpy as np
 from gymnasium import spaces
+from gymnasium.spaces import flatten_space
 from gymnasium.utils import seeding
 from jaxtyping import Bool, Float, Int
 from pettingzoo import ParallelEnv
@@ -20,12 +22,13 @@ from asp_env.data.classes import PREDICTED, AgentClass
 from asp_env.data.recording import DEFAULT_DT_S, Recording, frames_per_tick
 from asp_env.data.scenarios.scenario import Scenario, ScenarioFilter, ScenarioSet
 from asp_env.data.scene import EGO, Scene
-from asp_env.dynamics import denormalize_actions
 from asp_env.envs.episodes import RESET_OPTIONS, ReplayEpisodes, info_of, valid_actions
+from asp_env.envs.forecasts import ForecastSpec, PredictorSpec
 from asp_env.envs.options import ReplayOptions, suggest_options
 from asp_env.errors import AspEnvError, unknown_name
 from asp_env.render.frames import draw_frame
 from asp_env.render.live import render_fps
+from asp_env.sim.action_types import ActionType
 from asp_env.sim.reward import MIN_GOAL_M
 from asp_env.sim.traffic import Control, Driver
 from asp_env.sim.traffic.assignment import TrafficSpec
@@ -187,28 +190,38 @@ def _match(tracks: Int[np.ndarray, "b a"], known: Int[np.ndarray, " n"]) -> Int[
     return np.where(same.any(axis=-1), same.argmax(axis=-1), -1)
 
 
-Observations = dict[str, dict[str, np.ndarray]]
+PRESENT = "present"
+"""The key of the mask of `pad_absent` in observations and infos."""
+
+Observations = dict[str, Any]
+"""The observation of each agent: a dict of arrays, or with `flatten` one array."""
 
 
-class ParallelReplayEnv(ParallelEnv[str, dict[str, np.ndarray], Any]):
+class ParallelReplayEnv(ParallelEnv[str, Any, Any]):
     """Controls many vehicles of a recording at once; the others are replayed or react.
 
     ## Description
     Each agent has the observations, actions, rewards and infos that `ReplayEnv` has for its ego,
     from its own view. `vehicle_0` is the ego of the scenario. The other agents are the vehicles
     that are present during the whole history and move by at least 1 m until the scenario, or their
-    own track, ends. Vehicles that stand all the time or appear later are traffic, so the list
-    `agents` only shrinks. After a `reset`, `possible_agents` are the agents of the episode; before,
-    as many as any scenario can have.
+    own track, ends. Vehicles that stand all the time or appear later are traffic.
+
+    `possible_agents` never changes: it has as many agents as the scenario with the most agents.
+    After `reset`, `agents` are the first of them, as many as the scenario has. An agent is present
+    until its episode ends, and absent from then on. Without `pad_absent`, `agents` are the present
+    ones, and the list shrinks. With `pad_absent`, `agents` are all of `possible_agents` until no
+    agent is present, for tools that need a fixed population.
 
     ## Action Space
     That of `ReplayEnv` for each agent.
 
     ## Observation Space
-    That of `ReplayEnv` for each agent.
+    That of `ReplayEnv` for each agent. `pad_absent` adds the entry `present`, `Box(0, 1, (1,),
+    int8)`, which is 0 for an absent agent; all other entries are zeros then. `flatten` makes one
+    float32 `Box` of all entries, in their order, as `gymnasium.spaces.flatten` does.
 
     ## Rewards
-    Those of `ReplayEnv` for each agent.
+    Those of `ReplayEnv` for each agent; 0 for an absent one.
 
     ## Starting State
     As in `ReplayEnv`; only scenarios whose ego may be an agent are drawn. `reset` ignores unknown
@@ -218,7 +231,16 @@ class ParallelReplayEnv(ParallelEnv[str, dict[str, np.ndarray], Any]):
     As in `ReplayEnv` for each agent: terminated by `COLLISION` at its own fault, `OFF_ROAD` or
     `GOAL`, truncated by `OUT_OF_DATA` when its own track ends. An agent disappears after its last
     observation, also after a collision, since replayed traffic would pass through a wreck. A
-    vehicle that was hit continues. The episode is over when no agent is left.
+    vehicle that was hit continues. The episode is over when no agent is present. After that,
+    `step({})` returns five empty dicts.
+
+    With `pad_absent`, PettingZoo does not allow an agent to be terminated and to stay. Therefore
+    both flags are False until the last agent ends; then agents that end in this tick have their
+    own flags, and absent ones are terminated. `info["ending"]` names the reason in the tick in
+    which an agent ends, and `info["present"]` is False from the next tick on. An absent agent's
+    observations are all the same and its rewards are 0, so that a learned value of this state,
+    which is 0, ends its return. Infos of absent agents have the keys of the others, with zeros,
+    empty strings and empty tuples.
 
     ## Arguments
     The arguments of `ReplayEnv` (as `render_mode` only `rgb_array`), and
@@ -230,6 +252,8 @@ default all |
     | `ids` | `None` | track ids of the vehicles that may be agents, in any recording; by default \
 all |
     | `max_agents` | `None` | the largest number of agents; those nearest to `vehicle_0` are taken |
+    | `pad_absent` | `False` | absent agents stay in `agents`, with zeros and the mask `present` |
+    | `flatten` | `False` | the observation of an agent is one flat `Box` instead of a `Dict` |
 
     ## Version History
     - v0: initial version
@@ -243,14 +267,20 @@ all |
         classes: Sequence[str] | None = None,
         ids: Sequence[int] | None = None,
         max_agents: int | None = None,
+        pad_absent: bool = False,
+        flatten: bool = False,
         render_mode: str | None = None,
         observations: Sequence[str] = ("raster", "actions", "state"),
         view: str = "chauffeurnet",
         raster_px: tuple[int, int] | None = None,
         traffic: TrafficSpec | None = None,
         dt_s: float = DEFAULT_DT_S,
+        action_type: ActionType = "direct",
+        action_repeat: int = 1,
         reward_weights: Mapping[str, float] | None = None,
         scenarios: ScenarioSet | ScenarioFilter | str = "",
+        predictor: PredictorSpec | None = None,
+        forecast: ForecastSpec | None = None,
     ) -> None:
         """Makes the environment; the arguments are those of the class documentation.
 
@@ -267,16 +297,20 @@ all |
             raster_px=raster_px,
             traffic=traffic,
             dt_s=dt_s,
+            action_type=action_type,
+            action_repeat=action_repeat,
             reward_weights=reward_weights,
             scenarios=scenarios,
+            predictor=predictor,
+            forecast=forecast,
         )
+        self.render_mode = render_mode
+        self._episodes = ReplayEpisodes(data, options, 1)
         self.metadata = {
             "name": "asp_env/ParallelReplay-v0",
             "render_modes": ["rgb_array"],
-            "render_fps": render_fps(dt_s),
+            "render_fps": render_fps(dt_s * action_repeat),
         }
-        self.render_mode = render_mode
-        self._episodes = ReplayEpisodes(data, options, 1)
         self.recordings = self._episodes.recordings
         selection = AgentSelection(classes=classes, ids=ids)
         self._selected = tuple(selection.mask(recording) for recording in self.recordings)
@@ -287,8 +321,17 @@ all |
         simulation.driver = JointPolicyDriver(simulation.driver)
         self.possible_agents = [f"vehicle_{row}" for row in range(self._max_agents)]
         self.agents: list[str] = []
+        self._pad_absent, self._flatten = pad_absent, flatten
         self._rows = {name: row for row, name in enumerate(self.possible_agents)}
-        space: spaces.Space[Any] = self._episodes.observer.space
+        self._in_episode: list[str] = []
+        """The agents of the episode: those that were present after `reset`."""
+        self._present: list[str] = []
+        space = self._episodes.space
+        if pad_absent:
+            mask = spaces.Box(0, 1, (1,), dtype=np.int8)
+            space = spaces.Dict([*self._episodes.space.items(), (PRESENT, mask)])
+        if flatten:
+            space = flatten_space(space)
         self.observation_spaces: dict[str, Any] = dict.fromkeys(self._rows, space)
         self.action_spaces: dict[str, spaces.Space[Any]] = {
             name: spaces.Box(-1.0, 1.0, (2,), dtype=np.float32) for name in self._rows
@@ -324,8 +367,9 @@ all |
         reset_mask = np.arange(self._max_agents) < len(views)
         padding = [scenario] * (self._max_agents - len(views))
         self._episodes.begin([*views, *padding], [rng] * self._max_agents, reset_mask)
-        self.possible_agents = list(self._rows)[: len(views)]
-        self.agents = self.possible_agents.copy()
+        self._in_episode = self.possible_agents[: len(views)]
+        self._present = self._in_episode.copy()
+        self.agents = (self.possible_agents if self._pad_absent else self._present).copy()
         return self._observe(), self._infos()
 
     def step(
@@ -337,33 +381,55 @@ all |
         dict[str, bool],
         dict[str, dict[str, Any]],
     ]:
-        """Steps by one tick with an action (2,) for each of `agents`, which is clipped to [-1, 1].
+        """Steps by one tick with an action (2,) for each present agent, clipped to [-1, 1].
+
+        Args:
+            actions: the actions by agent; those of absent agents are ignored. An empty dict after
+                the end of the episode changes nothing.
+
+        Returns:
+            Observations, rewards, terminations, truncations and infos of `agents`, and of those
+            that end in this tick; five empty dicts after the end of the episode.
 
         Raises:
-            gymnasium.error.ResetNeeded: the episode is over, or none has begun.
+            gymnasium.error.ResetNeeded: there are actions after the end of the episode, or none
+                has begun.
             AspEnvError: an agent's action is missing, has another shape or is not finite.
         """
-        if not self.agents:
-            raise gymnasium.error.ResetNeeded("no agent is left: call reset before step")
+        if not self._present:
+            if actions or not self._in_episode:
+                raise gymnasium.error.ResetNeeded("no agent is left: call reset before step")
+            return {}, {}, {}, {}, {}
         joint = np.zeros((self._max_agents, 2), dtype=np.float32)
-        for name in self.agents:
+        for name in self._present:
             if name not in actions:
-                raise AspEnvError(f"no action for {name}: expected one for each of env.agents")
+                raise AspEnvError(
+                    f"no action for {name}: expected one for each present agent, which are "
+                    f"{', '.join(self._present)}"
+                )
             joint[self._rows[name]] = valid_actions(actions[name], (2,))
         driver = self._episodes.simulation.driver
         assert isinstance(driver, JointPolicyDriver)
-        driver.actions = denormalize_actions(joint)
+        driver.actions = self._episodes.physical_actions(joint)
         result = self._episodes.step(joint)
         over = result.terminated | result.truncated
+        remaining = [name for name in self._present if not over[self._rows[name]]]
+        present = self._present_mask()
+        terminated, truncated = result.terminated, result.truncated
+        if self._pad_absent:
+            terminated = np.where(present, terminated, True) & (not remaining)
+            truncated = present & truncated & (not remaining)
         returned = (
             self._observe(),
-            self._by_agent(result.reward),
-            self._by_agent(result.terminated),
-            self._by_agent(result.truncated),
+            self._by_agent(np.where(present, result.reward, 0.0)),
+            self._by_agent(terminated),
+            self._by_agent(truncated),
             self._infos(),
         )
         self._episodes.simulation.world.episodes.departed |= driver.slots_of(over)
-        self.agents = [name for name in self.agents if not over[self._rows[name]]]
+        self._present = remaining
+        if not self._pad_absent or not remaining:
+            self.agents = remaining.copy()
         return returned
 
     def scene(self, agent: str) -> Scene:
@@ -371,25 +437,29 @@ all |
 
         Raises:
             gymnasium.error.ResetNeeded: no episode has begun.
-            AspEnvError: there is no such agent.
+            AspEnvError: there is no such agent, or the episode began without it.
         """
         if agent not in self.possible_agents:
             raise unknown_name("agent", agent, self.possible_agents)
-        world = self._episodes.simulation.world
-        if world.scenarios[0] is None:
+        if not self._in_episode:
             raise gymnasium.error.ResetNeeded("no episode has begun: call reset first")
-        return world.scene().situation(self._rows[agent])
+        if agent not in self._in_episode:
+            raise AspEnvError(
+                f"{agent} is absent from this episode: expected one of "
+                f"{', '.join(self._in_episode)}"
+            )
+        return self._episodes.scene().situation(self._rows[agent])
 
     def state(self) -> Float[np.ndarray, "agents 7"]:
         """Returns the states of all possible agents in the recording's frame.
 
         Returns:
-            [x m, y m, heading rad, speed m/s, length m, width m, 1] of each agent; zeros for those
-            that have left.
+            [x m, y m, heading rad, speed m/s, length m, width m, 1] of each agent; zeros for absent
+            ones.
         """
         world = self._episodes.simulation.world
         state = np.zeros(self.state_space.shape or (), dtype=np.float32)
-        rows = [self._rows[name] for name in self.agents]
+        rows = [self._rows[name] for name in self._present]
         state[rows, :4] = world.ego_states()[rows]
         state[rows, 4:6] = world.episodes.sizes[rows, 0]
         state[rows, 6] = 1.0
@@ -407,7 +477,7 @@ all |
         """Returns an image of the whole map, uint8 (H, W, 3) RGB, or None without a mode."""
         if self.render_mode is None:
             return None
-        scene = self.scene((self.agents or self.possible_agents)[0])
+        scene = self.scene((self._present or self._in_episode or self.possible_agents)[0])
         recording = self._episodes.simulation.world.episodes.recording[0]
         background = self.recordings[int(recording)].background
         return draw_frame(scene, extent_m=None, background=background)
@@ -434,18 +504,65 @@ all |
             )
         return scenarios.select(drivable), num_agents
 
+    def _present_mask(self) -> Bool[np.ndarray, " agents"]:
+        """Returns the mask of the present agents among the possible ones."""
+        present = np.zeros(self._max_agents, dtype=bool)
+        present[[self._rows[name] for name in self._present]] = True
+        return present
+
     def _observe(self) -> Observations:
-        rows = np.array([self._rows[name] for name in self.agents])
+        rows = np.flatnonzero(self._present_mask())
         observed = self._episodes.observe(rows)
+        if self._pad_absent:
+            observed[PRESENT] = np.ones((len(rows), 1), dtype=np.int8)
+            observed = {
+                name: _pad(values, rows, self._max_agents) for name, values in observed.items()
+            }
+        names = self.agents
+        if self._flatten:
+            flat = np.concatenate(
+                [values.reshape(len(names), -1) for values in observed.values()],
+                axis=1,
+                dtype=np.float32,
+            )
+            return dict(zip(names, flat, strict=True))
         return {
-            name: {key: value[row] for key, value in observed.items()}
-            for row, name in enumerate(self.agents)
+            agent: {name: values[row] for name, values in observed.items()}
+            for row, agent in enumerate(names)
         }
 
     def _infos(self) -> dict[str, dict[str, Any]]:
-        infos = self._episodes.info()
-        return {agent: info_of(infos, self._rows[agent]) for agent in self.agents}
+        rows = self._episodes.info()
+        infos = {agent: info_of(rows, self._rows[agent]) for agent in self.agents}
+        if self._pad_absent:
+            empty = _empty(infos[self._present[0]])
+            present = set(self._present)
+            infos = {
+                agent: (info if agent in present else copy.deepcopy(empty))
+                | {PRESENT: agent in present}
+                for agent, info in infos.items()
+            }
+        return infos
 
     def _by_agent(self, values: np.ndarray) -> dict[str, Any]:
         plain = values.tolist()
         return {name: plain[self._rows[name]] for name in self.agents}
+
+
+def _pad(values: np.ndarray, rows: Int[np.ndarray, " n"], count: int) -> np.ndarray:
+    """Returns `count` rows: the given values in their rows, and zeros in the others."""
+    padded = np.zeros((count, *values.shape[1:]), dtype=values.dtype)
+    padded[rows] = values
+    return padded
+
+
+def _empty(info: dict[str, Any]) -> dict[str, Any]:
+    """Returns an info with the same keys and types, and with zeros and empty values."""
+    return {
+        name: _empty(value)
+        if isinstance(value, dict)
+        else np.zeros_like(value)
+        if isinstance(value, np.ndarray)
+        else type(value)()
+        for name, value in info.items()
+    }

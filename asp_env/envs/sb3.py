@@ -74,7 +74,7 @@ class ReplayVecEnv(VecEnv):
         for info, limit in zip(infos, limits, strict=True):
             info["TimeLimit.truncated"] = limit
         for b in np.flatnonzero(over).tolist():
-            infos[b]["episode"] = {"r": infos[b]["episode_return"], "l": infos[b]["tick"]}
+            infos[b]["episode"] = {"r": infos[b]["episode_return"], "l": infos[b]["episode_length"]}
         return observations, rewards.astype(np.float32), over, infos
 
     def _restart(self, observations: Observations, over: np.ndarray, infos: Infos) -> Observations:

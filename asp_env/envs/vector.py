@@ -11,19 +11,22 @@ from gymnasium.vector import AutoresetMode, VectorEnv
 from gymnasium.vector.utils import batch_space
 from jaxtyping import Bool, Shaped
 
+from asp_env.data.predictor import Predictor
 from asp_env.data.recording import DEFAULT_DT_S
 from asp_env.data.scenarios.scenario import ScenarioFilter, ScenarioSet
 from asp_env.data.scene import Scene
 from asp_env.data.snippets import Future
 from asp_env.data.source import Recordings
 from asp_env.envs.episodes import ObservationBuffers, ReplayEpisodes, StepResult, valid_actions
+from asp_env.envs.forecasts import ForecastSpec, PredictorSpec
 from asp_env.envs.options import ReplayOptions, suggest_options
+from asp_env.envs.shared_in_spec import SharedInSpec
 from asp_env.errors import AspEnvError
 from asp_env.render.frames import draw_frame
 from asp_env.render.live import render_fps
+from asp_env.sim.action_types import ActionType
 from asp_env.sim.observation import Observation
 from asp_env.sim.traffic.assignment import TrafficSpec
-from asp_env.sim.world import recorded_future
 
 Infos = dict[str, Any]
 
@@ -39,7 +42,7 @@ class VectorSnapshot:
     over: Bool[np.ndarray, " n"]
 
 
-class ReplayVectorEnv(VectorEnv[Observation, Any, np.ndarray]):
+class ReplayVectorEnv(SharedInSpec, VectorEnv[Observation, Any, np.ndarray]):
     """`asp_env/Replay-v0` as a vector environment: one world of arrays for all episodes.
 
     ## Description
@@ -96,8 +99,12 @@ class ReplayVectorEnv(VectorEnv[Observation, Any, np.ndarray]):
         raster_px: tuple[int, int] | None = None,
         traffic: TrafficSpec | None = None,
         dt_s: float = DEFAULT_DT_S,
+        action_type: ActionType = "direct",
+        action_repeat: int = 1,
         reward_weights: Mapping[str, float] | None = None,
         scenarios: ScenarioSet | ScenarioFilter | str = "",
+        predictor: PredictorSpec | None = None,
+        forecast: ForecastSpec | None = None,
     ) -> None:
         """Makes the environment; the arguments are those of the class documentation.
 
@@ -114,19 +121,23 @@ class ReplayVectorEnv(VectorEnv[Observation, Any, np.ndarray]):
             raster_px=raster_px,
             traffic=traffic,
             dt_s=dt_s,
+            action_type=action_type,
+            action_repeat=action_repeat,
             reward_weights=reward_weights,
             scenarios=scenarios,
+            predictor=predictor,
+            forecast=forecast,
         )
         self.num_envs = num_envs
         self.autoreset_mode = _parse_autoreset_mode(autoreset_mode)
-        self.metadata = {
-            "render_modes": ["rgb_array"],
-            "render_fps": render_fps(dt_s),
-            "autoreset_mode": self.autoreset_mode,
-        }
         self.render_mode = render_mode
         self._episodes = ReplayEpisodes(data, options, num_envs)
-        self.single_observation_space = self._episodes.observer.space
+        self.metadata = {
+            "render_modes": ["rgb_array"],
+            "render_fps": render_fps(dt_s * action_repeat),
+            "autoreset_mode": self.autoreset_mode,
+        }
+        self.single_observation_space = self._episodes.space
         self.single_action_space = self._episodes.action_space
         self.observation_space = batch_space(self.single_observation_space, num_envs)
         self.action_space = batch_space(self.single_action_space, num_envs)
@@ -217,7 +228,7 @@ class ReplayVectorEnv(VectorEnv[Observation, Any, np.ndarray]):
             gymnasium.error.ResetNeeded: an episode has not begun.
         """
         self._check_begun()
-        return self._episodes.simulation.world.scene()
+        return self._episodes.scene()
 
     def recorded_future(self, scene: Scene, horizon: int) -> Future:
         """Returns the recorded future of a scene's targets, for privileged predictors.
@@ -230,7 +241,7 @@ class ReplayVectorEnv(VectorEnv[Observation, Any, np.ndarray]):
             gymnasium.error.ResetNeeded: an episode has not begun.
         """
         self._check_begun()
-        return recorded_future(self._episodes.simulation.world, scene, horizon)
+        return self._episodes.recorded_future(scene, horizon)
 
     def render(self) -> tuple[Any, ...] | None:
         """Returns the image of each environment, see `ReplayEnv.render`; None without a mode.
@@ -270,6 +281,11 @@ class ReplayVectorEnv(VectorEnv[Observation, Any, np.ndarray]):
         self._over = snapshot.over.copy()
 
     @property
+    def episodes(self) -> ReplayEpisodes:
+        """The episodes, for wrappers."""
+        return self._episodes
+
+    @property
     def dt_s(self) -> float:
         """Length of a tick in seconds."""
         return self._episodes.simulation.world.dt_s
@@ -280,9 +296,18 @@ class ReplayVectorEnv(VectorEnv[Observation, Any, np.ndarray]):
         return self._episodes.recordings
 
     @property
+    def predictors(self) -> tuple[Predictor, ...]:
+        """The predictors whose forecasts are part of the observation."""
+        return self._episodes.predictors
+
+    @property
     def scenarios(self) -> ScenarioSet:
-        """The scenarios to draw from."""
+        """The scenarios to draw from; others of the same data can be set, for a curriculum."""
         return self._episodes.scenarios
+
+    @scenarios.setter
+    def scenarios(self, scenarios: ScenarioSet) -> None:
+        self._episodes.draw_from(scenarios)
 
     @property
     def np_random(self) -> tuple[np.random.Generator, ...]:  # pyright: ignore[reportIncompatibleMethodOverride]

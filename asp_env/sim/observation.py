@@ -8,7 +8,7 @@ Every value is finite and within the bounds of its space; values beyond the boun
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any, Protocol, final, no_type_check, runtime_checkable
+from typing import Protocol, final, no_type_check, runtime_checkable
 
 import numpy as np
 from gymnasium import spaces

@@ -17,11 +17,12 @@ import asp_env.envs
 from asp_env.envs import ReplayOptions, UnknownOptionError
 from asp_env.envs.parallel import ParallelReplayEnv
 
+PARALLEL = ["data", "classes", "ids", "max_agents", "pad_absent", "flatten", "render_mode"]
 CONSTRUCTORS = {
     asp_env.ReplayEnv: ["data", "render_mode"],
     asp_env.ReplayVectorEnv: ["num_envs", "data", "autoreset_mode", "render_mode"],
-    ParallelReplayEnv: ["data", "classes", "ids", "max_agents", "render_mode"],
-    asp_env.parallel_env: ["data", "classes", "ids", "max_agents", "render_mode"],
+    ParallelReplayEnv: PARALLEL,
+    asp_env.parallel_env: PARALLEL,
     asp_env.sb3_vec_env: ["num_envs", "data", "render_mode"],
 }
 """The parameters before those of `ReplayOptions`."""

@@ -10,6 +10,7 @@ from typing import Any
 import gymnasium
 import numpy as np
 import pytest
+from gymnasium.spaces import flatten, flatten_space
 
 import asp_env
 from asp_env.data.classes import AgentClass
@@ -22,7 +23,8 @@ from tests.real_data import real_data
 
 with warnings.catch_warnings():  # PettingZoo's tests import its games in a deprecated way
     warnings.simplefilter("ignore")
-    from pettingzoo.test import parallel_api_test, parallel_seed_test
+    from pettingzoo.test import api_test, parallel_api_test, parallel_seed_test
+    from pettingzoo.utils import parallel_to_aec
 
 COMPONENTS = ("raster", "vectors", "actions", "state", "route")
 
@@ -52,17 +54,145 @@ def queue(tmp_path_factory: pytest.TempPathFactory) -> str:
     return str(write_crossing(folder, drives=(drives,)))
 
 
+FEWER_AGENTS = pytest.mark.filterwarnings("ignore:No agents present but not all possible_agents")
+"""PettingZoo's test warns of episodes that do not have all possible agents, which its interface
+allows; with `pad_absent` there are none."""
+
+
+@FEWER_AGENTS
 @pytest.mark.parametrize(
     "options",
     [{"observations": COMPONENTS}, {"traffic": "idm", "classes": ("car", "van"), "max_agents": 3}],
     ids=("log", "idm"),
 )
-def test_pettingzoo_tests_pass_without_warnings(crossing, options):
-    """To the end of episodes, which last at most 75 ticks; warnings are errors."""
+def test_pettingzoo_tests_pass(crossing, options):
+    """To the end of episodes, which last at most 75 ticks; other warnings are errors."""
     parallel_api_test(_make(crossing, **options), num_cycles=80)
     parallel_seed_test(lambda: _make(crossing, **options), num_cycles=5)
 
 
+@pytest.mark.parametrize("options", [{}, {"flatten": True}], ids=("dict", "flat"))
+def test_pettingzoo_tests_pass_without_warnings_with_padding(crossing, options):
+    parallel_api_test(_make(crossing, pad_absent=True, **options), num_cycles=80)
+    parallel_seed_test(lambda: _make(crossing, pad_absent=True, **options), num_cycles=5)
+
+
+@FEWER_AGENTS
+@pytest.mark.filterwarnings("ignore:Observation numpy array is all zeros")
+@pytest.mark.parametrize("pad_absent", [False, True])
+def test_the_conversion_to_agents_in_turn_passes(crossing, pad_absent):
+    """PettingZoo's `parallel_to_aec` and its own test of the result."""
+    env = parallel_to_aec(_make(crossing, pad_absent=pad_absent, flatten=True))
+    api_test(env, num_cycles=100)
+
+
+def test_possible_agents_never_change(crossing):
+    """Over all scenarios, whose numbers of agents differ; those present come first."""
+    env, padded = _make(crossing), _make(crossing, pad_absent=True)
+    possible = list(env.possible_agents)
+    counts = set()
+    for scenario in range(len(env.scenarios)):
+        env.reset(options={"scenario": scenario})
+        padded.reset(options={"scenario": scenario})
+        assert env.possible_agents == padded.possible_agents == padded.agents == possible
+        assert env.agents == possible[: len(env.agents)]
+        counts.add(len(env.agents))
+    assert len(counts) > 1
+    assert max(counts) <= len(possible)
+
+
+def test_a_step_without_actions_after_the_end_returns_five_empty_dicts(queue):
+    """Any number of times; actions after the end are an error."""
+    for pad_absent in (False, True):
+        env = _make(queue, pad_absent=pad_absent)
+        env.reset(seed=0)
+        while env.agents:
+            env.step(_zero_actions(env))
+        assert env.step({}) == env.step({}) == ({}, {}, {}, {}, {})
+        with pytest.raises(gymnasium.error.ResetNeeded):
+            env.step({"vehicle_0": np.zeros(2)})
+        env.reset()
+        assert env.agents
+
+
+def test_absent_agents_are_padded(queue):
+    """A collides with B at its own fault at tick 17, its last tick; B alone lasts to the end.
+
+    From tick 18 on, A's observation is zero with the mask 0, and its reward is 0. It stays in
+    `agents` and is terminated in the tick in which B ends.
+    """
+    env, plain = _make(queue, pad_absent=True), _make(queue)
+    one, _ = env.reset(options={"scenario": 0})
+    other, _ = plain.reset(options={"scenario": 0})
+    assert list(one["vehicle_0"]) == [*other["vehicle_0"], "present"]
+    tick = 0
+    while plain.agents:
+        tick += 1
+        padded, unpadded = env.step(_zero_actions(env)), plain.step(_zero_actions(plain))
+        _check_padding(padded, unpadded)
+        _, rewards, terminated, truncated, infos = padded
+        assert infos["vehicle_0"]["present"] is (tick <= 17)
+        assert infos["vehicle_1"]["present"] is True
+        assert (rewards["vehicle_0"] != 0.0) is (tick <= 17)
+        assert (infos["vehicle_0"]["ending"] == "COLLISION") is (tick == 17)
+        assert set(infos["vehicle_0"]) == set(infos["vehicle_1"])
+        assert env.agents == (["vehicle_0", "vehicle_1"] if plain.agents else [])
+        over = not plain.agents
+        assert terminated["vehicle_0"] is over
+        assert truncated["vehicle_0"] is False
+        assert (terminated["vehicle_1"] or truncated["vehicle_1"]) is over
+    assert tick > 17
+
+
+def _check_padding(padded: Any, unpadded: Any) -> None:
+    """Present agents have the same values, absent ones zeros."""
+    for agent, seen in padded[0].items():
+        present = agent in unpadded[0]
+        assert seen["present"].tolist() == [int(present)]
+        for name, value in seen.items():
+            if present and name != "present":
+                same(value, unpadded[0][agent][name])
+            elif not present:
+                assert not value.any()
+        assert padded[1][agent] == unpadded[1].get(agent, 0.0)
+
+
+def test_agents_that_the_scenario_lacks_are_absent_from_the_start(crossing):
+    """Within their space; their actions are ignored, and they have no scene."""
+    env = _make(crossing, pad_absent=True)
+    lacking = 0
+    for scenario in range(len(env.scenarios)):
+        seen, infos = env.reset(options={"scenario": scenario})
+        for agent in env.possible_agents:
+            assert seen[agent] in env.observation_space(agent)
+            assert infos[agent]["present"] == bool(seen[agent]["present"][0])
+        absent = [agent for agent in env.agents if not infos[agent]["present"]]
+        lacking += len(absent)
+        if absent:
+            env.step({agent: np.zeros(2) for agent in env.agents if agent not in absent})
+            assert not env.state()[[int(agent.split("_")[1]) for agent in absent]].any()
+            with pytest.raises(asp_env.AspEnvError, match="is absent from this episode: expected"):
+                env.scene(absent[-1])
+    assert lacking > 0
+
+
+@pytest.mark.parametrize("pad_absent", [False, True])
+def test_flat_observations_are_those_of_gymnasium(crossing, pad_absent):
+    """`gymnasium.spaces.flatten` of the Dict observation, bit for bit, and of its space."""
+    options = {"observations": ("vectors", "state", "route"), "pad_absent": pad_absent}
+    one, other = _make(crossing, **options), _make(crossing, flatten=True, **options)
+    space = one.observation_space("vehicle_0")
+    assert other.observation_space("vehicle_0") == flatten_space(space)
+    seen, flat = one.reset(seed=1)[0], other.reset(seed=1)[0]
+    for _ in range(10):
+        assert list(seen) == list(flat)
+        for agent in seen:
+            same(flatten(space, seen[agent]), flat[agent])
+            assert flat[agent] in other.observation_space(agent)
+        seen, flat = one.step(_zero_actions(one))[0], other.step(_zero_actions(other))[0]
+
+
+@FEWER_AGENTS
 @pytest.mark.data
 def test_pettingzoo_test_passes_on_real_traffic():
     """Karlsruhe, with waiting, crossing and parked agents."""
