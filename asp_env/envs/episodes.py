@@ -23,7 +23,7 @@ from asp_env.data.scene import EGO, Scene, infer_actions
 from asp_env.data.snippets import HISTORY_S, Future
 from asp_env.data.source import Recordings, open_data
 from asp_env.envs.forecasts import Present, extended_space, forecast_observers
-from asp_env.envs.options import ReplayOptions
+from asp_env.envs.options import ReplayOptions, raster_size
 from asp_env.errors import AspEnvError, unknown_name
 from asp_env.sim.action_types import (
     check_action_type,
@@ -194,7 +194,7 @@ class ReplayEpisodes:
             self.recordings, options.scenarios, dt_s=options.dt_s, history=history
         )
         self.scenarios = self._sampler.scenarios
-        raster = make_raster_view(options.view, pixels=options.raster_px)
+        raster = make_raster_view(options.view, pixels=raster_size(options.raster_px))
         self.observer = Observer(options.observations, raster, history)
         kind = world_class(data)
         self.simulation = Simulation(
@@ -435,6 +435,11 @@ class ReplayEpisodes:
             rows: numbers of the episodes that are its situations; all by default.
         """
         return recorded_future(self.simulation.world, scene, horizon, rows)
+
+    @property
+    def num_steps(self) -> Int[np.ndarray, " b"]:
+        """Number of steps since the start of each episode."""
+        return self._num_steps
 
     def info(self) -> dict[str, Any]:
         """Returns the present infos in new arrays; keys, shapes and types never change.

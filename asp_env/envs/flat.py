@@ -1,4 +1,4 @@
-"""Observations as vectors: each entry of its own, or all of them in one."""
+"""Observations as vectors: each entry a vector, or all entries in one."""
 
 from collections.abc import Mapping
 from typing import Any, Literal
@@ -10,8 +10,11 @@ from jaxtyping import Shaped
 from asp_env.errors import AspEnvError
 
 Flatten = bool | Literal["parts"]
-"""`False`: the entries have their own shapes. `"parts"`: each entry is a vector, images stay images.
-`True`: the observation is one float32 vector of all entries, in their order."""
+"""How observations are flattened.
+
+`False`: entries have their own shapes. `"parts"`: entries are vectors, images stay images. `True`:
+the observation is one vector of all entries, in their order.
+"""
 
 
 def flat_space(space: spaces.Dict, flatten: Flatten) -> spaces.Space[Any]:
@@ -19,27 +22,16 @@ def flat_space(space: spaces.Dict, flatten: Flatten) -> spaces.Space[Any]:
 
     Args:
         space: a Dict of boxes.
-        flatten: how observations are flattened, see `Flatten`.
+        flatten: how observations are flattened.
 
     Raises:
-        AspEnvError: `flatten` is another value, or one vector would hold an image.
+        AspEnvError: `flatten` has another value.
     """
     if flatten not in (False, True, "parts"):
         raise AspEnvError(f"flatten {flatten!r}: expected False, True or 'parts'")
     if flatten == "parts":
         return spaces.Dict([(name, _flat_box(box)) for name, box in space.items()])
-    if not flatten:
-        return space
-    if images := [name for name, box in space.items() if _is_image(box)]:
-        raise AspEnvError(
-            f"flatten=True with {images[0]!r}, which is an image: use flatten='parts', or "
-            "observations without a raster, such as ('state', 'route', 'nearest')"
-        )
-    low, high = (
-        np.concatenate([np.ravel(getattr(box, bound)) for box in space.values()])
-        for bound in ("low", "high")
-    )
-    return spaces.Box(low.astype(np.float32), high.astype(np.float32), dtype=np.float32)
+    return spaces.flatten_space(space) if flatten else space
 
 
 def flatten_observations(
@@ -49,31 +41,44 @@ def flatten_observations(
 
     Args:
         observations: the entries by name, each with B as its first axis.
-        flatten: how they are flattened, see `Flatten`.
+        flatten: how they are flattened.
 
     Returns:
-        Views of the entries by name; with `flatten=True` a new float32 array (B, numbers).
+        The entries by name, or views of them; with `flatten=True` a new array (B, numbers), which
+        `gymnasium.spaces.flatten` would return for each observation.
     """
     if not flatten:
-        return dict(observations)
+        return observations
     if flatten == "parts":
         return {
-            name: value if _is_image_array(value) else value.reshape(len(value), -1)
+            name: value if _is_image(value.shape[1:], value.dtype) else _rows(value)
             for name, value in observations.items()
         }
-    rows = [value.reshape(len(value), -1) for value in observations.values()]
-    return np.concatenate(rows, axis=1, dtype=np.float32)
+    return np.concatenate([_rows(value) for value in observations.values()], axis=1)
 
 
-def _is_image(box: Any) -> bool:
-    return len(box.shape) == 3 and box.dtype == np.uint8
+def observation_of(observations: Any, b: int) -> Any:
+    """Returns a copy of one of B observations: of a Dict, or of one array.
+
+    Args:
+        observations: the entries by name with B as their first axis, or an array (B, numbers).
+        b: number of the observation.
+    """
+    if isinstance(observations, np.ndarray):
+        return observations[b].copy()
+    return {name: value[b].copy() for name, value in observations.items()}
 
 
-def _is_image_array(value: Shaped[np.ndarray, "b ..."]) -> bool:
-    return value.ndim == 4 and value.dtype == np.uint8
+def _rows(value: Shaped[np.ndarray, "b ..."]) -> Shaped[np.ndarray, "b n"]:
+    return value.reshape(len(value), -1)
+
+
+def _is_image(shape: tuple[int, ...], dtype: np.dtype | None) -> bool:
+    return len(shape) == 3 and dtype == np.uint8
 
 
 def _flat_box(box: spaces.Space[Any]) -> spaces.Space[Any]:
-    if not isinstance(box, spaces.Box) or len(box.shape) < 2 or _is_image(box):
+    is_table = isinstance(box, spaces.Box) and len(box.shape) > 1
+    if not is_table or _is_image(box.shape, box.dtype):
         return box
     return spaces.Box(np.ravel(box.low), np.ravel(box.high), dtype=box.low.dtype.type)

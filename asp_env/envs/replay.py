@@ -16,7 +16,9 @@ from asp_env.data.scene import Scene
 from asp_env.data.snippets import Future
 from asp_env.data.source import Recordings
 from asp_env.envs.episodes import ReplayEpisodes, StepResult, info_of, valid_actions
+from asp_env.envs.flat import Flatten, flat_space, flatten_observations
 from asp_env.envs.forecasts import ForecastSpec, PredictorSpec
+from asp_env.envs.hints import hint_at_large_observations
 from asp_env.envs.options import ReplayOptions, suggest_options
 from asp_env.envs.shared_in_spec import SharedInSpec
 from asp_env.render.live import MODES, LiveRenderer, render_fps
@@ -53,7 +55,7 @@ class EnvSnapshot:
         return partial(EnvSnapshot, **{name: getattr(self, name) for name in names}), ()
 
 
-class ReplayEnv(SharedInSpec, gymnasium.Env[dict[str, Any], Any]):
+class ReplayEnv(SharedInSpec, gymnasium.Env[Any, Any]):
     """Controls one vehicle of a recording, the ego, among replayed or reacting traffic.
 
     ## Description
@@ -201,10 +203,11 @@ name; several in a mapping with their prefixes |
         self,
         data: str = "sample:intersection",
         *,
+        flatten: Flatten = False,
         render_mode: str | None = None,
         observations: Sequence[str] = ("raster", "actions", "state"),
         view: str = "chauffeurnet",
-        raster_px: tuple[int, int] | None = None,
+        raster_px: int | Sequence[int] | None = None,
         traffic: TrafficSpec | None = None,
         dt_s: float = DEFAULT_DT_S,
         action_type: ActionType = "direct",
@@ -235,7 +238,9 @@ name; several in a mapping with their prefixes |
         )
         self.render_mode = render_mode
         self._episodes = ReplayEpisodes(data, options, 1)
-        self.observation_space = self._episodes.space
+        self.observation_space = flat_space(self._episodes.space, flatten)
+        self._flatten: Flatten = flatten
+        hint_at_large_observations(self._episodes.space, is_vector=False)
         self.action_space = self._episodes.action_space
         self._running = False
         self._start: tuple[Scenario, Mapping[str, Any]] | None = None
@@ -246,7 +251,7 @@ name; several in a mapping with their prefixes |
 
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
-    ) -> tuple[dict[str, Any], dict[str, Any]]:
+    ) -> tuple[Any, dict[str, Any]]:
         """Starts an episode.
 
         Args:
@@ -264,7 +269,7 @@ name; several in a mapping with their prefixes |
         self._update_window()
         return self._observe(), self._info()
 
-    def step(self, action: Any) -> tuple[dict[str, Any], float, bool, bool, dict[str, Any]]:
+    def step(self, action: Any) -> tuple[Any, float, bool, bool, dict[str, Any]]:
         """Steps by one tick with an action (2,), which is clipped to [-1, 1].
 
         Raises:
@@ -408,8 +413,9 @@ name; several in a mapping with their prefixes |
         self._actions.append(action)
         return self._episodes.step(action[None])
 
-    def _observe(self) -> dict[str, Any]:
-        return {name: value[0] for name, value in self._episodes.observe().items()}
+    def _observe(self) -> Any:
+        seen = flatten_observations(self._episodes.observe(), self._flatten)
+        return seen[0] if self._flatten is True else {name: each[0] for name, each in seen.items()}
 
     def _info(self) -> dict[str, Any]:
         return info_of(self._episodes.info(), 0)

@@ -11,10 +11,12 @@ from stable_baselines3.common.vec_env import VecEnv
 from stable_baselines3.common.vec_env.base_vec_env import VecEnvIndices, VecEnvStepReturn
 
 from asp_env.data.scene import Scene
+from asp_env.envs.flat import observation_of
 from asp_env.errors import AspEnvError
 
 Infos = list[dict[str, Any]]
-Observations = dict[str, np.ndarray]
+Observations = Any
+"""A dict of arrays, or one array."""
 
 _PER_ENVIRONMENT = ("np_random", "np_random_seed")
 _SINGLE = ("observation_space", "action_space")
@@ -86,8 +88,7 @@ class ReplayVecEnv(VecEnv):
                 self.reset_infos[b], infos[b] = infos[b], ended | {"terminal_observation": last}
             return observations
         for b in rows:
-            last = {name: value[b].copy() for name, value in observations.items()}
-            infos[b]["terminal_observation"] = last
+            infos[b]["terminal_observation"] = observation_of(observations, b)
         observations, batched = self.envs.reset(options={"reset_mask": over})
         reset_infos = _unbatch_infos(batched, self.num_envs)
         for b in rows:
