@@ -19,6 +19,7 @@ from asp_env.envs.episodes import ReplayEpisodes, StepResult, info_of, valid_act
 from asp_env.envs.flat import Flatten, flat_space, flatten_observations
 from asp_env.envs.forecasts import ForecastSpec, PredictorSpec
 from asp_env.envs.hints import hint_at_large_observations
+from asp_env.envs.keyboard import keyboard_actions
 from asp_env.envs.options import ReplayOptions, suggest_options
 from asp_env.envs.shared_in_spec import SharedInSpec
 from asp_env.render.live import MODES, LiveRenderer, render_fps
@@ -375,6 +376,14 @@ name; several in a mapping with their prefixes |
         if self.render_mode is None:
             return None
         return self._live.render(self.scene(), self._background())
+
+    def get_keys_to_action(self) -> dict[str | tuple[str | int, ...], Float[np.ndarray, " 2"]]:
+        """Returns the actions of keys for `gymnasium.utils.play.play`.
+
+        W or up accelerates by 2 m/s², S or down brakes by 4 m/s², and A, D, left and right steer by
+        9°. The empty text stands for no key.
+        """
+        return keyboard_actions()
 
     def close(self) -> None:
         """Closes the window."""

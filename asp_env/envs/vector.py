@@ -400,7 +400,7 @@ def _options_of(options: dict[str, Any], b: int, num_envs: int) -> dict[str, Any
     """Returns the reset options of environment `b`; a list holds one value for each."""
     chosen: dict[str, Any] = {}
     for name, value in options.items():
-        if not isinstance(value, list | tuple | np.ndarray):
+        if isinstance(value, str) or not isinstance(value, Sequence | np.ndarray):
             chosen[name] = value
         elif len(value) == num_envs:
             chosen[name] = value[b]
