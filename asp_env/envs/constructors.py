@@ -5,6 +5,7 @@ from typing import TYPE_CHECKING
 
 from asp_env.data.recording import DEFAULT_DT_S
 from asp_env.data.scenarios.scenario import ScenarioFilter, ScenarioSet
+from asp_env.envs.flat import Flatten
 from asp_env.envs.forecasts import ForecastSpec, PredictorSpec
 from asp_env.envs.options import suggest_options
 from asp_env.envs.vector import ReplayVectorEnv
@@ -29,7 +30,7 @@ def parallel_env(
     render_mode: str | None = None,
     observations: Sequence[str] = ("raster", "actions", "state"),
     view: str = "chauffeurnet",
-    raster_px: tuple[int, int] | None = None,
+    raster_px: int | Sequence[int] | None = None,
     traffic: TrafficSpec | None = None,
     dt_s: float = DEFAULT_DT_S,
     action_type: str = "direct",
@@ -53,7 +54,7 @@ def parallel_env(
         render_mode: `rgb_array` or None.
         observations: see `ReplayEnv`, as for the following arguments.
         view: the view that draws the `raster`.
-        raster_px: height and width of the `raster` in pixels.
+        raster_px: height and width of the `raster` in pixels, or one number for both.
         traffic: the driver of the uncontrolled agents, or a table of drivers.
         dt_s: length of a tick in seconds.
         action_type: what actions mean: `direct`, `jerk` or `route`.
@@ -100,10 +101,12 @@ def sb3_vec_env(
     num_envs: int,
     data: str = "sample:intersection",
     *,
+    max_episode_steps: int | None = None,
+    flatten: Flatten = False,
     render_mode: str | None = None,
     observations: Sequence[str] = ("raster", "actions", "state"),
     view: str = "chauffeurnet",
-    raster_px: tuple[int, int] | None = None,
+    raster_px: int | Sequence[int] | None = None,
     traffic: TrafficSpec | None = None,
     dt_s: float = DEFAULT_DT_S,
     action_type: str = "direct",
@@ -118,10 +121,12 @@ def sb3_vec_env(
     Args:
         num_envs: number of environments.
         data: a folder with recordings, or `scheme:argument`.
+        max_episode_steps: number of steps after which episodes are truncated.
+        flatten: `True`: the observation is one vector; `"parts"`: each entry is a vector.
         render_mode: `rgb_array` or None.
         observations: see `ReplayEnv`, as for the following arguments.
         view: the view that draws the `raster`.
-        raster_px: height and width of the `raster` in pixels.
+        raster_px: height and width of the `raster` in pixels, or one number for both.
         traffic: the driver of the uncontrolled agents, or a table of drivers.
         dt_s: length of a tick in seconds.
         action_type: what actions mean: `direct`, `jerk` or `route`.
@@ -144,6 +149,8 @@ def sb3_vec_env(
         num_envs,
         data,
         autoreset_mode="SameStep",
+        max_episode_steps=max_episode_steps,
+        flatten=flatten,
         render_mode=render_mode,
         observations=observations,
         view=view,

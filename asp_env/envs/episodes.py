@@ -12,17 +12,18 @@ from typing import Any
 
 import numpy as np
 from gymnasium import spaces
-from jaxtyping import Bool, Float, Int, Shaped
+from jaxtyping import Bool, Float, Int
 
 from asp_env.data.predictor import Predictor
 from asp_env.data.recording import ticks
 from asp_env.data.scenarios.scenario import Scenario, ScenarioFilter, ScenarioSet
 from asp_env.data.scenarios.selection import choose_scenarios, scenario_of
+from asp_env.data.scenarios.tags import TAGS
 from asp_env.data.scene import EGO, Scene, infer_actions
 from asp_env.data.snippets import HISTORY_S, Future
 from asp_env.data.source import Recordings, open_data
 from asp_env.envs.forecasts import Present, extended_space, forecast_observers
-from asp_env.envs.options import ReplayOptions
+from asp_env.envs.options import ReplayOptions, raster_size
 from asp_env.errors import AspEnvError, unknown_name
 from asp_env.sim.action_types import (
     check_action_type,
@@ -32,7 +33,7 @@ from asp_env.sim.action_types import (
 )
 from asp_env.sim.log_following import logged_actions
 from asp_env.sim.observation import Observation, Observer, ego_context
-from asp_env.sim.reward import reward_terms, weighted_sum, weights_from
+from asp_env.sim.reward import REWARD_TERMS, reward_terms, weighted_sum, weights_from
 from asp_env.sim.simulation import Simulation, ending
 from asp_env.sim.traffic.assignment import make_traffic
 from asp_env.sim.world import Ending, Events, recorded_future, world_class
@@ -167,15 +168,11 @@ def _whole_number(name: str, value: Any) -> int:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class StepResult:
-    """Rewards and endings of one step of B episodes."""
+    """Rewards and ends of one step of B episodes; `ReplayEpisodes.info` has the details."""
 
     reward: Float[np.ndarray, " b"]
-    terms: dict[str, Float[np.ndarray, " b"]]
-    """The terms of the reward by name, unweighted."""
     terminated: Bool[np.ndarray, " b"]
     truncated: Bool[np.ndarray, " b"]
-    ending: Shaped[np.ndarray, " b"]
-    """Name of the `Ending` of each episode."""
 
 
 class ReplayEpisodes:
@@ -198,7 +195,7 @@ class ReplayEpisodes:
             self.recordings, options.scenarios, dt_s=options.dt_s, history=history
         )
         self.scenarios = self._sampler.scenarios
-        raster = make_raster_view(options.view, pixels=options.raster_px)
+        raster = make_raster_view(options.view, pixels=raster_size(options.raster_px))
         self.observer = Observer(options.observations, raster, history)
         kind = world_class(data)
         self.simulation = Simulation(
@@ -223,7 +220,20 @@ class ReplayEpisodes:
         """Number of episodes begun or restored so far."""
         self._allocate(num_episodes)
         self.action_space = spaces.Box(-1.0, 1.0, (2,), dtype=np.float32)
+
+    def _allocate(self, num_episodes: int) -> None:
+        """Describes episodes that have not begun."""
         self.events: Events | None = None
+        self._names = np.full(num_episodes, None, dtype=object)
+        self._tags = np.zeros((num_episodes, len(TAGS)), dtype=bool)
+        self._return = np.zeros(num_episodes)
+        """Sum of the rewards since the start of each episode."""
+        self._num_steps = np.zeros(num_episodes, dtype=np.int64)
+        self._seeds = np.zeros(num_episodes, dtype=np.uint64)
+        self._serials = np.full(num_episodes, -1)
+        self._rows = np.arange(num_episodes)
+        self._terms = {name: np.zeros(num_episodes) for name in REWARD_TERMS}
+        """The unweighted terms of the reward of each episode's last step; zeros at its start."""
 
     def restrict(self, scenarios: ScenarioSet, num_episodes: int) -> None:
         """Replaces the scenarios to draw from and the number of episodes, and ends all episodes."""
@@ -238,14 +248,6 @@ class ReplayEpisodes:
             world_class=type(world),
         )
         self._allocate(num_episodes)
-        self.events = None
-
-    def _allocate(self, num_episodes: int) -> None:
-        self._names = np.full(num_episodes, None, dtype=object)
-        self._tags = np.full(num_episodes, None, dtype=object)
-        self._seeds = np.zeros(num_episodes, dtype=np.uint64)
-        self._serials = np.full(num_episodes, -1)
-        self._rows = np.arange(num_episodes)
 
     def draw_from(self, scenarios: ScenarioSet) -> None:
         """Replaces the scenarios to draw from; episodes under way go on."""
@@ -280,10 +282,16 @@ class ReplayEpisodes:
         """Starts the episodes of a mask; the other entries of the sequences are ignored."""
         self.simulation.reset(scenarios, rngs, reset_mask)
         for b in np.flatnonzero(reset_mask).tolist():
-            self._names[b], self._tags[b] = scenarios[b].name, scenarios[b].tags
+            self._describe(b, scenarios[b])
             self._seeds[b] = _seed_from(rngs[b])
+        self._return[reset_mask], self._num_steps[reset_mask] = 0.0, 0
+        self._terms = {name: np.where(reset_mask, 0.0, term) for name, term in self._terms.items()}
         self._number(np.flatnonzero(reset_mask))
         self.events = self.simulation.world.events()
+
+    def _describe(self, b: int, scenario: Scenario | None) -> None:
+        self._names[b] = None if scenario is None else scenario.name
+        self._tags[b] = [scenario is not None and tag in scenario.tags for tag in TAGS]
 
     def step(self, actions: Float[np.ndarray, "b 2"]) -> StepResult:
         """Steps all episodes by `action_repeat` ticks, or up to the tick at which they end.
@@ -302,12 +310,14 @@ class ReplayEpisodes:
             terms = {name: terms[name] + value * running for name, value in more.items()}
             self.events = after = _merge_events(later, after, running)
             endings = np.where(running, ending(later), endings)
+        reward = weighted_sum(terms, self._weights)
+        self._return += reward
+        self._num_steps += 1
+        self._terms = {name: value.astype(np.float64) for name, value in terms.items()}
         return StepResult(
-            reward=weighted_sum(terms, self._weights),
-            terms=terms,
+            reward=reward,
             terminated=_IS_TERMINAL[endings],
             truncated=endings == Ending.OUT_OF_DATA,
-            ending=_ENDING_NAMES[endings],
         )
 
     def _tick(
@@ -427,10 +437,22 @@ class ReplayEpisodes:
         """
         return recorded_future(self.simulation.world, scene, horizon, rows)
 
-    def info(self) -> dict[str, Shaped[np.ndarray, " b"]]:
-        """Returns the present infos in new arrays."""
+    @property
+    def num_steps(self) -> Int[np.ndarray, " b"]:
+        """Number of steps since the start of each episode."""
+        return self._num_steps
+
+    def info(self) -> dict[str, Any]:
+        """Returns the present infos in new arrays; keys, shapes and types never change.
+
+        The value of `tags` is (B, tags), that of `reward_terms` a dictionary of arrays (B,), and
+        all others are (B,).
+        """
         events = self.events
         assert events is not None
+        endings = ending(events)
+        # An episode has not ended before its first step, even where its goal is at its start.
+        endings[events.elapsed == 0] = Ending.RUNNING
         return {
             "scenario": self._names.copy(),
             "tags": self._tags.copy(),
@@ -439,6 +461,11 @@ class ReplayEpisodes:
             "collision": events.collision,
             "at_fault": events.at_fault,
             "off_road_m": events.off_road_m.astype(np.float64),
+            "reward_terms": {name: term.copy() for name, term in self._terms.items()},
+            "ending": _ENDING_NAMES[endings],
+            "is_success": endings == Ending.GOAL,
+            "episode_return": self._return.copy(),
+            "episode_length": self._num_steps.copy(),
         }
 
     def logged_actions(self) -> tuple[Float[np.ndarray, "b 2"], Bool[np.ndarray, " b"]]:
@@ -455,20 +482,22 @@ class ReplayEpisodes:
     def snapshot(self) -> Any:
         """Returns the whole state for `restore`; it holds no recordings and no rasters."""
         forecasts = [each.snapshot() for each in self._forecasts]
-        return self.simulation.snapshot(), self._seeds.copy(), forecasts
+        statistics = self._return.copy(), self._num_steps.copy(), dict(self._terms)
+        return self.simulation.snapshot(), self._seeds.copy(), forecasts, statistics
 
     def restore(self, snapshot: Any) -> None:
         """Restores the state of a snapshot, bit for bit."""
-        simulation, seeds, forecasts = snapshot
+        simulation, seeds, forecasts, (returns, num_steps, terms) = snapshot
         self.simulation.restore(simulation)
+        self._return, self._num_steps = returns.copy(), num_steps.copy()
+        self._terms = dict(terms)
         self._seeds = seeds.copy()
         self._number(self._rows)
         for each, stored in zip(self._forecasts, forecasts, strict=True):
             each.restore(stored, self._serials)
         world = self.simulation.world
         for b, scenario in enumerate(world.scenarios):
-            self._names[b] = None if scenario is None else scenario.name
-            self._tags[b] = None if scenario is None else scenario.tags
+            self._describe(b, scenario)
         self.events = world.events()
 
     def _number(self, rows: Int[np.ndarray, " n"]) -> None:
@@ -491,6 +520,22 @@ def _merge_events(new: Events, old: Events, rows: Bool[np.ndarray, " b"]) -> Eve
         left, right = getattr(new, field.name), getattr(old, field.name)
         merged[field.name] = np.where(rows.reshape(-1, *[1] * (left.ndim - 1)), left, right)
     return Events(**merged)
+
+
+def info_of(infos: Mapping[str, Any], b: int) -> dict[str, Any]:
+    """Returns the info of one episode of `ReplayEpisodes.info`, with numbers as Python's own.
+
+    Args:
+        infos: the infos of all episodes.
+        b: number of the episode.
+    """
+    info: dict[str, Any] = {}
+    for name, values in infos.items():
+        if isinstance(values, Mapping):
+            info[name] = info_of(values, b)
+        else:
+            info[name] = values[b].copy() if values.ndim > 1 else values.tolist()[b]
+    return info
 
 
 def _events_of(events: Events, rows: Int[np.ndarray, " n"]) -> Events:

@@ -22,11 +22,12 @@ from asp_env.data.classes import PREDICTED, AgentClass
 from asp_env.data.recording import DEFAULT_DT_S, Recording, frames_per_tick
 from asp_env.data.scenarios.scenario import Scenario, ScenarioFilter, ScenarioSet
 from asp_env.data.scene import EGO, Scene
-from asp_env.envs.episodes import RESET_OPTIONS, ReplayEpisodes, StepResult, valid_actions
+from asp_env.envs.episodes import RESET_OPTIONS, ReplayEpisodes, info_of, valid_actions
 from asp_env.envs.forecasts import ForecastSpec, PredictorSpec
 from asp_env.envs.options import ReplayOptions, suggest_options
 from asp_env.errors import AspEnvError, unknown_name
 from asp_env.render.frames import draw_frame
+from asp_env.render.live import render_fps
 from asp_env.sim.reward import MIN_GOAL_M
 from asp_env.sim.traffic import Control, Driver
 from asp_env.sim.traffic.assignment import TrafficSpec
@@ -273,7 +274,7 @@ all |
         render_mode: str | None = None,
         observations: Sequence[str] = ("raster", "actions", "state"),
         view: str = "chauffeurnet",
-        raster_px: tuple[int, int] | None = None,
+        raster_px: int | Sequence[int] | None = None,
         traffic: TrafficSpec | None = None,
         dt_s: float = DEFAULT_DT_S,
         action_type: str = "direct",
@@ -305,10 +306,13 @@ all |
             predictor=predictor,
             forecast=forecast,
         )
-        self.metadata = {"name": "asp_env/ParallelReplay-v0", "render_modes": ["rgb_array"]}
         self.render_mode = render_mode
         self._episodes = ReplayEpisodes(data, options, 1)
-        self.metadata["render_fps"] = 1 / dt_s
+        self.metadata = {
+            "name": "asp_env/ParallelReplay-v0",
+            "render_modes": ["rgb_array"],
+            "render_fps": render_fps(dt_s * action_repeat),
+        }
         self.recordings = self._episodes.recordings
         selection = AgentSelection(classes=classes, ids=ids)
         self._selected = tuple(selection.mask(recording) for recording in self.recordings)
@@ -424,7 +428,7 @@ all |
             self._by_agent(np.where(present, result.reward, 0.0)),
             self._by_agent(terminated),
             self._by_agent(truncated),
-            self._infos(result),
+            self._infos(),
         )
         self._episodes.simulation.world.episodes.departed |= driver.slots_of(over)
         self._present = remaining
@@ -531,22 +535,11 @@ all |
             for row, agent in enumerate(names)
         }
 
-    def _infos(self, result: StepResult | None = None) -> dict[str, dict[str, Any]]:
-        columns = {
-            name: self._by_agent(value)
-            for name, value in self._episodes.info().items()
-            if not (self._numeric_infos and value.dtype == object)
-        }
-        if result is not None and not self._numeric_infos:
-            terms = {name: self._by_agent(value) for name, value in result.terms.items()}
-            columns["reward_terms"] = {
-                agent: {name: value[agent] for name, value in terms.items()}
-                for agent in self.agents
-            }
-            columns["ending"] = self._by_agent(result.ending)
-        infos = {
-            agent: {name: value[agent] for name, value in columns.items()} for agent in self.agents
-        }
+    def _infos(self) -> dict[str, dict[str, Any]]:
+        rows = self._episodes.info()
+        if self._numeric_infos:
+            rows = {name: value for name, value in rows.items() if _is_numeric(value)}
+        infos = {agent: info_of(rows, self._rows[agent]) for agent in self.agents}
         if self._pad_absent:
             empty = _empty(infos[self._present[0]])
             present = set(self._present)
@@ -579,3 +572,8 @@ def _empty(info: dict[str, Any]) -> dict[str, Any]:
         else type(value)()
         for name, value in info.items()
     }
+
+
+def _is_numeric(value: Any) -> bool:
+    """Whether an entry of the infos is one number for each agent."""
+    return isinstance(value, np.ndarray) and value.ndim == 1 and value.dtype != object

@@ -15,16 +15,19 @@ from asp_env.data.scenarios.scenario import Scenario, ScenarioFilter, ScenarioSe
 from asp_env.data.scene import Scene
 from asp_env.data.snippets import Future
 from asp_env.data.source import Recordings
-from asp_env.envs.episodes import ReplayEpisodes, StepResult, valid_actions
+from asp_env.envs.episodes import ReplayEpisodes, StepResult, info_of, valid_actions
+from asp_env.envs.flat import Flatten, flat_space, flatten_observations
 from asp_env.envs.forecasts import ForecastSpec, PredictorSpec
+from asp_env.envs.hints import hint_at_large_observations
+from asp_env.envs.keyboard import keyboard_actions
 from asp_env.envs.options import ReplayOptions, suggest_options
 from asp_env.envs.shared_in_spec import SharedInSpec
-from asp_env.render.live import MODES, LiveRenderer
+from asp_env.render.live import MODES, LiveRenderer, render_fps
 from asp_env.sim.traffic.assignment import TrafficSpec
 from asp_env.sim.world import World
 
 NOT_BEGUN = "no episode has begun: call reset first"
-METADATA = {"render_modes": [*MODES], "render_fps": 5}
+METADATA = {"render_modes": [*MODES], "render_fps": render_fps(DEFAULT_DT_S)}
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -52,7 +55,7 @@ class EnvSnapshot:
         return partial(EnvSnapshot, **{name: getattr(self, name) for name in names}), ()
 
 
-class ReplayEnv(SharedInSpec, gymnasium.Env[dict[str, Any], Any]):
+class ReplayEnv(SharedInSpec, gymnasium.Env[Any, Any]):
     """Controls one vehicle of a recording, the ego, among replayed or reacting traffic.
 
     ## Description
@@ -201,10 +204,11 @@ name; several in a mapping with their prefixes |
         self,
         data: str = "sample:intersection",
         *,
+        flatten: Flatten = False,
         render_mode: str | None = None,
         observations: Sequence[str] = ("raster", "actions", "state"),
         view: str = "chauffeurnet",
-        raster_px: tuple[int, int] | None = None,
+        raster_px: int | Sequence[int] | None = None,
         traffic: TrafficSpec | None = None,
         dt_s: float = DEFAULT_DT_S,
         action_type: str = "direct",
@@ -235,18 +239,20 @@ name; several in a mapping with their prefixes |
         )
         self.render_mode = render_mode
         self._episodes = ReplayEpisodes(data, options, 1)
-        self.observation_space = self._episodes.space
+        self.observation_space = flat_space(self._episodes.space, flatten)
+        self._flatten: Flatten = flatten
+        hint_at_large_observations(self._episodes.space, is_vector=False)
         self.action_space = self._episodes.action_space
         self._running = False
         self._start: tuple[Scenario, Mapping[str, Any]] | None = None
         """The scenario, and the state of its generator at the start."""
         self._actions: list[Float[np.ndarray, " 2"]] = []
-        self.metadata = {**METADATA, "render_fps": round(1 / dt_s, 6)}
+        self.metadata = {**METADATA, "render_fps": render_fps(dt_s * action_repeat)}
         self._live = LiveRenderer(render_mode, title=f"asp-env: {data}", dt_s=dt_s)
 
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
-    ) -> tuple[dict[str, Any], dict[str, Any]]:
+    ) -> tuple[Any, dict[str, Any]]:
         """Starts an episode.
 
         Args:
@@ -264,7 +270,7 @@ name; several in a mapping with their prefixes |
         self._update_window()
         return self._observe(), self._info()
 
-    def step(self, action: Any) -> tuple[dict[str, Any], float, bool, bool, dict[str, Any]]:
+    def step(self, action: Any) -> tuple[Any, float, bool, bool, dict[str, Any]]:
         """Steps by one tick with an action (2,), which is clipped to [-1, 1].
 
         Raises:
@@ -276,12 +282,8 @@ name; several in a mapping with their prefixes |
         result = self._act(valid_actions(action, (2,)))
         terminated, truncated = bool(result.terminated[0]), bool(result.truncated[0])
         self._running = not (terminated or truncated)
-        info = self._info() | {
-            "reward_terms": {name: float(value[0]) for name, value in result.terms.items()},
-            "ending": result.ending[0],
-        }
         self._update_window()
-        return self._observe(), float(result.reward[0]), terminated, truncated, info
+        return self._observe(), float(result.reward[0]), terminated, truncated, self._info()
 
     def scene(self) -> Scene:
         """Returns everything that may be known now, for predictors and planners; the ego is slot 0.
@@ -399,6 +401,14 @@ name; several in a mapping with their prefixes |
             return None
         return self._live.render(self.scene(), self._background())
 
+    def get_keys_to_action(self) -> dict[str | tuple[str | int, ...], Float[np.ndarray, " 2"]]:
+        """Returns the actions of keys for `gymnasium.utils.play.play`.
+
+        W or up accelerates by 2 m/s², S or down brakes by 4 m/s², and A, D, left and right steer by
+        9°. The empty text stands for no key.
+        """
+        return keyboard_actions()
+
     def close(self) -> None:
         """Closes the window."""
         self._live.close()
@@ -436,11 +446,12 @@ name; several in a mapping with their prefixes |
         self._actions.append(action)
         return self._episodes.step(action[None])
 
-    def _observe(self) -> dict[str, Any]:
-        return {name: value[0] for name, value in self._episodes.observe().items()}
+    def _observe(self) -> Any:
+        seen = flatten_observations(self._episodes.observe(), self._flatten)
+        return seen[0] if self._flatten is True else {name: each[0] for name, each in seen.items()}
 
     def _info(self) -> dict[str, Any]:
-        return {name: value.tolist()[0] for name, value in self._episodes.info().items()}
+        return info_of(self._episodes.info(), 0)
 
     def _check_begun(self) -> None:
         if self._start is None:

@@ -13,6 +13,7 @@ from gymnasium.vector.utils import batch_space
 
 from asp_env.data.predictor import Predictor
 from asp_env.envs.episodes import ReplayEpisodes
+from asp_env.envs.flat import flat_space
 from asp_env.envs.forecasts import (
     FORECAST_TIMES_S,
     ForecastObserver,
@@ -23,11 +24,14 @@ from asp_env.envs.shared_in_spec import shared_predictors
 from asp_env.errors import AspEnvError
 
 
-class FlatParts(gymnasium.ObservationWrapper[dict[str, Any], Any, dict[str, Any]]):
+class FlatParts(
+    gymnasium.ObservationWrapper[dict[str, Any], Any, dict[str, Any]], RecordConstructorArgs
+):
     """Flattens the tables of a Dict observation to vectors; images and vectors stay unchanged.
 
     stable-baselines3's `check_env` warns of tables such as the action history, (15, 2), which
     becomes (30,), tick by tick. Agents, lines, their masks and the route are flattened as well.
+    The option `flatten="parts"` of the environments does the same without a wrapper.
     """
 
     def __init__(self, env: gymnasium.Env[dict[str, Any], Any]) -> None:
@@ -36,24 +40,17 @@ class FlatParts(gymnasium.ObservationWrapper[dict[str, Any], Any, dict[str, Any]
         Args:
             env: an environment whose observation space is a Dict of boxes.
         """
+        RecordConstructorArgs.__init__(self)
         super().__init__(env)
         space = env.observation_space
         assert isinstance(space, spaces.Dict)
-        self.observation_space = spaces.Dict({name: _flatten(box) for name, box in space.items()})
+        self.observation_space = flat_space(space, "parts")
 
     def observation(self, observation: dict[str, Any]) -> dict[str, Any]:
         """Returns the observation in the shapes of this wrapper's space."""
         space = self.observation_space
         assert isinstance(space, spaces.Dict)
         return {name: value.reshape(space[name].shape) for name, value in observation.items()}
-
-
-def _flatten(box: spaces.Space[Any]) -> spaces.Space[Any]:
-    if not isinstance(box, spaces.Box) or len(box.shape) < 2:
-        return box
-    if len(box.shape) == 3 and box.dtype == np.uint8:
-        return box
-    return spaces.Box(np.ravel(box.low), np.ravel(box.high), dtype=box.low.dtype.type)
 
 
 class PredictionFeatures(

@@ -45,6 +45,10 @@ class RewardWeights:
     every second whose heading differs from the route's by over 90°."""
 
 
+REWARD_TERMS = tuple(field.name for field in fields(RewardWeights))
+"""Names of the terms, in the order of their weights."""
+
+
 def weights_from(given: Mapping[str, float]) -> RewardWeights:
     """The default weights, some of them replaced.
 
@@ -54,10 +58,9 @@ def weights_from(given: Mapping[str, float]) -> RewardWeights:
     Raises:
         AspEnvError: a name is unknown, or a value is not a finite number.
     """
-    known = [field.name for field in fields(RewardWeights)]
     for name, value in given.items():
-        if name not in known:
-            raise unknown_name("reward weight", name, known)
+        if name not in REWARD_TERMS:
+            raise unknown_name("reward weight", name, REWARD_TERMS)
         if not (isinstance(value, int | float) and math.isfinite(value)):
             raise AspEnvError(f"reward weight {name} {value}: expected a finite number")
     return RewardWeights(**{name: float(value) for name, value in given.items()})
