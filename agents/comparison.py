@@ -11,7 +11,7 @@ import json
 import os
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from functools import partial
+from functools import cache, partial
 from pathlib import Path
 from typing import Any
 
@@ -21,7 +21,7 @@ from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 from rich.table import Table
 
-from agents.evaluation import evaluate_agent, evaluate_policy
+from agents.evaluation import evaluate_policy
 from agents.held_actions import RandomActions, zero_actions
 from agents.planner import AgentPlanner
 from agents.runs import POLICY, load_agent
@@ -32,7 +32,7 @@ from asp_env.data.recording import ticks
 from asp_env.data.scenarios.scenario import ScenarioSet
 from asp_env.data.scenarios.selection import choose_scenarios
 from asp_env.data.snippets import HISTORY_S
-from asp_env.data.source import open_data
+from asp_env.data.source import Recordings, open_data
 from asp_env.errors import AspEnvError
 from asp_env.evaluation.closed_loop.episodes import EpisodeSettings, drive_episodes
 from asp_env.evaluation.statistics import (
@@ -121,11 +121,17 @@ class HeldOut:
         Raises:
             AspEnvError: none fits.
         """
-        recordings = open_data(self.data)
+        recordings = _recordings(self.data)
         chosen = choose_scenarios(
             recordings, self.scenarios, dt_s=dt_s, history=ticks(HISTORY_S, dt_s)
         )
         return chosen if self.max_scenarios is None else chosen.evenly_spaced(self.max_scenarios)
+
+
+@cache
+def _recordings(data: str) -> Recordings:
+    """The recordings of held-out data, once per process: what is made of their maps is reused."""
+    return open_data(data)
 
 
 Values = dict[str, Float[np.ndarray, " n"]]
@@ -144,7 +150,7 @@ def drive_held_out(planner: Planner, predictor: str, held_out: HeldOut, dt_s: fl
     Raises:
         AspEnvError: no scenario fits, or the predictor does not suit the data.
     """
-    scenarios, recordings = held_out.choose(dt_s), open_data(held_out.data)
+    scenarios, recordings = held_out.choose(dt_s), _recordings(held_out.data)
     world, rules = world_class(held_out.data), find_rules(DEFAULT_RULES)
     settings = EpisodeSettings(
         rules=rules,
@@ -190,16 +196,7 @@ def run_cell(held_out: HeldOut, cell: Cell) -> str:
             held_out,
             environment.dt_s,
         )
-        in_environment = evaluate_agent(
-            agent,
-            held_out.data,
-            scenarios=held_out.choose(environment.dt_s),
-            privileged=cell.privileged,
-        )
-        content = {
-            "planner": {name: value.tolist() for name, value in values.items()},
-            "environment": {name: v.tolist() for name, v in in_environment.values.items()},
-        }
+        content = {name: value.tolist() for name, value in values.items()}
         write_text(results, json.dumps(content))
     return cell.row
 
@@ -229,7 +226,7 @@ def baselines(held_out: HeldOut, environment: EnvironmentSettings) -> dict[str, 
 
 def read_values(folder: Path) -> Values:
     """The values of an agent as a planner, from its run folder."""
-    content = json.loads((folder / "held_out.json").read_text())["planner"]
+    content = json.loads((folder / "held_out.json").read_text())
     return {name: np.array(value) for name, value in content.items()}
 
 
