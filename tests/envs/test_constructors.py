@@ -73,7 +73,9 @@ def test_an_unknown_option_names_the_nearest_one(make):
 
 
 def test_an_unknown_option_without_a_near_name_lists_the_known_ones():
-    with pytest.raises(TypeError, match="'colour'; known: data, flatten, render_mode, observations"):
+    with pytest.raises(
+        TypeError, match="'colour'; known: data, flatten, render_mode, observations"
+    ):
         asp_env.ReplayEnv(colour=1)  # pyright: ignore[reportCallIssue]
 
 
