@@ -1,8 +1,9 @@
 """Does this trajectory predictor make the car drive better?
 
 Importing this package registers the Gymnasium environments `asp_env/Replay-v0`,
-`asp_env/HighwayIntersection-v0` and `asp_env/HighwayRoundabout-v0`. The public names are imported
-on first use, so that `import asp_env` stays cheap.
+`asp_env/HighwayIntersection-v0` and `asp_env/HighwayRoundabout-v0`, and of each one with light
+observations, such as `asp_env/ReplayVectors-v0` and `asp_env/ReplayState-v0`. The public names are
+imported on first use, so that `import asp_env` stays cheap.
 """
 
 from importlib import import_module
@@ -19,6 +20,7 @@ if TYPE_CHECKING:
     from asp_env.dynamics import denormalize_actions, normalize_actions
     from asp_env.envs import (
         FlatParts,
+        ForecastOptions,
         PredictionFeatures,
         ReplayEnv,
         ReplayVectorEnv,
@@ -33,6 +35,7 @@ __all__ = [
     "AspEnvError",
     "FlatParts",
     "Forecast",
+    "ForecastOptions",
     "Plan",
     "Planner",
     "PredictionFeatures",
@@ -60,6 +63,7 @@ _MODULES = {
     "asp_env.dynamics": ("denormalize_actions", "normalize_actions"),
     "asp_env.envs": (
         "FlatParts",
+        "ForecastOptions",
         "PredictionFeatures",
         "ReplayEnv",
         "ReplayVectorEnv",
@@ -92,14 +96,22 @@ def __dir__() -> list[str]:
     return sorted({*globals(), *__all__, *_SUBMODULES})
 
 
-for _name, _kwargs in (
-    ("Replay", {}),
-    ("HighwayIntersection", {"data": "highway:intersection"}),
-    ("HighwayRoundabout", {"data": "highway:roundabout"}),
-):
-    gymnasium.register(
-        id=f"asp_env/{_name}-v0",
-        entry_point="asp_env.envs.replay:ReplayEnv",
-        vector_entry_point="asp_env.envs.vector:ReplayVectorEnv",
-        kwargs=_kwargs,
-    )
+_WORLDS = {
+    "Replay": {},
+    "HighwayIntersection": {"data": "highway:intersection"},
+    "HighwayRoundabout": {"data": "highway:roundabout"},
+}
+_OBSERVATIONS = {
+    "": {},
+    "Vectors": {"observations": ("vectors", "state", "route"), "flatten": "parts"},
+    "State": {"observations": ("state", "route", "nearest"), "flatten": True},
+}
+
+for _world, _data in _WORLDS.items():
+    for _suffix, _options in _OBSERVATIONS.items():
+        gymnasium.register(
+            id=f"asp_env/{_world}{_suffix}-v0",
+            entry_point="asp_env.envs.replay:ReplayEnv",
+            vector_entry_point="asp_env.envs.vector:ReplayVectorEnv",
+            kwargs={**_data, **_options},
+        )

@@ -17,6 +17,8 @@ from asp_env.errors import AspEnvError
 BAD_INPUT = 2
 """Exit status for input that a command rejects."""
 
+HELP = ("-h", "--help")
+
 RENAMED_OPTIONS = {
     ("drive", "--most"): "--max-scenarios",
     ("drive", "--metrics"): "--rules",
@@ -38,10 +40,11 @@ def main(argv: Sequence[str] | None = None) -> int:
         interrupted.
     """
     args = list(sys.argv[1:] if argv is None else argv)
-    if not args or args[0] in ("-h", "--help"):
-        _print_commands()
+    group = args.pop(0) if args and args[0] in _groups() else ""
+    if not args or args[0] in HELP:
+        _print_commands(group)
         return 0
-    name, options = args[0], args[1:]
+    name, options = f"{group} {args[0]}".strip(), args[1:]
     try:
         command = registry.find("commands", name)
         _parse(name, command, _with_current_names(name, options)).run()
@@ -54,6 +57,11 @@ def main(argv: Sequence[str] | None = None) -> int:
         sys.stderr.write("asp-env: interrupted\n")
         return 130
     return 0
+
+
+def _groups() -> set[str]:
+    """The first words of the commands whose names have two."""
+    return {name.split()[0] for name in registry.names("commands") if " " in name}
 
 
 def _with_current_names(command: str, args: Sequence[str]) -> list[str]:
@@ -93,16 +101,20 @@ def _report(message: str) -> int:
     return BAD_INPUT
 
 
-def _print_commands() -> None:
+def _print_commands(group: str = "") -> None:
+    """Prints the commands of a group, by default all commands."""
     table = Table(box=None, show_header=False, padding=(0, 2))
     for name in registry.names("commands"):
+        if not f"{name} ".startswith(f"{group} ".lstrip()):
+            continue
         try:
             description = registry.find("commands", name).__doc__ or ""
         except AspEnvError as error:
             description = str(error)
         table.add_row(name, description.strip().partition("\n")[0])
     console = Console()
-    console.print("usage: asp-env COMMAND …    (asp-env COMMAND --help lists its options)\n")
+    prog = f"asp-env {group}".strip()
+    console.print(f"usage: {prog} COMMAND …    ({prog} COMMAND --help lists its options)\n")
     console.print(table)
 
 

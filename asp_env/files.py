@@ -86,6 +86,16 @@ def atomic_file(path: Path) -> Iterator[Path]:
             partial.unlink()
 
 
+def write_text(path: Path, text: str) -> None:
+    """Writes a text file atomically.
+
+    Raises:
+        OSError: the file cannot be written.
+    """
+    with atomic_file(path) as partial:
+        partial.write_text(text)
+
+
 def leftovers(path: Path) -> list[Path]:
     """Temporary files and folders beside `path`, of processes that write it or were killed."""
     token = "[0-9a-f]" * (2 * _TOKEN_BYTES)

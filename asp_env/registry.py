@@ -13,14 +13,20 @@ The groups are:
 - `asp_env.sources`: data by `scheme:argument`, such as `synthetic:intersection`;
 - `asp_env.worlds`: simulate the data of a source that are not replayed, such as `highway:`;
 - `asp_env.views`: render scenes for networks;
-- `asp_env.commands`: sub-commands of `asp-env`.
+- `asp_env.commands`: sub-commands of `asp-env`. A name of two words, such as `"rl train"`, is a
+  command of a group: `asp-env rl train`.
 """
 
+import re
+from collections import Counter
 from functools import cache
-from importlib.metadata import EntryPoint, entry_points
+from importlib.metadata import EntryPoint, entry_points, requires
 from typing import Any, Literal
 
 from asp_env.errors import AspEnvError, unknown_name
+
+_PACKAGE_OF_MODULE = {"pygame": "pygame-ce", "sumolib": "eclipse-sumo", "traci": "eclipse-sumo"}
+"""Packages that have other names than their modules."""
 
 Group = Literal["predictors", "planners", "drivers", "sources", "worlds", "views", "commands"]
 
@@ -58,13 +64,29 @@ def find(group: Group, name: str) -> Any:
         if missing is not None and not _is_within(plugs[name].module, missing):
             raise AspEnvError(
                 f"{kind} {name!r} needs the package {missing!r}, which is not "
-                "installed: pip install 'asp-env[all]'"
+                f"installed: pip install {_requirement_with(missing)}"
             ) from error
         reason = " ".join(f"{type(error).__name__}: {error}".split())
         raise AspEnvError(
             f"{kind} {name!r} cannot be imported from its entry point {plugs[name].value} "
             f"({reason}): repair the package that registers it, or uninstall it"
         ) from error
+
+
+def _requirement_with(module: str) -> str:
+    """What to install for a missing module: the smallest extra with it, or the package itself."""
+    package = _PACKAGE_OF_MODULE.get(module, module).replace("_", "-")
+    sizes: Counter[str] = Counter()
+    having = set()
+    for requirement in requires("asp-env") or ():
+        found = re.match(r"([\w.-]+).*extra == [\"'](.+)[\"']", requirement)
+        if found and found[1] != "asp-env":  # an extra of this package is that extra's own entry
+            sizes[found[2]] += 1
+            if found[1] == package:
+                having.add(found[2])
+    if not having:
+        return package
+    return f"'asp-env[{min(having, key=lambda extra: (sizes[extra], extra))}]'"
 
 
 def _is_within(module: str, package: str) -> bool:

@@ -30,6 +30,7 @@ import traceback
 from collections import deque
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from concurrent.futures import Future, ThreadPoolExecutor
+from contextlib import contextmanager
 from multiprocessing import current_process
 from multiprocessing.connection import Connection
 from multiprocessing.reduction import ForkingPickler
@@ -291,3 +292,18 @@ def _dump_error(error: Exception) -> Any:
 
 if __name__ == "__main__":
     _serve(Connection(int(sys.argv[1])))
+
+
+@contextmanager
+def one_thread() -> Iterator[None]:
+    """Limits torch to one thread, so that sums do not depend on the number of cores."""
+    torch = sys.modules.get("torch")
+    if torch is None:
+        yield
+        return
+    before = torch.get_num_threads()
+    torch.set_num_threads(1)
+    try:
+        yield
+    finally:
+        torch.set_num_threads(before)

@@ -5,11 +5,11 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 
 import numpy as np
-from jaxtyping import Float
 
 from asp_env.data.predictor import (
     Forecast,
     Predictor,
+    continued,
     feature_size,
     load_predictor,
     make_forecast,
@@ -125,7 +125,7 @@ class Delayed:
             )
         then = self.inner.predict(_scene_before(scene, self.ticks), future)
         first, end = self.ticks, self.ticks + self.horizon
-        states = _continued(then.states, end, scene.dt_s)
+        states = continued(then.states, end, scene.dt_s)
         actions = np.zeros((*states.shape[:-1], 2), dtype=np.float32)
         known = min(end, then.actions.shape[2])
         actions[:, :, :known] = then.actions[:, :, :known]
@@ -155,17 +155,3 @@ def _scene_before(scene: Scene, ticks: int) -> Scene:
         tick=scene.tick - ticks,
         signals=None if scene.signals is None else scene.signals.before(ticks),
     )
-
-
-def _continued(
-    states: Float[np.ndarray, "t m steps 4"], steps: int, dt_s: float
-) -> Float[np.ndarray, "t m all 4"]:
-    """The states, continued straight at their last speed up to some number of steps."""
-    missing = steps - states.shape[2]
-    if missing <= 0:
-        return states
-    added = np.repeat(states[:, :, -1:], missing, axis=2)
-    distance_m = added[..., 3] * dt_s * np.arange(1, missing + 1, dtype=np.float32)
-    added[..., 0] += distance_m * np.cos(added[..., 2])
-    added[..., 1] += distance_m * np.sin(added[..., 2])
-    return np.concatenate([states, added], axis=2)

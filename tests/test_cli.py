@@ -4,6 +4,7 @@ import os
 import subprocess
 import sys
 from dataclasses import dataclass
+from importlib.metadata import EntryPoint
 from pathlib import Path
 
 import pytest
@@ -129,6 +130,38 @@ def test_help_lists_the_commands(capsys):
             assert f" {name} " in output.out
 
 
+@pytest.fixture
+def group(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Two commands of the group `pet` and one without a group."""
+    plugs = {
+        name: EntryPoint(name, f"{__name__}:Fail", "asp_env.commands")
+        for name in ("pet feed", "pet wash", "petrol")
+    }
+    monkeypatch.setattr(registry, "_plugs", lambda _: plugs)
+
+
+@pytest.mark.usefixtures("group")
+def test_help_of_a_group_lists_its_commands(capsys):
+    """With `--help`, `-h` and no argument."""
+    for args in (["pet"], ["pet", "--help"], ["pet", "-h"]):
+        assert main(args) == 0
+        output = capsys.readouterr()
+        assert output.err == ""
+        assert "usage: asp-env pet COMMAND" in output.out
+        assert output.out.count("A command that fails.") == 2
+        assert " pet feed " in output.out
+
+
+@pytest.mark.usefixtures("group")
+def test_commands_of_a_group_run_by_two_words(capsys):
+    assert _rejected(capsys, "pet", "feed", "--how", "input") == "asp-env: first line second line"
+    line = _rejected(capsys, "pet", "feed")
+    assert line.endswith("see asp-env pet feed --help")
+    line = _rejected(capsys, "pet", "fed")
+    assert "unknown command 'pet fed' (did you mean 'pet feed'?): known are pet feed, pet" in line
+    assert "unknown command 'pe'" in _rejected(capsys, "pe", "feed")
+
+
 def test_help_lists_commands_that_cannot_be_loaded(capsys, monkeypatch):
     """With the missing package."""
 
@@ -147,7 +180,7 @@ def test_help_lists_commands_that_cannot_be_loaded(capsys, monkeypatch):
 @pytest.mark.parametrize("command", registry.names("commands"))
 def test_every_command_has_help(capsys, command):
     with pytest.raises(SystemExit) as stop:
-        main([command, "--help"])
+        main([*command.split(), "--help"])
     assert not stop.value.code
     assert f"asp-env {command}" in capsys.readouterr().out
 

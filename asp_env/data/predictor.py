@@ -14,7 +14,7 @@ from asp_env import registry
 from asp_env.data.scene import Scene
 from asp_env.data.snippets import Future
 from asp_env.data.split import TrainedOn
-from asp_env.dynamics import rollout
+from asp_env.geometry import wrap_angle
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -247,11 +247,35 @@ def constant_velocity(scene: Scene, *, steps: int) -> Float[np.ndarray, "t steps
         scene: the scene.
         steps: number of ticks.
     """
-    at = (scene.targets[:, 0], scene.targets[:, 1])
-    now = scene.states[at][:, -1]
-    actions = np.zeros((len(now), steps, 2), dtype=now.dtype)
-    lengths_m = np.maximum(scene.sizes[at][:, 0], 0.1)
-    return rollout(now, actions, lengths_m, scene.dt_s, reverse=True)
+    now = scene.target_states
+    step_m = now[:, 3:] * np.stack([np.cos(now[:, 2]), np.sin(now[:, 2])], axis=-1)
+    # Heun's method with zero actions: twice the velocity times half the duration.
+    step_m = (step_m + step_m) * (0.5 * scene.dt_s)
+    states = np.empty((len(now), steps, 4), dtype=now.dtype)
+    states[:] = now[:, None]
+    states[..., :2] += np.cumsum(np.repeat(step_m[:, None], steps, axis=1), axis=1)
+    states[..., 2] = wrap_angle(now[:, None, 2])
+    return states
+
+
+def continued(
+    states: Float[np.ndarray, "t m steps 4"], steps: int, dt_s: float
+) -> Float[np.ndarray, "t m all 4"]:
+    """States that go on straight at their last speed up to some number of steps.
+
+    Args:
+        states: [x m, y m, heading rad, speed m/s] of each mode.
+        steps: number of steps of the result, at least; longer modes are returned unchanged.
+        dt_s: seconds per step.
+    """
+    missing = steps - states.shape[2]
+    if missing <= 0:
+        return states
+    added = np.repeat(states[:, :, -1:], missing, axis=2)
+    distance_m = added[..., 3] * dt_s * np.arange(1, missing + 1, dtype=np.float32)
+    added[..., 0] += distance_m * np.cos(added[..., 2])
+    added[..., 1] += distance_m * np.sin(added[..., 2])
+    return np.concatenate([states, added], axis=2)
 
 
 def fill_missing(forecast: Forecast, scene: Scene) -> Forecast:
@@ -263,12 +287,13 @@ def fill_missing(forecast: Forecast, scene: Scene) -> Forecast:
     missing = ~forecast.valid & scene.valid[at][:, -1]
     if not missing.any():
         return forecast
-    straight = constant_velocity(scene, steps=forecast.states.shape[2])[:, None]
-    states = np.where(missing[:, None, None, None], straight, forecast.states)
+    alone = scene.with_targets(scene.targets[missing])
+    states = forecast.states.astype(np.float32)
+    states[missing] = constant_velocity(alone, steps=states.shape[2])[:, None]
     log_prob = np.float32(-np.log(forecast.log_probs.shape[1]))
     return dataclasses.replace(
         forecast,
-        states=states.astype(np.float32),
+        states=states,
         log_probs=np.where(missing[:, None], log_prob, forecast.log_probs),
         valid=forecast.valid | missing,
     )

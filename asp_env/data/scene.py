@@ -4,7 +4,7 @@ import dataclasses
 from dataclasses import dataclass
 
 import numpy as np
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Bool, Float, Int, UInt64
 
 from asp_env.data.classes import PREDICTED
 from asp_env.data.road_map import RoadMap
@@ -51,6 +51,10 @@ class Scene:
     """Seconds per tick."""
     signals: SceneSignals | None = None
     """Traffic signals up to now; None if no recording of the scene has any."""
+    seeds: UInt64[np.ndarray, " b"] | None = None
+    """Random number of each situation, which stochastic predictors draw from. In environments it
+    follows from the seed of `reset`; None where the noise is the same in every episode, as in
+    `asp-env drive`."""
 
     def with_targets(self, targets: Int[np.ndarray, "t 2"]) -> "Scene":
         """The same scene with other targets."""
@@ -58,13 +62,14 @@ class Scene:
 
     def situation(self, index: int) -> "Scene":
         """A scene of one of the situations, which becomes situation 0."""
-        shared = ("targets", "maps", "dt_s", "signals")
+        shared = ("targets", "maps", "dt_s", "signals", "seeds")
         names = [field.name for field in dataclasses.fields(self) if field.name not in shared]
         targets = self.targets[self.targets[:, 0] == index]
         targets[:, 0] = 0
         own = {name: getattr(self, name)[index : index + 1] for name in names}
         signals = None if self.signals is None else self.signals.situation(index)
-        return dataclasses.replace(self, targets=targets, signals=signals, **own)
+        seeds = None if self.seeds is None else self.seeds[index : index + 1]
+        return dataclasses.replace(self, targets=targets, signals=signals, seeds=seeds, **own)
 
     @property
     def history(self) -> int:

@@ -7,6 +7,7 @@
 from typing import TYPE_CHECKING, Any
 
 from asp_env.envs.constructors import parallel_env, sb3_vec_env
+from asp_env.envs.forecasts import ForecastOptions
 from asp_env.envs.options import ReplayOptions, UnknownOptionError
 from asp_env.envs.replay import EnvSnapshot, ReplayEnv
 from asp_env.envs.vector import ReplayVectorEnv, VectorSnapshot
@@ -19,6 +20,7 @@ if TYPE_CHECKING:
 __all__ = [
     "EnvSnapshot",
     "FlatParts",
+    "ForecastOptions",
     "PredictionFeatures",
     "ReplayEnv",
     "ReplayOptions",

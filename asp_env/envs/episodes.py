@@ -12,21 +12,30 @@ from typing import Any
 
 import numpy as np
 from gymnasium import spaces
-from jaxtyping import Bool, Float, Int, Shaped
+from jaxtyping import Bool, Float, Int
 
+from asp_env.data.predictor import Predictor
 from asp_env.data.recording import ticks
 from asp_env.data.scenarios.scenario import Scenario, ScenarioFilter, ScenarioSet
 from asp_env.data.scenarios.selection import choose_scenarios, scenario_of
-from asp_env.data.snippets import HISTORY_S
+from asp_env.data.scenarios.tags import TAGS
+from asp_env.data.scene import EGO, Scene, infer_actions
+from asp_env.data.snippets import HISTORY_S, Future
 from asp_env.data.source import Recordings, open_data
-from asp_env.dynamics import denormalize_actions
-from asp_env.envs.options import ReplayOptions
+from asp_env.envs.forecasts import Present, extended_space, forecast_observers
+from asp_env.envs.options import ReplayOptions, raster_size
 from asp_env.errors import AspEnvError, unknown_name
+from asp_env.sim.action_types import (
+    check_action_type,
+    following_steering,
+    from_physical,
+    to_physical,
+)
 from asp_env.sim.observation import Observation, Observer, ego_context
-from asp_env.sim.reward import reward_terms, weighted_sum, weights_from
+from asp_env.sim.reward import REWARD_TERMS, reward_terms, weighted_sum, weights_from
 from asp_env.sim.simulation import Simulation, ending
 from asp_env.sim.traffic.assignment import make_traffic
-from asp_env.sim.world import Ending, Events, world_class
+from asp_env.sim.world import Ending, Events, recorded_future, world_class
 from asp_env.views import make_raster_view
 
 RESET_OPTIONS = ("scenario", "start_tick", "ego")
@@ -158,15 +167,11 @@ def _whole_number(name: str, value: Any) -> int:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class StepResult:
-    """Rewards and endings of one step of B episodes."""
+    """Rewards and ends of one step of B episodes; `ReplayEpisodes.info` has the details."""
 
     reward: Float[np.ndarray, " b"]
-    terms: dict[str, Float[np.ndarray, " b"]]
-    """The terms of the reward by name, unweighted."""
     terminated: Bool[np.ndarray, " b"]
     truncated: Bool[np.ndarray, " b"]
-    ending: Shaped[np.ndarray, " b"]
-    """Name of the `Ending` of each episode."""
 
 
 class ReplayEpisodes:
@@ -189,7 +194,7 @@ class ReplayEpisodes:
             self.recordings, options.scenarios, dt_s=options.dt_s, history=history
         )
         self.scenarios = self._sampler.scenarios
-        raster = make_raster_view(options.view, pixels=options.raster_px)
+        raster = make_raster_view(options.view, pixels=raster_size(options.raster_px))
         self.observer = Observer(options.observations, raster, history)
         kind = world_class(data)
         self.simulation = Simulation(
@@ -200,17 +205,39 @@ class ReplayEpisodes:
             history=history,
             world_class=kind,
         )
+        check_action_type(options.action_type)
+        self._action_type = options.action_type
+        if options.action_repeat < 1:
+            raise AspEnvError(f"action_repeat {options.action_repeat}: expected at least 1")
+        self._action_repeat = options.action_repeat
         self._weights = weights_from(options.reward_weights or {})
-        self._names = np.full(num_episodes, None, dtype=object)
-        self._tags = np.full(num_episodes, None, dtype=object)
+        self._forecasts = forecast_observers(options.predictor, options.forecast, options.dt_s)
+        self.space: spaces.Space[Any] = self.observer.space
+        for each in self._forecasts:
+            self.space = extended_space(self.space, each.spaces)
+        self._num_begun = 0
+        """Number of episodes begun or restored so far."""
+        self._allocate(num_episodes)
         self.action_space = spaces.Box(-1.0, 1.0, (2,), dtype=np.float32)
+
+    def _allocate(self, num_episodes: int) -> None:
+        """Describes episodes that have not begun."""
         self.events: Events | None = None
+        self._names = np.full(num_episodes, None, dtype=object)
+        self._tags = np.zeros((num_episodes, len(TAGS)), dtype=bool)
+        self._return = np.zeros(num_episodes)
+        """Sum of the rewards since the start of each episode."""
+        self._num_steps = np.zeros(num_episodes, dtype=np.int64)
+        self._seeds = np.zeros(num_episodes, dtype=np.uint64)
+        self._serials = np.full(num_episodes, -1)
+        self._rows = np.arange(num_episodes)
+        self._terms = {name: np.zeros(num_episodes) for name in REWARD_TERMS}
+        """The unweighted terms of the reward of each episode's last step; zeros at its start."""
 
     def restrict(self, scenarios: ScenarioSet, num_episodes: int) -> None:
         """Replaces the scenarios to draw from and the number of episodes, and ends all episodes."""
         world = self.simulation.world
-        self.scenarios = scenarios
-        self._sampler = dataclasses.replace(self._sampler, scenarios=scenarios)
+        self.draw_from(scenarios)
         self.simulation = Simulation(
             self.recordings,
             self.simulation.driver,
@@ -219,9 +246,12 @@ class ReplayEpisodes:
             history=world.history,
             world_class=type(world),
         )
-        self._names = np.full(num_episodes, None, dtype=object)
-        self._tags = np.full(num_episodes, None, dtype=object)
-        self.events = None
+        self._allocate(num_episodes)
+
+    def draw_from(self, scenarios: ScenarioSet) -> None:
+        """Replaces the scenarios to draw from; episodes under way go on."""
+        self.scenarios = scenarios
+        self._sampler = dataclasses.replace(self._sampler, scenarios=scenarios)
 
     def draw(
         self, np_random: np.random.Generator, options: Mapping[str, Any]
@@ -251,26 +281,91 @@ class ReplayEpisodes:
         """Starts the episodes of a mask; the other entries of the sequences are ignored."""
         self.simulation.reset(scenarios, rngs, reset_mask)
         for b in np.flatnonzero(reset_mask).tolist():
-            self._names[b], self._tags[b] = scenarios[b].name, scenarios[b].tags
+            self._describe(b, scenarios[b])
+            self._seeds[b] = _seed_from(rngs[b])
+        self._return[reset_mask], self._num_steps[reset_mask] = 0.0, 0
+        self._terms = {name: np.where(reset_mask, 0.0, term) for name, term in self._terms.items()}
+        self._number(np.flatnonzero(reset_mask))
         self.events = self.simulation.world.events()
 
+    def _describe(self, b: int, scenario: Scenario | None) -> None:
+        self._names[b] = None if scenario is None else scenario.name
+        self._tags[b] = [scenario is not None and tag in scenario.tags for tag in TAGS]
+
     def step(self, actions: Float[np.ndarray, "b 2"]) -> StepResult:
-        """Steps all episodes by one tick; the egos' actions lie in [-1, 1]."""
+        """Steps all episodes by `action_repeat` ticks, or up to the tick at which they end.
+
+        Args:
+            actions: the egos' actions of the action type, in [-1, 1].
+        """
+        terms, after = self._tick(actions)
+        endings = ending(after)
+        for _ in range(self._action_repeat - 1):
+            running = endings == Ending.RUNNING
+            if not running.any():
+                break
+            self.make_forecasts()
+            more, later = self._tick(actions)
+            terms = {name: terms[name] + value * running for name, value in more.items()}
+            self.events = after = _merge_events(later, after, running)
+            endings = np.where(running, ending(later), endings)
+        reward = weighted_sum(terms, self._weights)
+        self._return += reward
+        self._num_steps += 1
+        self._terms = {name: value.astype(np.float64) for name, value in terms.items()}
+        return StepResult(
+            reward=reward,
+            terminated=_IS_TERMINAL[endings],
+            truncated=endings == Ending.OUT_OF_DATA,
+        )
+
+    def _tick(
+        self, actions: Float[np.ndarray, "b 2"]
+    ) -> tuple[dict[str, Float[np.ndarray, " b"]], Events]:
+        """Steps by one tick; returns the terms of the reward, and the events after it."""
         world, before = self.simulation.world, self.events
         assert before is not None
         states_before = world.ego_states()
         controlled = np.ones(len(world), dtype=bool)
-        self.simulation.step(denormalize_actions(actions), controlled)
+        self.simulation.step(self.physical_actions(actions), controlled)
         self.events = after = world.events()
         terms = reward_terms(before, after, states_before, world.ego_states(), world.dt_s)
-        endings = ending(after)
-        return StepResult(
-            reward=weighted_sum(terms, self._weights),
-            terms=terms,
-            terminated=_IS_TERMINAL[endings],
-            truncated=endings == Ending.OUT_OF_DATA,
-            ending=_ENDING_NAMES[endings],
-        )
+        return terms, after
+
+    @property
+    def predictors(self) -> tuple[Predictor, ...]:
+        """The predictors whose forecasts are part of the observation."""
+        return tuple(each.predictor for each in self._forecasts)
+
+    def physical_actions(self, actions: Float[np.ndarray, "b 2"]) -> Float[np.ndarray, "b 2"]:
+        """Converts the egos' actions in [-1, 1] to [acceleration m/s², steering rad]."""
+        return to_physical(self._action_type, actions, *self._action_context())
+
+    def actions_from(self, physical: Float[np.ndarray, "b 2"]) -> Float[np.ndarray, "b 2"]:
+        """Converts [acceleration m/s², steering rad] to actions, possibly beyond [-1, 1]."""
+        return from_physical(self._action_type, physical, *self._action_context())
+
+    def _action_context(self) -> tuple[np.ndarray, np.ndarray, float]:
+        """The last actions of the egos, their steering along the route, and the time step."""
+        world = self.simulation.world
+        episodes, count = world.episodes, len(world)
+        last, following = np.zeros((count, 2), dtype=np.float32), np.zeros(count)
+        lengths = episodes.sizes[:, EGO, 0]
+        if self._action_type == "jerk":
+            rows = np.arange(count)
+            before = np.stack([episodes.states[rows, world.now - k, EGO] for k in (1, 0)], axis=1)
+            seen = np.stack([episodes.valid[rows, world.now - k, EGO] for k in (1, 0)], axis=1)
+            last = infer_actions(before, seen, lengths, world.dt_s)[:, 0]
+        if self._action_type == "route":
+            assert self.events is not None
+            following = following_steering(
+                world.ego_states(),
+                np.maximum(lengths, 0.1),
+                episodes.route,
+                episodes.route_valid,
+                self.events.route_m,
+            )
+        return last, following, world.dt_s
 
     def observe(
         self, rows: Int[np.ndarray, " n"] | None = None, out: Observation | None = None
@@ -283,12 +378,80 @@ class ReplayEpisodes:
         """
         assert self.events is not None
         events = self.events if rows is None else _events_of(self.events, rows)
-        return self.observer.observe(ego_context(self.simulation.world, rows), events, out)
+        seen = self.observer.observe(ego_context(self.simulation.world, rows), events, out)
+        for each in self._forecasts:
+            seen |= each.observe(self, self._rows if rows is None else rows)
+        return seen
 
-    def info(self) -> dict[str, Shaped[np.ndarray, " b"]]:
-        """Returns the present infos in new arrays."""
+    def make_forecasts(self) -> None:
+        """Makes the forecasts that are due now, as `observe` does, without observing."""
+        for each in self._forecasts:
+            each.make(self, self._rows)
+
+    def __len__(self) -> int:
+        """The number of episodes."""
+        return len(self._rows)
+
+    @property
+    def dt_s(self) -> float:
+        """Length of a tick in seconds."""
+        return self.simulation.world.dt_s
+
+    def present(self, rows: Int[np.ndarray, " r"]) -> Present:
+        """Returns the present tick of some episodes, for forecasts."""
+        world, episodes = self.simulation.world, self.simulation.world.episodes
+        at = rows, world.now[rows]
+        return Present(
+            states=episodes.states[at],
+            valid=episodes.valid[at],
+            ids=episodes.ids[rows],
+            elapsed=episodes.elapsed[rows],
+            serials=self._serials[rows],
+        )
+
+    def scene(
+        self,
+        rows: Int[np.ndarray, " r"] | None = None,
+        targets: Int[np.ndarray, "t 2"] | None = None,
+    ) -> Scene:
+        """Returns the scene of some episodes, by default of all, with the seeds of predictors.
+
+        Args:
+            rows: numbers of the episodes, which are the situations in this order.
+            targets: (situation, slot) of the targets; by default all present agents but the egos.
+        """
+        scene = self.simulation.world.scene(rows, targets)
+        seeds = self._seeds.copy() if rows is None else self._seeds[rows]
+        return dataclasses.replace(scene, seeds=seeds)
+
+    def recorded_future(
+        self, scene: Scene, horizon: int, rows: Int[np.ndarray, " r"] | None = None
+    ) -> Future:
+        """Returns the recorded future of a scene's targets, for privileged predictors.
+
+        Args:
+            scene: a present scene.
+            horizon: number of ticks.
+            rows: numbers of the episodes that are its situations; all by default.
+        """
+        return recorded_future(self.simulation.world, scene, horizon, rows)
+
+    @property
+    def num_steps(self) -> Int[np.ndarray, " b"]:
+        """Number of steps since the start of each episode."""
+        return self._num_steps
+
+    def info(self) -> dict[str, Any]:
+        """Returns the present infos in new arrays; keys, shapes and types never change.
+
+        The value of `tags` is (B, tags), that of `reward_terms` a dictionary of arrays (B,), and
+        all others are (B,).
+        """
         events = self.events
         assert events is not None
+        endings = ending(events)
+        # An episode has not ended before its first step, even where its goal is at its start.
+        endings[events.elapsed == 0] = Ending.RUNNING
         return {
             "scenario": self._names.copy(),
             "tags": self._tags.copy(),
@@ -297,20 +460,70 @@ class ReplayEpisodes:
             "collision": events.collision,
             "at_fault": events.at_fault,
             "off_road_m": events.off_road_m.astype(np.float64),
+            "reward_terms": {name: term.copy() for name, term in self._terms.items()},
+            "ending": _ENDING_NAMES[endings],
+            "is_success": endings == Ending.GOAL,
+            "episode_return": self._return.copy(),
+            "episode_length": self._num_steps.copy(),
         }
 
     def snapshot(self) -> Any:
         """Returns the whole state for `restore`; it holds no recordings and no rasters."""
-        return self.simulation.snapshot()
+        forecasts = [each.snapshot() for each in self._forecasts]
+        statistics = self._return.copy(), self._num_steps.copy(), dict(self._terms)
+        return self.simulation.snapshot(), self._seeds.copy(), forecasts, statistics
 
     def restore(self, snapshot: Any) -> None:
         """Restores the state of a snapshot, bit for bit."""
-        self.simulation.restore(snapshot)
+        simulation, seeds, forecasts, (returns, num_steps, terms) = snapshot
+        self.simulation.restore(simulation)
+        self._return, self._num_steps = returns.copy(), num_steps.copy()
+        self._terms = dict(terms)
+        self._seeds = seeds.copy()
+        self._number(self._rows)
+        for each, stored in zip(self._forecasts, forecasts, strict=True):
+            each.restore(stored, self._serials)
         world = self.simulation.world
         for b, scenario in enumerate(world.scenarios):
-            self._names[b] = None if scenario is None else scenario.name
-            self._tags[b] = None if scenario is None else scenario.tags
+            self._describe(b, scenario)
         self.events = world.events()
+
+    def _number(self, rows: Int[np.ndarray, " n"]) -> None:
+        """Gives episodes serial numbers, so that forecasts of earlier ones are not shown."""
+        self._serials[rows] = self._num_begun + np.arange(len(rows))
+        self._num_begun += len(rows)
+
+
+def _seed_from(rng: np.random.Generator) -> int:
+    """A number of 64 bits from the state of a generator, which stays unchanged."""
+    state = rng.bit_generator.state["state"]
+    bits = state["state"] ^ state["inc"]
+    return (bits ^ (bits >> 64)) & (2**64 - 1)
+
+
+def _merge_events(new: Events, old: Events, rows: Bool[np.ndarray, " b"]) -> Events:
+    """The new events in the rows of a mask, the old ones in the others."""
+    merged = {}
+    for field in dataclasses.fields(Events):
+        left, right = getattr(new, field.name), getattr(old, field.name)
+        merged[field.name] = np.where(rows.reshape(-1, *[1] * (left.ndim - 1)), left, right)
+    return Events(**merged)
+
+
+def info_of(infos: Mapping[str, Any], b: int) -> dict[str, Any]:
+    """Returns the info of one episode of `ReplayEpisodes.info`, with numbers as Python's own.
+
+    Args:
+        infos: the infos of all episodes.
+        b: number of the episode.
+    """
+    info: dict[str, Any] = {}
+    for name, values in infos.items():
+        if isinstance(values, Mapping):
+            info[name] = info_of(values, b)
+        else:
+            info[name] = values[b].copy() if values.ndim > 1 else values.tolist()[b]
+    return info
 
 
 def _events_of(events: Events, rows: Int[np.ndarray, " n"]) -> Events:

@@ -7,9 +7,13 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, TypeVar, cast
 
+import numpy as np
+
 from asp_env.data.recording import DEFAULT_DT_S
 from asp_env.data.scenarios.scenario import ScenarioFilter, ScenarioSet
+from asp_env.envs.forecasts import ForecastSpec, PredictorSpec
 from asp_env.errors import AspEnvError
+from asp_env.sim.action_types import ActionType
 from asp_env.sim.traffic.assignment import TrafficSpec
 
 Function = TypeVar("Function", bound=Callable[..., Any])
@@ -24,21 +28,54 @@ class ReplayOptions:
     """
 
     observations: Sequence[str] = ("raster", "actions", "state")
-    """Components of the observation: some of `raster`, `vectors`, `actions`, `state`, `route` and
-    the names of views that draw rasters."""
+    """Components of the observation: some of `raster`, `vectors`, `actions`, `state`, `route`,
+    `nearest` and the names of views that draw rasters."""
     view: str = "chauffeurnet"
     """The view that draws the `raster`."""
-    raster_px: tuple[int, int] | None = None
-    """Height and width of the `raster` in pixels; the view's own by default."""
+    raster_px: int | Sequence[int] | None = None
+    """Height and width of the `raster` in pixels, or one number for both; by default the view's.
+    """
     traffic: TrafficSpec | None = None
     """The driver of the uncontrolled agents, or a table of drivers by id and class; by default the
     world moves them."""
     dt_s: float = DEFAULT_DT_S
     """Length of a tick in seconds."""
+    action_type: ActionType = "direct"
+    """What the two numbers of an action mean, see `asp_env.sim.action_types`."""
+    action_repeat: int = 1
+    """Number of ticks for which each action is held; rewards are summed over them."""
     reward_weights: Mapping[str, float] | None = None
     """Weights of reward terms by name, where they differ from the defaults."""
     scenarios: ScenarioSet | ScenarioFilter | str = ""
     """The scenarios to draw from: a set of them, or a filter such as `left,length>=8`."""
+    predictor: PredictorSpec | None = None
+    """The predictor whose forecasts the observation shows, or its name; several in a mapping with
+    the prefixes of their entries. None adds nothing."""
+    forecast: ForecastSpec | None = None
+    """`ForecastOptions` or a mapping of its fields; for several predictors also a mapping from
+    their prefixes to either."""
+
+
+def raster_size(raster_px: int | Sequence[int] | None) -> tuple[int, int] | None:
+    """Returns the height and the width of rasters in pixels.
+
+    Args:
+        raster_px: both, one number for both, or None for those of the view.
+
+    Raises:
+        AspEnvError: it is neither one nor two whole numbers.
+    """
+    if raster_px is None:
+        return None
+    is_sequence = isinstance(raster_px, Sequence | np.ndarray) and not isinstance(raster_px, str)
+    sizes = list(raster_px) if is_sequence else [raster_px, raster_px]
+    whole = [isinstance(size, int | np.integer) and not isinstance(size, bool) for size in sizes]
+    if len(sizes) != 2 or not all(whole):
+        raise AspEnvError(
+            f"raster_px {raster_px!r}: expected height and width in pixels such as (90, 60), or "
+            "one number for a square raster"
+        )
+    return int(sizes[0]), int(sizes[1])
 
 
 class UnknownOptionError(AspEnvError, TypeError):

@@ -13,7 +13,6 @@ from typing import Any
 import gymnasium
 import numpy as np
 from gymnasium import spaces
-from gymnasium.spaces import flatten_space
 from gymnasium.utils import seeding
 from jaxtyping import Bool, Float, Int
 from pettingzoo import ParallelEnv
@@ -22,11 +21,14 @@ from asp_env.data.classes import PREDICTED, AgentClass
 from asp_env.data.recording import DEFAULT_DT_S, Recording, frames_per_tick
 from asp_env.data.scenarios.scenario import Scenario, ScenarioFilter, ScenarioSet
 from asp_env.data.scene import EGO, Scene
-from asp_env.dynamics import denormalize_actions
-from asp_env.envs.episodes import RESET_OPTIONS, ReplayEpisodes, StepResult, valid_actions
+from asp_env.envs.episodes import RESET_OPTIONS, ReplayEpisodes, info_of, valid_actions
+from asp_env.envs.flat import Flatten, flat_space, flatten_observations
+from asp_env.envs.forecasts import ForecastSpec, PredictorSpec
 from asp_env.envs.options import ReplayOptions, suggest_options
 from asp_env.errors import AspEnvError, unknown_name
 from asp_env.render.frames import draw_frame
+from asp_env.render.live import render_fps
+from asp_env.sim.action_types import ActionType
 from asp_env.sim.reward import MIN_GOAL_M
 from asp_env.sim.traffic import Control, Driver
 from asp_env.sim.traffic.assignment import TrafficSpec
@@ -192,7 +194,7 @@ PRESENT = "present"
 """The key of the mask of `pad_absent` in observations and infos."""
 
 Observations = dict[str, Any]
-"""The observation of each agent: a dict of arrays, or with `flatten` one array."""
+"""The observation of each agent: a dict of arrays, or with `flatten=True` one array."""
 
 
 class ParallelReplayEnv(ParallelEnv[str, Any, Any]):
@@ -215,8 +217,7 @@ class ParallelReplayEnv(ParallelEnv[str, Any, Any]):
 
     ## Observation Space
     That of `ReplayEnv` for each agent. `pad_absent` adds the entry `present`, `Box(0, 1, (1,),
-    int8)`, which is 0 for an absent agent; all other entries are zeros then. `flatten` makes one
-    float32 `Box` of all entries, in their order, as `gymnasium.spaces.flatten` does.
+    int8)`, which is 0 for an absent agent; all other entries are zeros then.
 
     ## Rewards
     Those of `ReplayEnv` for each agent; 0 for an absent one.
@@ -251,9 +252,10 @@ default all |
 all |
     | `max_agents` | `None` | the largest number of agents; those nearest to `vehicle_0` are taken |
     | `pad_absent` | `False` | absent agents stay in `agents`, with zeros and the mask `present` |
-    | `flatten` | `False` | the observation of an agent is one flat `Box` instead of a `Dict` |
+    | `flatten` | `False` | `True`: the observation of an agent is one vector; `"parts"`: each \
+entry is a vector, images stay images |
     | `numeric_infos` | `False` | infos are numbers only, with the same keys after `reset` and \
-`step`; no `scenario`, `tags`, `reward_terms`, `ending` |
+`step`; no `scenario`, `ending` and `reward_terms` |
 
     ## Version History
     - v0: initial version
@@ -268,16 +270,20 @@ all |
         ids: Sequence[int] | None = None,
         max_agents: int | None = None,
         pad_absent: bool = False,
-        flatten: bool = False,
+        flatten: Flatten = False,
         numeric_infos: bool = False,
         render_mode: str | None = None,
         observations: Sequence[str] = ("raster", "actions", "state"),
         view: str = "chauffeurnet",
-        raster_px: tuple[int, int] | None = None,
+        raster_px: int | Sequence[int] | None = None,
         traffic: TrafficSpec | None = None,
         dt_s: float = DEFAULT_DT_S,
+        action_type: ActionType = "direct",
+        action_repeat: int = 1,
         reward_weights: Mapping[str, float] | None = None,
         scenarios: ScenarioSet | ScenarioFilter | str = "",
+        predictor: PredictorSpec | None = None,
+        forecast: ForecastSpec | None = None,
     ) -> None:
         """Makes the environment; the arguments are those of the class documentation.
 
@@ -294,13 +300,20 @@ all |
             raster_px=raster_px,
             traffic=traffic,
             dt_s=dt_s,
+            action_type=action_type,
+            action_repeat=action_repeat,
             reward_weights=reward_weights,
             scenarios=scenarios,
+            predictor=predictor,
+            forecast=forecast,
         )
-        self.metadata = {"name": "asp_env/ParallelReplay-v0", "render_modes": ["rgb_array"]}
         self.render_mode = render_mode
         self._episodes = ReplayEpisodes(data, options, 1)
-        self.metadata["render_fps"] = 1 / dt_s
+        self.metadata = {
+            "name": "asp_env/ParallelReplay-v0",
+            "render_modes": ["rgb_array"],
+            "render_fps": render_fps(dt_s * action_repeat),
+        }
         self.recordings = self._episodes.recordings
         selection = AgentSelection(classes=classes, ids=ids)
         self._selected = tuple(selection.mask(recording) for recording in self.recordings)
@@ -311,18 +324,18 @@ all |
         simulation.driver = JointPolicyDriver(simulation.driver)
         self.possible_agents = [f"vehicle_{row}" for row in range(self._max_agents)]
         self.agents: list[str] = []
-        self._pad_absent, self._flatten = pad_absent, flatten
+        self._pad_absent = pad_absent
+        self._flatten: Flatten = flatten
         self._numeric_infos = numeric_infos
         self._rows = {name: row for row, name in enumerate(self.possible_agents)}
         self._in_episode: list[str] = []
         """The agents of the episode: those that were present after `reset`."""
         self._present: list[str] = []
-        space: spaces.Space[Any] = self._episodes.observer.space
+        space = self._episodes.space
         if pad_absent:
             mask = spaces.Box(0, 1, (1,), dtype=np.int8)
-            space = spaces.Dict([*self._episodes.observer.space.items(), (PRESENT, mask)])
-        if flatten:
-            space = flatten_space(space)
+            space = spaces.Dict([*self._episodes.space.items(), (PRESENT, mask)])
+        space = flat_space(space, flatten)
         self.observation_spaces: dict[str, Any] = dict.fromkeys(self._rows, space)
         self.action_spaces: dict[str, spaces.Space[Any]] = {
             name: spaces.Box(-1.0, 1.0, (2,), dtype=np.float32) for name in self._rows
@@ -401,7 +414,7 @@ all |
             joint[self._rows[name]] = valid_actions(actions[name], (2,))
         driver = self._episodes.simulation.driver
         assert isinstance(driver, JointPolicyDriver)
-        driver.actions = denormalize_actions(joint)
+        driver.actions = self._episodes.physical_actions(joint)
         result = self._episodes.step(joint)
         over = result.terminated | result.truncated
         remaining = [name for name in self._present if not over[self._rows[name]]]
@@ -416,7 +429,7 @@ all |
             self._by_agent(np.where(present, result.reward, 0.0)),
             self._by_agent(terminated),
             self._by_agent(truncated),
-            self._infos(result),
+            self._infos(),
         )
         self._episodes.simulation.world.episodes.departed |= driver.slots_of(over)
         self._present = remaining
@@ -440,7 +453,7 @@ all |
                 f"{agent} is absent from this episode: expected one of "
                 f"{', '.join(self._in_episode)}"
             )
-        return self._episodes.simulation.world.scene().situation(self._rows[agent])
+        return self._episodes.scene().situation(self._rows[agent])
 
     def state(self) -> Float[np.ndarray, "agents 7"]:
         """Returns the states of all possible agents in the recording's frame.
@@ -510,35 +523,23 @@ all |
             observed = {
                 name: _pad(values, rows, self._max_agents) for name, values in observed.items()
             }
-        names = self.agents
-        if self._flatten:
-            flat = np.concatenate(
-                [values.reshape(len(names), -1) for values in observed.values()],
-                axis=1,
-                dtype=np.float32,
-            )
-            return dict(zip(names, flat, strict=True))
+        observed = flatten_observations(observed, self._flatten)
+        if self._flatten is True:
+            return dict(zip(self.agents, observed, strict=True))
         return {
             agent: {name: values[row] for name, values in observed.items()}
-            for row, agent in enumerate(names)
+            for row, agent in enumerate(self.agents)
         }
 
-    def _infos(self, result: StepResult | None = None) -> dict[str, dict[str, Any]]:
-        columns = {
-            name: self._by_agent(value)
-            for name, value in self._episodes.info().items()
-            if not (self._numeric_infos and value.dtype == object)
-        }
-        if result is not None and not self._numeric_infos:
-            terms = {name: self._by_agent(value) for name, value in result.terms.items()}
-            columns["reward_terms"] = {
-                agent: {name: value[agent] for name, value in terms.items()}
-                for agent in self.agents
+    def _infos(self) -> dict[str, dict[str, Any]]:
+        rows = self._episodes.info()
+        if self._numeric_infos:
+            rows = {
+                name: values
+                for name, values in rows.items()
+                if isinstance(values, np.ndarray) and values.dtype != object
             }
-            columns["ending"] = self._by_agent(result.ending)
-        infos = {
-            agent: {name: value[agent] for name, value in columns.items()} for agent in self.agents
-        }
+        infos = {agent: info_of(rows, self._rows[agent]) for agent in self.agents}
         if self._pad_absent:
             empty = _empty(infos[self._present[0]])
             present = set(self._present)

@@ -9,20 +9,26 @@ import gymnasium
 import numpy as np
 from jaxtyping import Float, Shaped
 
-from asp_env.data.predictor import Forecast
+from asp_env.data.predictor import Forecast, Predictor
 from asp_env.data.recording import DEFAULT_DT_S, Background
 from asp_env.data.scenarios.scenario import Scenario, ScenarioFilter, ScenarioSet
 from asp_env.data.scene import Scene
 from asp_env.data.snippets import Future
 from asp_env.data.source import Recordings
-from asp_env.envs.episodes import ReplayEpisodes, StepResult, valid_actions
+from asp_env.envs.episodes import ReplayEpisodes, StepResult, info_of, valid_actions
+from asp_env.envs.flat import Flatten, flat_space, flatten_observations
+from asp_env.envs.forecasts import ForecastSpec, PredictorSpec
+from asp_env.envs.hints import hint_at_large_observations
+from asp_env.envs.keyboard import keyboard_actions
 from asp_env.envs.options import ReplayOptions, suggest_options
-from asp_env.render.live import MODES, LiveRenderer
+from asp_env.envs.shared_in_spec import SharedInSpec
+from asp_env.render.live import MODES, LiveRenderer, render_fps
+from asp_env.sim.action_types import ActionType
 from asp_env.sim.traffic.assignment import TrafficSpec
-from asp_env.sim.world import World, recorded_future
+from asp_env.sim.world import World
 
 NOT_BEGUN = "no episode has begun: call reset first"
-METADATA = {"render_modes": [*MODES], "render_fps": 5}
+METADATA = {"render_modes": [*MODES], "render_fps": render_fps(DEFAULT_DT_S)}
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -50,7 +56,7 @@ class EnvSnapshot:
         return partial(EnvSnapshot, **{name: getattr(self, name) for name in names}), ()
 
 
-class ReplayEnv(gymnasium.Env[dict[str, Any], Any]):
+class ReplayEnv(SharedInSpec, gymnasium.Env[Any, Any]):
     """Controls one vehicle of a recording, the ego, among replayed or reacting traffic.
 
     ## Description
@@ -176,6 +182,9 @@ table of drivers; `log` by default, `own` in a world with reacting traffic |
     | `dt_s` | `0.2` | length of a tick in seconds |
     | `reward_weights` | `None` | weights of reward terms that differ from the defaults |
     | `scenarios` | `""` | a set of scenarios, or a filter such as `left,length>=8` |
+    | `predictor` | `None` | predictor whose forecasts become entries of the observation, or its \
+name; several in a mapping with their prefixes |
+    | `forecast` | `None` | `ForecastOptions` or a mapping of its fields |
 
     An unknown argument raises a `TypeError` that names the nearest known one.
     `asp_env/HighwayIntersection-v0` and `asp_env/HighwayRoundabout-v0` are this environment with
@@ -195,14 +204,19 @@ table of drivers; `log` by default, `own` in a world with reacting traffic |
         self,
         data: str = "sample:intersection",
         *,
+        flatten: Flatten = False,
         render_mode: str | None = None,
         observations: Sequence[str] = ("raster", "actions", "state"),
         view: str = "chauffeurnet",
-        raster_px: tuple[int, int] | None = None,
+        raster_px: int | Sequence[int] | None = None,
         traffic: TrafficSpec | None = None,
         dt_s: float = DEFAULT_DT_S,
+        action_type: ActionType = "direct",
+        action_repeat: int = 1,
         reward_weights: Mapping[str, float] | None = None,
         scenarios: ScenarioSet | ScenarioFilter | str = "",
+        predictor: PredictorSpec | None = None,
+        forecast: ForecastSpec | None = None,
     ) -> None:
         """Makes the environment; the arguments are those of the class documentation.
 
@@ -216,23 +230,29 @@ table of drivers; `log` by default, `own` in a world with reacting traffic |
             raster_px=raster_px,
             traffic=traffic,
             dt_s=dt_s,
+            action_type=action_type,
+            action_repeat=action_repeat,
             reward_weights=reward_weights,
             scenarios=scenarios,
+            predictor=predictor,
+            forecast=forecast,
         )
         self.render_mode = render_mode
         self._episodes = ReplayEpisodes(data, options, 1)
-        self.observation_space = self._episodes.observer.space
+        self.observation_space = flat_space(self._episodes.space, flatten)
+        self._flatten: Flatten = flatten
+        hint_at_large_observations(self._episodes.space, is_vector=False)
         self.action_space = self._episodes.action_space
         self._running = False
         self._start: tuple[Scenario, Mapping[str, Any]] | None = None
         """The scenario, and the state of its generator at the start."""
         self._actions: list[Float[np.ndarray, " 2"]] = []
-        self.metadata = {**METADATA, "render_fps": round(1 / dt_s, 6)}
+        self.metadata = {**METADATA, "render_fps": render_fps(dt_s * action_repeat)}
         self._live = LiveRenderer(render_mode, title=f"asp-env: {data}", dt_s=dt_s)
 
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
-    ) -> tuple[dict[str, Any], dict[str, Any]]:
+    ) -> tuple[Any, dict[str, Any]]:
         """Starts an episode.
 
         Args:
@@ -250,7 +270,7 @@ table of drivers; `log` by default, `own` in a world with reacting traffic |
         self._update_window()
         return self._observe(), self._info()
 
-    def step(self, action: Any) -> tuple[dict[str, Any], float, bool, bool, dict[str, Any]]:
+    def step(self, action: Any) -> tuple[Any, float, bool, bool, dict[str, Any]]:
         """Steps by one tick with an action (2,), which is clipped to [-1, 1].
 
         Raises:
@@ -262,12 +282,8 @@ table of drivers; `log` by default, `own` in a world with reacting traffic |
         result = self._act(valid_actions(action, (2,)))
         terminated, truncated = bool(result.terminated[0]), bool(result.truncated[0])
         self._running = not (terminated or truncated)
-        info = self._info() | {
-            "reward_terms": {name: float(value[0]) for name, value in result.terms.items()},
-            "ending": result.ending[0],
-        }
         self._update_window()
-        return self._observe(), float(result.reward[0]), terminated, truncated, info
+        return self._observe(), float(result.reward[0]), terminated, truncated, self._info()
 
     def scene(self) -> Scene:
         """Returns everything that may be known now, for predictors and planners; the ego is slot 0.
@@ -275,7 +291,8 @@ table of drivers; `log` by default, `own` in a world with reacting traffic |
         Raises:
             gymnasium.error.ResetNeeded: no episode has begun.
         """
-        return self._world().scene()
+        self._check_begun()
+        return self._episodes.scene()
 
     def recorded_future(self, scene: Scene, horizon: int) -> Future:
         """Returns the recorded future of a scene's targets, for privileged predictors.
@@ -287,7 +304,8 @@ table of drivers; `log` by default, `own` in a world with reacting traffic |
         Raises:
             gymnasium.error.ResetNeeded: no episode has begun.
         """
-        return recorded_future(self._world(), scene, horizon)
+        self._check_begun()
+        return self._episodes.recorded_future(scene, horizon)
 
     def snapshot(self) -> EnvSnapshot:
         """Returns the whole state, including that of `np_random`, for `restore`.
@@ -317,6 +335,7 @@ table of drivers; `log` by default, `own` in a world with reacting traffic |
             rng.bit_generator.state = snapshot.rng
             self._begin(snapshot.scenario, rng)
             for action in snapshot.actions:
+                self._episodes.make_forecasts()
                 self._act(action)
         else:
             self._episodes.restore(snapshot.arrays)
@@ -358,9 +377,22 @@ table of drivers; `log` by default, `own` in a world with reacting traffic |
             return None
         return self._live.render(self.scene(), self._background())
 
+    def get_keys_to_action(self) -> dict[str | tuple[str | int, ...], Float[np.ndarray, " 2"]]:
+        """Returns the actions of keys for `gymnasium.utils.play.play`.
+
+        W or up accelerates by 2 m/s², S or down brakes by 4 m/s², and A, D, left and right steer by
+        9°. The empty text stands for no key.
+        """
+        return keyboard_actions()
+
     def close(self) -> None:
         """Closes the window."""
         self._live.close()
+
+    @property
+    def episodes(self) -> ReplayEpisodes:
+        """The single episode as a batch of one, for wrappers."""
+        return self._episodes
 
     @property
     def dt_s(self) -> float:
@@ -371,6 +403,11 @@ table of drivers; `log` by default, `own` in a world with reacting traffic |
     def recordings(self) -> Recordings:
         """The recordings of `data`."""
         return self._episodes.recordings
+
+    @property
+    def predictors(self) -> tuple[Predictor, ...]:
+        """The predictors whose forecasts are part of the observation."""
+        return self._episodes.predictors
 
     @property
     def scenarios(self) -> ScenarioSet:
@@ -385,15 +422,19 @@ table of drivers; `log` by default, `own` in a world with reacting traffic |
         self._actions.append(action)
         return self._episodes.step(action[None])
 
-    def _observe(self) -> dict[str, Any]:
-        return {name: value[0] for name, value in self._episodes.observe().items()}
+    def _observe(self) -> Any:
+        seen = flatten_observations(self._episodes.observe(), self._flatten)
+        return seen[0] if self._flatten is True else {name: each[0] for name, each in seen.items()}
 
     def _info(self) -> dict[str, Any]:
-        return {name: value.tolist()[0] for name, value in self._episodes.info().items()}
+        return info_of(self._episodes.info(), 0)
 
-    def _world(self) -> World:
+    def _check_begun(self) -> None:
         if self._start is None:
             raise gymnasium.error.ResetNeeded(NOT_BEGUN)
+
+    def _world(self) -> World:
+        self._check_begun()
         return self._episodes.simulation.world
 
     def _update_window(self) -> None:

@@ -11,10 +11,12 @@ from stable_baselines3.common.vec_env import VecEnv
 from stable_baselines3.common.vec_env.base_vec_env import VecEnvIndices, VecEnvStepReturn
 
 from asp_env.data.scene import Scene
+from asp_env.envs.flat import observation_of
 from asp_env.errors import AspEnvError
 
 Infos = list[dict[str, Any]]
-Observations = dict[str, np.ndarray]
+Observations = Any
+"""A dict of arrays, or one array."""
 
 _PER_ENVIRONMENT = ("np_random", "np_random_seed")
 _SINGLE = ("observation_space", "action_space")
@@ -44,6 +46,10 @@ class ReplayVecEnv(VecEnv):
         self.envs = envs
         self._actions = np.zeros((envs.num_envs, 2), dtype=np.float32)
         super().__init__(envs.num_envs, envs.single_observation_space, envs.single_action_space)
+        # `VecVideoRecorder` takes its frame rate from here.
+        self.metadata = {
+            name: value for name, value in envs.metadata.items() if name.startswith("render_")
+        }
 
     def reset(self) -> Observations:
         """Starts all episodes with the seeds and options that were set, and clears these."""
@@ -69,6 +75,8 @@ class ReplayVecEnv(VecEnv):
             observations = self._restart(observations, over, infos)
         for info, limit in zip(infos, limits, strict=True):
             info["TimeLimit.truncated"] = limit
+        for b in np.flatnonzero(over).tolist():
+            infos[b]["episode"] = {"r": infos[b]["episode_return"], "l": infos[b]["episode_length"]}
         return observations, rewards.astype(np.float32), over, infos
 
     def _restart(self, observations: Observations, over: np.ndarray, infos: Infos) -> Observations:
@@ -80,8 +88,7 @@ class ReplayVecEnv(VecEnv):
                 self.reset_infos[b], infos[b] = infos[b], ended | {"terminal_observation": last}
             return observations
         for b in rows:
-            last = {name: value[b].copy() for name, value in observations.items()}
-            infos[b]["terminal_observation"] = last
+            infos[b]["terminal_observation"] = observation_of(observations, b)
         observations, batched = self.envs.reset(options={"reset_mask": over})
         reset_infos = _unbatch_infos(batched, self.num_envs)
         for b in rows:
@@ -174,7 +181,10 @@ def _unbatch_infos(infos: dict[str, Any], count: int) -> Infos:
         if not name.startswith("_"):
             continue
         values = infos[name[1:]]
-        plain = _unbatch_infos(values, count) if isinstance(values, dict) else values.tolist()
+        if isinstance(values, dict):
+            plain = _unbatch_infos(values, count)
+        else:
+            plain = list(values) if values.ndim > 1 else values.tolist()
         for b in np.flatnonzero(mask).tolist():
             unbatched[b][name[1:]] = plain[b]
     return unbatched

@@ -1,5 +1,6 @@
 """Many episodes of `asp_env/Replay-v0` side by side, batched in arrays."""
 
+import dataclasses
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
@@ -11,18 +12,24 @@ from gymnasium.vector import AutoresetMode, VectorEnv
 from gymnasium.vector.utils import batch_space
 from jaxtyping import Bool, Shaped
 
+from asp_env.data.predictor import Predictor
 from asp_env.data.recording import DEFAULT_DT_S
 from asp_env.data.scenarios.scenario import ScenarioFilter, ScenarioSet
 from asp_env.data.scene import Scene
 from asp_env.data.snippets import Future
 from asp_env.data.source import Recordings
 from asp_env.envs.episodes import ObservationBuffers, ReplayEpisodes, StepResult, valid_actions
+from asp_env.envs.flat import Flatten, flat_space, flatten_observations, observation_of
+from asp_env.envs.forecasts import ForecastSpec, PredictorSpec
+from asp_env.envs.hints import hint_at_large_observations
 from asp_env.envs.options import ReplayOptions, suggest_options
+from asp_env.envs.shared_in_spec import SharedInSpec
 from asp_env.errors import AspEnvError
 from asp_env.render.frames import draw_frame
+from asp_env.render.live import render_fps
+from asp_env.sim.action_types import ActionType
 from asp_env.sim.observation import Observation
 from asp_env.sim.traffic.assignment import TrafficSpec
-from asp_env.sim.world import recorded_future
 
 Infos = dict[str, Any]
 
@@ -38,7 +45,7 @@ class VectorSnapshot:
     over: Bool[np.ndarray, " n"]
 
 
-class ReplayVectorEnv(VectorEnv[Observation, Any, np.ndarray]):
+class ReplayVectorEnv(SharedInSpec, VectorEnv[Any, Any, np.ndarray]):
     """`asp_env/Replay-v0` as a vector environment: one world of arrays for all episodes.
 
     ## Description
@@ -89,14 +96,20 @@ class ReplayVectorEnv(VectorEnv[Observation, Any, np.ndarray]):
         data: str = "sample:intersection",
         *,
         autoreset_mode: AutoresetMode | str = AutoresetMode.NEXT_STEP,
+        max_episode_steps: int | None = None,
+        flatten: Flatten = False,
         render_mode: str | None = None,
         observations: Sequence[str] = ("raster", "actions", "state"),
         view: str = "chauffeurnet",
-        raster_px: tuple[int, int] | None = None,
+        raster_px: int | Sequence[int] | None = None,
         traffic: TrafficSpec | None = None,
         dt_s: float = DEFAULT_DT_S,
+        action_type: ActionType = "direct",
+        action_repeat: int = 1,
         reward_weights: Mapping[str, float] | None = None,
         scenarios: ScenarioSet | ScenarioFilter | str = "",
+        predictor: PredictorSpec | None = None,
+        forecast: ForecastSpec | None = None,
     ) -> None:
         """Makes the environment; the arguments are those of the class documentation.
 
@@ -105,6 +118,8 @@ class ReplayVectorEnv(VectorEnv[Observation, Any, np.ndarray]):
         """
         if num_envs < 1:
             raise AspEnvError(f"num_envs {num_envs}: expected at least 1")
+        if max_episode_steps is not None and max_episode_steps < 1:
+            raise AspEnvError(f"max_episode_steps {max_episode_steps}: expected at least 1")
         if render_mode not in (None, "rgb_array"):
             raise AspEnvError(f"render mode {render_mode!r}: expected rgb_array or None")
         options = ReplayOptions(
@@ -113,15 +128,26 @@ class ReplayVectorEnv(VectorEnv[Observation, Any, np.ndarray]):
             raster_px=raster_px,
             traffic=traffic,
             dt_s=dt_s,
+            action_type=action_type,
+            action_repeat=action_repeat,
             reward_weights=reward_weights,
             scenarios=scenarios,
+            predictor=predictor,
+            forecast=forecast,
         )
         self.num_envs = num_envs
-        self._mode = _parse_autoreset_mode(autoreset_mode)
-        self.metadata = {**self.metadata, "autoreset_mode": self._mode}
+        self.autoreset_mode = _parse_autoreset_mode(autoreset_mode)
         self.render_mode = render_mode
         self._episodes = ReplayEpisodes(data, options, num_envs)
-        self.single_observation_space = self._episodes.observer.space
+        self.metadata = {
+            "render_modes": ["rgb_array"],
+            "render_fps": render_fps(dt_s * action_repeat),
+            "autoreset_mode": self.autoreset_mode,
+        }
+        self.single_observation_space = flat_space(self._episodes.space, flatten)
+        self._flatten: Flatten = flatten
+        self._max_episode_steps = max_episode_steps
+        hint_at_large_observations(self._episodes.space, is_vector=True)
         self.single_action_space = self._episodes.action_space
         self.observation_space = batch_space(self.single_observation_space, num_envs)
         self.action_space = batch_space(self.single_action_space, num_envs)
@@ -136,7 +162,7 @@ class ReplayVectorEnv(VectorEnv[Observation, Any, np.ndarray]):
         *,
         seed: int | Sequence[int | None] | None = None,
         options: dict[str, Any] | None = None,
-    ) -> tuple[Observation, Infos]:
+    ) -> tuple[Any, Infos]:
         """Starts all episodes, or those of `options["reset_mask"]`.
 
         Args:
@@ -155,9 +181,9 @@ class ReplayVectorEnv(VectorEnv[Observation, Any, np.ndarray]):
             if reset_mask[b] and env_seed is not None:
                 self._generators[b], self._seeds[b] = seeding.np_random(env_seed)
         self._begin(reset_mask, [_options_of(options, b, self.num_envs) for b in self._rows])
-        return self._observe(), _mask_infos(self._episodes.info(), reset_mask)
+        return self._flat(self._observe()), _mask_infos(self._episodes.info(), reset_mask)
 
-    def step(self, actions: Any) -> tuple[Observation, np.ndarray, np.ndarray, np.ndarray, Infos]:
+    def step(self, actions: Any) -> tuple[Any, np.ndarray, np.ndarray, np.ndarray, Infos]:
         """Steps all episodes by one tick with actions (num_envs, 2), which are clipped to [-1, 1].
 
         Raises:
@@ -167,45 +193,48 @@ class ReplayVectorEnv(VectorEnv[Observation, Any, np.ndarray]):
         if not self._begun.all():
             raise gymnasium.error.ResetNeeded("call reset before step")
         restart = self._over.copy()
-        if restart.any() and self._mode is not AutoresetMode.NEXT_STEP:
+        if restart.any() and self.autoreset_mode is not AutoresetMode.NEXT_STEP:
             over = np.flatnonzero(restart).tolist()
             raise gymnasium.error.ResetNeeded(
                 f"the episodes {over} are over: reset them with options={{'reset_mask': mask}}"
             )
         result = self._episodes.step(valid_actions(actions, (self.num_envs, 2), restart))
-        if self._mode is AutoresetMode.SAME_STEP:
+        if self._max_episode_steps is not None:
+            is_long = self._episodes.num_steps >= self._max_episode_steps
+            result = dataclasses.replace(result, truncated=result.truncated | is_long)
+        if self.autoreset_mode is AutoresetMode.SAME_STEP:
             return self._finish_same_step(result)
         if restart.any():
             self._begin(restart, [{}] * self.num_envs)
         stepped = ~restart
         infos = _mask_infos(self._episodes.info(), np.ones_like(restart))
-        infos |= _mask_infos(_step_infos(result), stepped)
         terminated, truncated = result.terminated & stepped, result.truncated & stepped
         self._over = terminated | truncated
         reward = np.where(stepped, result.reward, 0.0)
-        return self._observe(), reward, terminated, truncated, infos
+        return self._flat(self._observe()), reward, terminated, truncated, infos
 
     def _finish_same_step(
         self, result: StepResult
-    ) -> tuple[Observation, np.ndarray, np.ndarray, np.ndarray, Infos]:
+    ) -> tuple[Any, np.ndarray, np.ndarray, np.ndarray, Infos]:
         """Resets the finished episodes and moves their last observations to the infos."""
         over = result.terminated | result.truncated
-        observation, ended = self._observe(), self._episodes.info() | _step_infos(result)
+        observation, ended = self._observe(), self._episodes.info()
         if not over.any():
             infos = _mask_infos(ended, ~over)
-            return observation, result.reward, result.terminated, result.truncated, infos
+            flat = self._flat(observation)
+            return flat, result.reward, result.terminated, result.truncated, infos
         rows = np.flatnonzero(over)
-        last = np.full(self.num_envs, None, dtype=object)
+        last, flat = np.full(self.num_envs, None, dtype=object), self._flat(observation)
         for b in rows.tolist():
-            last[b] = {name: value[b].copy() for name, value in observation.items()}
+            last[b] = observation_of(flat, b)
         self._begin(over, [{}] * self.num_envs)
         for name, value in self._episodes.observe(rows).items():
             observation[name][rows] = value
         infos = _mask_infos({"final_obs": last, "final_info": ended}, over)
         infos |= _mask_infos(self._episodes.info(), np.ones_like(over))
-        infos |= _mask_infos(_step_infos(result), ~over)
         self._over = np.zeros_like(over)
-        return observation, result.reward, result.terminated, result.truncated, infos
+        flat = self._flat(observation)
+        return flat, result.reward, result.terminated, result.truncated, infos
 
     def scene(self) -> Scene:
         """Returns everything that may be known now; situation i is environment i, its ego slot 0.
@@ -214,7 +243,7 @@ class ReplayVectorEnv(VectorEnv[Observation, Any, np.ndarray]):
             gymnasium.error.ResetNeeded: an episode has not begun.
         """
         self._check_begun()
-        return self._episodes.simulation.world.scene()
+        return self._episodes.scene()
 
     def recorded_future(self, scene: Scene, horizon: int) -> Future:
         """Returns the recorded future of a scene's targets, for privileged predictors.
@@ -227,7 +256,7 @@ class ReplayVectorEnv(VectorEnv[Observation, Any, np.ndarray]):
             gymnasium.error.ResetNeeded: an episode has not begun.
         """
         self._check_begun()
-        return recorded_future(self._episodes.simulation.world, scene, horizon)
+        return self._episodes.recorded_future(scene, horizon)
 
     def render(self) -> tuple[Any, ...] | None:
         """Returns the image of each environment, see `ReplayEnv.render`; None without a mode.
@@ -267,6 +296,11 @@ class ReplayVectorEnv(VectorEnv[Observation, Any, np.ndarray]):
         self._over = snapshot.over.copy()
 
     @property
+    def episodes(self) -> ReplayEpisodes:
+        """The episodes, for wrappers."""
+        return self._episodes
+
+    @property
     def dt_s(self) -> float:
         """Length of a tick in seconds."""
         return self._episodes.simulation.world.dt_s
@@ -277,9 +311,18 @@ class ReplayVectorEnv(VectorEnv[Observation, Any, np.ndarray]):
         return self._episodes.recordings
 
     @property
+    def predictors(self) -> tuple[Predictor, ...]:
+        """The predictors whose forecasts are part of the observation."""
+        return self._episodes.predictors
+
+    @property
     def scenarios(self) -> ScenarioSet:
-        """The scenarios to draw from."""
+        """The scenarios to draw from; others of the same data can be set, for a curriculum."""
         return self._episodes.scenarios
+
+    @scenarios.setter
+    def scenarios(self, scenarios: ScenarioSet) -> None:
+        self._episodes.draw_from(scenarios)
 
     @property
     def np_random(self) -> tuple[np.random.Generator, ...]:  # pyright: ignore[reportIncompatibleMethodOverride]
@@ -315,6 +358,9 @@ class ReplayVectorEnv(VectorEnv[Observation, Any, np.ndarray]):
 
     def _observe(self) -> Observation:
         return self._episodes.observe(out=self._buffers.take())
+
+    def _flat(self, observation: Observation) -> Any:
+        return flatten_observations(observation, self._flatten)
 
     def _check_begun(self) -> None:
         if not self._begun.all():
@@ -354,7 +400,7 @@ def _options_of(options: dict[str, Any], b: int, num_envs: int) -> dict[str, Any
     """Returns the reset options of environment `b`; a list holds one value for each."""
     chosen: dict[str, Any] = {}
     for name, value in options.items():
-        if not isinstance(value, list | tuple | np.ndarray):
+        if isinstance(value, str) or not isinstance(value, Sequence | np.ndarray):
             chosen[name] = value
         elif len(value) == num_envs:
             chosen[name] = value[b]
@@ -363,10 +409,6 @@ def _options_of(options: dict[str, Any], b: int, num_envs: int) -> dict[str, Any
                 f"reset option {name!r} of {len(value)} values: expected one or {num_envs}"
             )
     return chosen
-
-
-def _step_infos(result: StepResult) -> Infos:
-    return {"reward_terms": dict(result.terms), "ending": result.ending}
 
 
 def _mask_infos(infos: Infos, mask: Bool[np.ndarray, " n"]) -> Infos:
@@ -384,9 +426,9 @@ def _mask_infos(infos: Infos, mask: Bool[np.ndarray, " n"]) -> Infos:
     return masked
 
 
-def _mask_values(values: Shaped[np.ndarray, " n"], mask: Bool[np.ndarray, " n"]) -> np.ndarray:
+def _mask_values(values: Shaped[np.ndarray, "n ..."], mask: Bool[np.ndarray, " n"]) -> np.ndarray:
     if mask.all():
         return values
-    out = np.full(len(values), None if values.dtype == object else 0, dtype=values.dtype)
+    out = np.full(values.shape, None if values.dtype == object else 0, dtype=values.dtype)
     out[mask] = values[mask]
     return out

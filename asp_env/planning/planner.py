@@ -7,7 +7,7 @@ import numpy as np
 from jaxtyping import Float
 
 from asp_env import registry
-from asp_env.data.predictor import Forecast
+from asp_env.data.predictor import Forecast, Predictor
 from asp_env.data.scene import Scene
 from asp_env.errors import AspEnvError
 
@@ -27,7 +27,8 @@ class Planner(Protocol):
     """Decides what the egos (slot 0) of a scene do.
 
     A planner is registered in the entry point group `asp_env.planners`, as a callable without
-    arguments that returns it.
+    arguments that returns it. If the callable has an attribute `from_name`, the planner is named
+    `NAME:ARGUMENT`, and `from_name(ARGUMENT)` returns it.
     """
 
     name: str
@@ -46,6 +47,19 @@ class Planner(Protocol):
 
         Raises:
             AspEnvError: the scene has no routes.
+        """
+        ...
+
+
+@runtime_checkable
+class TrainedPlanner(Planner, Protocol):
+    """A planner that was trained with the forecasts of one predictor, or without any."""
+
+    def check_predictor(self, predictor: Predictor) -> None:
+        """Checks that a predictor is the one of the training.
+
+        Raises:
+            AspEnvError: it is another one.
         """
         ...
 
@@ -106,12 +120,21 @@ def planning_regret(
 
 
 def load_planner(name: str) -> Planner:
-    """The planner registered under a name.
+    """The planner registered under a name, or `NAME:ARGUMENT` for one that needs an argument.
 
     Raises:
-        AspEnvError: the name is unknown.
+        AspEnvError: the name is unknown, or the planner rejects the argument.
     """
-    return registry.find("planners", name)()
+    kind, colon, argument = name.partition(":")
+    factory = registry.find("planners", kind)
+    from_name = getattr(factory, "from_name", None)
+    if from_name is not None:
+        if not argument:
+            raise AspEnvError(f"planner {kind}: name a run as well, such as {kind}:RUN")
+        return from_name(argument)
+    if colon:
+        raise AspEnvError(f"planner {name}: {kind} takes no argument; write {kind}")
+    return factory()
 
 
 class Expert:

@@ -14,6 +14,15 @@ MODES = ("human", "rgb_array")
 SIZE_PX = (720, 720)
 
 
+def render_fps(dt_s: float) -> int:
+    """Frames per second of a video in real time, as a whole number, which Gymnasium requires.
+
+    Args:
+        dt_s: length of a tick in seconds.
+    """
+    return max(1, round(1 / dt_s))
+
+
 class LiveRenderer:
     """Frames on request, or a window that shows every tick of the episode."""
 

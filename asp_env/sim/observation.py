@@ -1,4 +1,4 @@
-"""Observations: rasters, vectors, action history, state and route, in any combination.
+"""Observations: rasters, vectors, actions, state, route and nearest agents, in any combination.
 
 An `Observer` consists of one `ObservationComponent` per name; each writes one or several arrays.
 They read an `ObservationContext`: the last ticks of some episodes from the view of their egos.
@@ -26,7 +26,7 @@ from asp_env.sim.world import Events, World
 from asp_env.views import RasterView, make_raster_view, raster_view_names, view_names
 from asp_env.views.vectors import AGENT_FIELDS, LINE_FIELDS, VectorBounds, Vectors, VectorView
 
-COMPONENT_NAMES = ("raster", "vectors", "actions", "state", "route")
+COMPONENT_NAMES = ("raster", "vectors", "actions", "state", "route", "nearest")
 """Observations besides the views that render rasters, which are observations by their names."""
 
 MAX_OBSERVED_POSITION_M = 1000.0
@@ -50,6 +50,12 @@ STATE_FIELDS: dict[str, tuple[float, float]] = {
     "width_m": (0.0, 10.0),
 }
 """Fields of the `state` observation in their order, with their bounds."""
+
+NEAREST_AGENTS = 8
+"""Number of agents of the `nearest` observation. Chosen by hand."""
+
+NEAREST_FIELDS = (*AGENT_FIELDS, "present")
+"""Fields of the `nearest` observation: `AGENT_FIELDS`, and 1 where there is an agent."""
 
 ROUTE_POINTS = 30
 """Number of points of the `route` observation."""
@@ -282,6 +288,30 @@ class RouteComponent:
         _clip_to(self.spaces["route"], out["route"])
 
 
+@final
+class NearestComponent:
+    """The agents nearest to the ego at the present tick: float32 (agents, `NEAREST_FIELDS`).
+
+    They are those of the view `vectors` without the ego: the nearest comes first, ties are ordered
+    by id, and rows without an agent are zero.
+    """
+
+    history = 1
+
+    def __init__(self) -> None:
+        self._view = VectorView(agents=NEAREST_AGENTS + 1, lines=0, history=self.history)
+        low, high = _field_bounds(NEAREST_FIELDS)
+        self.spaces: Spaces = {"nearest": _box(low, high, (NEAREST_AGENTS,))}
+
+    def write(self, context: ObservationContext, events: Events, out: Observation) -> None:
+        """Writes the fields of the nearest agents."""
+        del events
+        vectors = self._view.render(context)
+        out["nearest"][..., :-1] = vectors.agents[:, 1:, -1]
+        out["nearest"][..., -1] = vectors.agents_valid[:, 1:, -1]
+        _clip_to(self.spaces["nearest"], out["nearest"])
+
+
 class Observer:
     """Writes the observations of the chosen components, and computes nothing else."""
 
@@ -351,6 +381,8 @@ def _make_component(name: str, raster: RasterView, history: int) -> ObservationC
         return StateComponent()
     if name == "route":
         return RouteComponent()
+    if name == "nearest":
+        return NearestComponent()
     return RasterComponent(name, make_raster_view(name))
 
 

@@ -6,13 +6,19 @@ from dataclasses import dataclass, fields
 from typing import no_type_check
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 from numba import njit
 
 from asp_env.dynamics import MAX_ACCELERATION_MPS2
 from asp_env.errors import AspEnvError, unknown_name
 from asp_env.metrics.drivable import OFF_ROAD_M
 from asp_env.sim.world import Events
+
+STANDING_MPS = 0.5
+"""Below this speed the ego counts as standing. Chosen by hand."""
+
+ROUTE_OFFSET_M = 2.0
+"""Offset from the route at which the term `route` is -1 per second. Chosen by hand: half a lane."""
 
 MIN_GOAL_M = 1.0
 """Progress is relative to at least this distance, so that it stays finite. Chosen by hand."""
@@ -30,6 +36,17 @@ class RewardWeights:
     """-1 when the ego touches an agent and is at fault."""
     off_road: float = 1.0
     """-1 for every second in which a corner of the ego is over 0.3 m outside the drivable area."""
+    goal: float = 0.0
+    """1 in the step that reaches the goal."""
+    standing: float = 0.0
+    """-1 for every second at less than 0.5 m/s."""
+    route: float = 0.0
+    """Minus the square of the offset from the route over 2 m, at most 1, for every second; -1 for
+    every second whose heading differs from the route's by over 90°."""
+
+
+REWARD_TERMS = tuple(field.name for field in fields(RewardWeights))
+"""Names of the terms, in the order of their weights."""
 
 
 def weights_from(given: Mapping[str, float]) -> RewardWeights:
@@ -41,10 +58,9 @@ def weights_from(given: Mapping[str, float]) -> RewardWeights:
     Raises:
         AspEnvError: a name is unknown, or a value is not a finite number.
     """
-    known = [field.name for field in fields(RewardWeights)]
     for name, value in given.items():
-        if name not in known:
-            raise unknown_name("reward weight", name, known)
+        if name not in REWARD_TERMS:
+            raise unknown_name("reward weight", name, REWARD_TERMS)
         if not (isinstance(value, int | float) and math.isfinite(value)):
             raise AspEnvError(f"reward weight {name} {value}: expected a finite number")
     return RewardWeights(**{name: float(value) for name, value in given.items()})
@@ -69,12 +85,20 @@ def reward_terms(
     progress, comfort = np.empty(len(after.goal_m)), np.empty(len(after.goal_m))
     _write_progress(before.route_m, after.route_m, after.goal_m, progress)
     _write_comfort(states_before, states_after, dt_s, comfort)
+    offset = np.minimum((after.route_offset_m / ROUTE_OFFSET_M) ** 2, 1.0)
     return {
         "progress": progress,
         "comfort": comfort,
         "collision": -after.at_fault.astype(np.float64),
         "off_road": -dt_s * (after.off_road_m > OFF_ROAD_M),
+        "goal": (after.reached_goal & ~before.reached_goal).astype(np.float64),
+        "standing": -dt_s * (np.abs(states_after[:, 3]) < STANDING_MPS),
+        "route": -dt_s * np.where(_is_reversed(after, states_after), 1.0, offset),
     }
+
+
+def _is_reversed(events: Events, states: Float[np.ndarray, "b 4"]) -> Bool[np.ndarray, " b"]:
+    return np.cos(states[:, 2] - events.route_heading_rad) < 0.0
 
 
 @njit(cache=True)

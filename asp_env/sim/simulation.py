@@ -17,9 +17,6 @@ OFF_ROAD_END_M = 2.0
 """An episode ends this far outside the drivable area. Chosen by hand: smaller distances may be a
 gap in the map."""
 
-GOAL_TOLERANCE_M = 0.01
-"""The goal counts as reached this far before it: allows for rounding."""
-
 
 class Simulation:
     """B episodes in which the caller controls the egos and a driver controls the other agents."""
@@ -122,7 +119,7 @@ def ending(events: Events) -> Int[np.ndarray, " b"]:
     endings = np.full(len(events.elapsed), int(Ending.RUNNING), dtype=np.int64)
     masks = (
         (Ending.OUT_OF_DATA, events.elapsed >= events.length),
-        (Ending.GOAL, events.route_m >= events.goal_m - GOAL_TOLERANCE_M),
+        (Ending.GOAL, events.reached_goal),
         (Ending.OFF_ROAD, events.off_road_m > OFF_ROAD_END_M),
         (Ending.COLLISION, events.at_fault),
     )

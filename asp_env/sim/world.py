@@ -40,6 +40,9 @@ from asp_env.sim.episodes import (
 _AT_FAULT = np.array([kind in AT_FAULT for kind in Contact])
 """Whether the ego is at fault, by value of `Contact`."""
 
+GOAL_TOLERANCE_M = 0.01
+"""The goal counts as reached this far before it: allows for rounding."""
+
 
 class Ending(IntEnum):
     """Why an episode is over."""
@@ -77,6 +80,11 @@ class Events:
     """Ticks since the first observation."""
     length: Int[np.ndarray, " b"]
     """Ticks that the recording provides."""
+
+    @property
+    def reached_goal(self) -> Bool[np.ndarray, " b"]:
+        """Whether the ego is at its goal or beyond."""
+        return np.asarray(self.route_m >= self.goal_m - GOAL_TOLERANCE_M)
 
     @property
     def collision(self) -> Bool[np.ndarray, " b"]:
@@ -270,31 +278,54 @@ class World(ABC):
             states, episodes.sizes, valid & ~episodes.own_trailer, episodes.contacts
         )
 
-    def scene(self) -> Scene:
-        """All that may be known now, in fresh arrays. Targets: all present agents but the ego."""
+    def scene(
+        self,
+        rows: Int[np.ndarray, " r"] | None = None,
+        targets: Int[np.ndarray, "t 2"] | None = None,
+    ) -> Scene:
+        """All that may be known now, in fresh arrays.
+
+        Args:
+            rows: indices of the R episodes that are its situations, in their order; all by default.
+            targets: (situation, slot) of the targets; by default all present agents but the egos.
+        """
         episodes = self.episodes
-        self._infer_actions()
-        states, valid = last_ticks(episodes, self.now, self._rows, self.history)
-        past = self.now[:, None] + np.arange(-self.history, 0)
-        actions = np.ascontiguousarray(episodes.actions[self._rows[:, None], past].swapaxes(1, 2))
-        targets = valid[..., -1].copy()
-        targets[:, EGO] = False
+        every_row = rows is None
+        rows = self._rows if rows is None else rows
+        self._infer_actions(rows)
+        states, valid = last_ticks(episodes, self.now, rows, self.history)
+        past = self.now[rows, None] + np.arange(-self.history, 0)
+        actions = np.ascontiguousarray(episodes.actions[rows[:, None], past].swapaxes(1, 2))
+        if targets is None:
+            present = valid[..., -1].copy()
+            present[:, EGO] = False
+            targets = np.argwhere(present)
         seen = np.asarray(valid.any(axis=-1))  # agents that appear later are not known yet
+        sizes, classes, ids, route, route_valid = (
+            column.copy() if every_row else column[rows]
+            for column in (
+                episodes.sizes,
+                episodes.classes,
+                episodes.ids,
+                episodes.route,
+                episodes.route_valid,
+            )
+        )
         return Scene(
             states=states,
             actions=actions,
             valid=valid,
-            sizes=np.where(seen[..., None], episodes.sizes, 0).astype(np.float32),
-            classes=np.where(seen, episodes.classes, 0).astype(np.int32),
-            ids=np.where(seen, episodes.ids, -1),
-            tick=episodes.start_tick + episodes.elapsed,
-            targets=np.argwhere(targets),
-            route=episodes.route.copy(),
-            route_valid=episodes.route_valid.copy(),
+            sizes=np.where(seen[..., None], sizes, 0).astype(np.float32),
+            classes=np.where(seen, classes, 0).astype(np.int32),
+            ids=np.where(seen, ids, -1),
+            tick=episodes.start_tick[rows] + episodes.elapsed[rows],
+            targets=targets,
+            route=route,
+            route_valid=route_valid,
             maps=self._maps,
-            map_index=self._map_index,
+            map_index=self._map_index if every_row else self._map_index[rows],
             dt_s=self.dt_s,
-            signals=self.signals(self._rows),
+            signals=self.signals(rows),
         )
 
     def signals(self, rows: Int[np.ndarray, " r"]) -> SceneSignals | None:
@@ -313,12 +344,12 @@ class World(ABC):
             dt_s=self.dt_s,
         )
 
-    def _infer_actions(self) -> None:
-        """Brings `episodes.actions` up to date."""
+    def _infer_actions(self, wanted: Int[np.ndarray, " r"]) -> None:
+        """Brings `episodes.actions` of some episodes up to date."""
         episodes = self.episodes
-        behind = self.now - episodes.num_actions
+        behind = self.now[wanted] - episodes.num_actions[wanted]
         for missing in np.unique(behind[behind > 0]).tolist():
-            rows = np.flatnonzero(behind == missing)
+            rows = wanted[behind == missing]
             ticks = episodes.num_actions[rows, None] + np.arange(missing + 1)
             states = episodes.states[rows[:, None], ticks].swapaxes(1, 2)
             valid = episodes.valid[rows[:, None], ticks].swapaxes(1, 2)
@@ -428,22 +459,26 @@ def world_class(source: str) -> type[World]:
     return registry.find("worlds", scheme)
 
 
-def recorded_future(world: World, scene: Scene, horizon: int) -> Future:
+def recorded_future(
+    world: World, scene: Scene, horizon: int, rows: Int[np.ndarray, " r"] | None = None
+) -> Future:
     """The recorded states of a scene's targets, for privileged predictors only.
 
     Args:
         world: the world that the scene was taken from.
         scene: the present scene, with N targets.
         horizon: number of ticks.
+        rows: indices of the episodes that are the situations of the scene; all by default.
 
     Returns:
         States (N, horizon, 4) from the next tick on, however the targets really move.
     """
-    episodes, b, a = world.episodes, scene.targets[:, 0], scene.targets[:, 1]
+    episodes, situation, slot = world.episodes, scene.targets[:, 0], scene.targets[:, 1]
+    b = situation if rows is None else rows[situation]
     index = SnippetIndex(
         recording=episodes.recording[b],
-        track=episodes.tracks[b, a],
-        tick=scene.tick[b],
+        track=episodes.tracks[b, slot],
+        tick=scene.tick[situation],
         dt_s=world.dt_s,
         history=0,
         horizon_ticks=horizon,

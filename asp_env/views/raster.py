@@ -54,7 +54,10 @@ class Viewport:
             )
 
     def scaled(self, pixels: tuple[int, int] | None) -> "Viewport":
-        """The same extent and anchor in another resolution.
+        """The same extent and anchor in another resolution, or the square around it.
+
+        A square raster of a viewport that is not square shows a larger extent: the shorter side is
+        extended by the same length at both ends.
 
         Args:
             pixels: height and width; `None` returns the viewport unchanged.
@@ -65,6 +68,8 @@ class Viewport:
         if pixels is None:
             return self
         height_px, width_px = pixels
+        if height_px == width_px >= 1 and self.height_px != self.width_px:
+            return self._square().scaled(pixels)
         if height_px < 1 or height_px * self.width_px != width_px * self.height_px:
             common = math.gcd(self.height_px, self.width_px)
             suggestions = [
@@ -76,7 +81,7 @@ class Viewport:
             raise AspEnvError(
                 f"a view of {height_px}x{width_px} pixels does not show {self.height_px * scale:g} "
                 f"m x {self.width_px * scale:g} m in square pixels: give a height and a width "
-                f"such as {', '.join(suggestions)}"
+                f"such as {', '.join(suggestions)}, or twice the same number for a larger extent"
             )
         scale = height_px / self.height_px
         return Viewport(
@@ -85,6 +90,16 @@ class Viewport:
             metres_per_pixel=self.metres_per_pixel / scale,
             anchor_row_px=self.anchor_row_px * scale,
             anchor_column_px=self.anchor_column_px * scale,
+        )
+
+    def _square(self) -> "Viewport":
+        side_px = max(self.height_px, self.width_px)
+        return Viewport(
+            height_px=side_px,
+            width_px=side_px,
+            metres_per_pixel=self.metres_per_pixel,
+            anchor_row_px=self.anchor_row_px + (side_px - self.height_px) / 2,
+            anchor_column_px=self.anchor_column_px + (side_px - self.width_px) / 2,
         )
 
     @classmethod

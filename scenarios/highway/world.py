@@ -224,23 +224,41 @@ class HighwayWorld(World):
         data.states[b, tick, ~present] = 0.0
         data.departed[b] |= data.valid[b, tick - 1] & ~present
 
-    def snapshot(self) -> Any:
-        """The whole state, for `restore`."""
-        saved = [
+    def _saved_runs(self) -> list[_SavedRun | None]:
+        return [
             run and _SavedRun(rows=read_vehicles(run.road), steps=run.road.steps, frame=run.frame)
             for run in self._runs
         ]
-        return super().snapshot(), saved
 
-    def restore(self, snapshot: Any) -> None:
-        """Restores a snapshot, bit for bit."""
-        arrays, saved = snapshot
-        super().restore(arrays)
+    def _continue_runs(self, saved: Sequence[_SavedRun | None]) -> None:
         for b, (each, scenario) in enumerate(zip(saved, self.scenarios, strict=True)):
             self._runs[b] = None
             if each is not None:
                 assert scenario is not None
                 self._begin(b, self._history(scenario.recording), each)
+
+    def snapshot(self) -> Any:
+        """The whole state, for `restore`."""
+        return super().snapshot(), self._saved_runs()
+
+    def restore(self, snapshot: Any) -> None:
+        """Restores a snapshot, bit for bit."""
+        arrays, saved = snapshot
+        super().restore(arrays)
+        self._continue_runs(saved)
+
+    def __getstate__(self) -> dict[str, Any]:
+        """The state for copies and pickles: highway-env's objects hold functions and are left out.
+
+        Internal states of recorded vehicles are read from their files again.
+        """
+        return {**self.__dict__, "_runs": self._saved_runs(), "_histories": {}}
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        """Continues from the state of `__getstate__`."""
+        saved = state["_runs"]
+        self.__dict__.update(state, _runs=[None] * len(saved))
+        self._continue_runs(saved)
 
 
 def _states_of(rows: Rows) -> Float[np.ndarray, "n 4"]:

@@ -22,11 +22,13 @@ PARALLEL = [
     "render_mode",
 ]
 CONSTRUCTORS = {
-    asp_env.ReplayEnv: ["data", "render_mode"],
-    asp_env.ReplayVectorEnv: ["num_envs", "data", "autoreset_mode", "render_mode"],
+    asp_env.ReplayEnv: ["data", "flatten", "render_mode"],
+    asp_env.ReplayVectorEnv: [
+        *("num_envs", "data", "autoreset_mode", "max_episode_steps", "flatten", "render_mode")
+    ],
     ParallelReplayEnv: PARALLEL,
     asp_env.parallel_env: PARALLEL,
-    asp_env.sb3_vec_env: ["num_envs", "data", "render_mode"],
+    asp_env.sb3_vec_env: ["num_envs", "data", "max_episode_steps", "flatten", "render_mode"],
 }
 """The parameters before those of `ReplayOptions`."""
 
@@ -71,7 +73,9 @@ def test_an_unknown_option_names_the_nearest_one(make):
 
 
 def test_an_unknown_option_without_a_near_name_lists_the_known_ones():
-    with pytest.raises(TypeError, match="'colour'; known: data, render_mode, observations, view"):
+    with pytest.raises(
+        TypeError, match="'colour'; known: data, flatten, render_mode, observations"
+    ):
         asp_env.ReplayEnv(colour=1)  # pyright: ignore[reportCallIssue]
 
 

@@ -16,8 +16,9 @@ import asp_env
 from asp_env.data.predictor import Forecast, load_predictor, make_forecast
 from asp_env.data.scene import Scene
 from asp_env.data.snippets import Future
+from asp_env.envs.forecasts import Present, nearest_agents
 from asp_env.envs.replay import ReplayEnv
-from asp_env.envs.wrappers import PredictionFeatures, nearest_agents
+from asp_env.envs.wrappers import PredictionFeatures
 from asp_env.geometry import to_frame
 from tests.conformance.predictor_cases import Case
 from tests.envs.same import same
@@ -143,16 +144,19 @@ def test_nearest_agents_come_first(crossing):
     np.testing.assert_array_equal(few, targets[:2])
 
 
-def test_without_agents_the_forecasts_are_zero(crossing):
+def test_without_agents_the_forecasts_are_zero(crossing, monkeypatch):
     """The predictor is not called."""
-    env = _env(crossing)
-    env.reset(seed=0)
-    scene = _scene(env)
-    lonely = scene.valid.copy()
-    lonely[:, 1:] = False
     fan = Fan((1.0,))
     features = PredictionFeatures(_env(crossing), fan)
-    features.unwrapped.scene = lambda: dataclasses.replace(scene, valid=lonely)  # pyright: ignore[reportAttributeAccessIssue]
+    inner = features.unwrapped
+    assert isinstance(inner, ReplayEnv)
+    present = inner.episodes.present
+
+    def alone(rows: np.ndarray) -> Present:
+        now = present(rows)
+        return now._replace(valid=now.valid & (np.arange(now.valid.shape[1]) == 0))
+
+    monkeypatch.setattr(inner.episodes, "present", alone)
     seen, _ = features.reset(seed=0)
     assert not any(seen[name].any() for name in seen if name.startswith("forecast"))
     assert fan.calls == 0

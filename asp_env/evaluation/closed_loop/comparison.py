@@ -5,9 +5,7 @@ other or on the number of processes, and networks run on one thread, so results 
 for bit however the units are distributed.
 """
 
-import sys
-from collections.abc import Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
 from typing import Any, final
@@ -27,9 +25,10 @@ from asp_env.evaluation.selection import load_predictors
 from asp_env.metrics.driving.rules import Rules, find_rules
 from asp_env.metrics.driving.scores import driving_metrics
 from asp_env.metrics.masked import Masked
-from asp_env.planning.planner import Planner, load_planner
+from asp_env.planning.planner import Planner, TrainedPlanner, load_planner
 from asp_env.sim.traffic.assignment import make_traffic
 from asp_env.sim.world import Ending, world_class
+from asp_env.workers import one_thread
 
 EPISODES_AT_ONCE = 16
 """Number of scenarios in a work unit at most. Chosen by hand: units of one to a few seconds let
@@ -138,6 +137,9 @@ class Methods:
         runs = [run for names in predictors.values() for run in names]
         loaded = load_predictors(runs, horizon=self.settings.horizon, dt_s=dt_s)
         self.predictors: Mapping[str, Predictor] = dict(zip(runs, loaded, strict=True))
+        if isinstance(chosen, TrainedPlanner):
+            for each in loaded if chosen.uses_forecasts else []:
+                chosen.check_predictor(each)
         alone = partial(Method, predictor=loaded[0], predictor_name="", run="")
         methods = [alone(planner=load_planner(EXPERT))]
         if chosen.uses_forecasts:
@@ -169,7 +171,7 @@ class Methods:
             AspEnvError: the data do not suit a predictor or a driver.
         """
         method = self.all[unit.method]
-        with _one_thread():
+        with one_thread():
             driven = drive_episodes(
                 recordings, unit.scenarios, method.planner, method.predictor, self.settings
             )
@@ -179,21 +181,6 @@ class Methods:
             endings=tuple(Ending(kind) for kind in driven.endings.tolist()),
             rollouts=driven.rollouts,
         )
-
-
-@contextmanager
-def _one_thread() -> Iterator[None]:
-    """Limits torch to one thread, so that sums do not depend on the number of cores."""
-    torch = sys.modules.get("torch")
-    if torch is None:
-        yield
-        return
-    before = torch.get_num_threads()
-    torch.set_num_threads(1)
-    try:
-        yield
-    finally:
-        torch.set_num_threads(before)
 
 
 def work_units(scenarios: ScenarioSet, methods: int) -> list[WorkUnit]:

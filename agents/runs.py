@@ -1,0 +1,314 @@
+"""Run folders of agents, without pickles.
+
+| file | content |
+|---|---|
+| `config.json` | `settings` (`AgentSettings`), `observation` (shape, type and bounds of each \
+entry), `predictor` (name and hash of the weights), `steps` of training |
+| `policy.safetensors` | weights of the policy, written at the end of the training |
+| `checkpoint.safetensors` | during the training: weights, states of the optimizers, statistics of \
+the rewards |
+| `progress.csv`, `events…` | training statistics as a table, and for TensorBoard |
+"""
+
+import dataclasses
+import json
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from gymnasium import spaces
+from safetensors import SafetensorError
+from safetensors.torch import load, save
+from stable_baselines3 import PPO, SAC
+from stable_baselines3.common.base_class import BaseAlgorithm
+from stable_baselines3.common.policies import BasePolicy, MultiInputActorCriticPolicy
+from stable_baselines3.sac.policies import MultiInputPolicy as SACPolicy
+from torch import Tensor, nn
+
+from agents.networks import RasterFeatures, TrafficFeatures
+from agents.settings import CONFIG, AgentSettings, read_settings
+from asp_env.data.predictor import Predictor
+from asp_env.errors import AspEnvError, MissingExtraError
+from asp_env.files import atomic_file, write_text
+
+POLICY = "policy.safetensors"
+CHECKPOINT = "checkpoint.safetensors"
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class AlgorithmClasses:
+    """The class of an algorithm in stable-baselines3 or sb3-contrib, and that of its policy."""
+
+    algorithm: type[BaseAlgorithm]
+    policy: type[BasePolicy]
+
+
+def algorithm_classes(name: str) -> AlgorithmClasses:
+    """The classes of an algorithm.
+
+    Args:
+        name: one of `agents.settings.ALGORITHMS`.
+
+    Raises:
+        MissingExtraError: the algorithm needs sb3-contrib, which is not installed.
+    """
+    if name == "sac":
+        return AlgorithmClasses(algorithm=SAC, policy=SACPolicy)
+    if name == "ppo":
+        return AlgorithmClasses(algorithm=PPO, policy=MultiInputActorCriticPolicy)
+    try:
+        from sb3_contrib import RecurrentPPO
+        from sb3_contrib.ppo_recurrent.policies import RecurrentMultiInputActorCriticPolicy
+    except ModuleNotFoundError as error:
+        raise MissingExtraError(str(error.name), "rl", f"the algorithm {name}") from error
+    return AlgorithmClasses(algorithm=RecurrentPPO, policy=RecurrentMultiInputActorCriticPolicy)
+
+
+def policy_arguments(settings: AgentSettings) -> dict[str, Any]:
+    """Arguments of the policy's class, besides spaces and learning rate.
+
+    Args:
+        settings: the settings of the agent.
+    """
+    extractor: dict[str, Any] = {"width": settings.width}
+    kind: type[nn.Module] = TrafficFeatures
+    if settings.environment.view is not None:
+        kind = RasterFeatures
+        if settings.encoder is not None:
+            from agents.encoders import trained_encoder
+
+            extractor["encoder"] = trained_encoder(settings.encoder, settings.environment)
+    arguments: dict[str, Any] = {
+        "features_extractor_class": kind,
+        "features_extractor_kwargs": extractor,
+        "net_arch": [64, 64],
+        "activation_fn": nn.ReLU,
+    }
+    if settings.algorithm != "sac":
+        # The default deviation of 1 would steer and accelerate at the limits half of the time.
+        arguments["log_std_init"] = -1.0
+    if settings.algorithm == "recurrent-ppo":
+        arguments["lstm_hidden_size"] = settings.width
+    return arguments
+
+
+class Agent:
+    """A trained agent: acts on observations, without an environment."""
+
+    def __init__(self, settings: AgentSettings, space: spaces.Dict, policy: BasePolicy) -> None:
+        """Holds a policy.
+
+        Args:
+            settings: the settings of the agent.
+            space: space of its observation.
+            policy: its policy.
+        """
+        self.settings, self.space, self._policy = settings, space, policy
+        self._memory: Any = None
+
+    def act(
+        self, observations: Mapping[str, np.ndarray], starts: np.ndarray | None = None
+    ) -> np.ndarray:
+        """The most probable actions (B, 2) in [-1, 1], float32.
+
+        Args:
+            observations: reduced observations (`agents.observations`) of B environments.
+            starts: (B,) bool, which episodes begin now; only recurrent policies read it.
+        """
+        for name, box in self.space.items():
+            if name not in observations or observations[name].shape[1:] != box.shape:
+                given = getattr(observations.get(name), "shape", "none")
+                raise AspEnvError(
+                    f"observation {name!r}: expected shape (B, *{box.shape}) as in training, got "
+                    f"{given}"
+                )
+        shown = {name: observations[name] for name in self.space.spaces}
+        actions, self._memory = self._policy.predict(
+            shown, state=self._memory, episode_start=starts, deterministic=True
+        )
+        return np.asarray(actions, dtype=np.float32)
+
+
+def load_agent(folder: Path) -> Agent:
+    """Loads a trained agent.
+
+    Raises:
+        AspEnvError: there is no finished run, or a file is damaged.
+    """
+    settings = read_settings(folder)
+    content = json.loads((folder / CONFIG).read_text())
+    space = _read_space(content, folder)
+    weights = read_tensors(folder / POLICY)
+    policy = algorithm_classes(settings.algorithm).policy(
+        observation_space=space,
+        action_space=action_space(),
+        lr_schedule=_no_learning,
+        **policy_arguments(settings),
+    )
+    try:
+        policy.load_state_dict(weights)
+    except RuntimeError as error:
+        raise AspEnvError(
+            f"{folder / POLICY}: does not fit {CONFIG} ({str(error).splitlines()[-1].strip()}); "
+            "train the agent again"
+        ) from None
+    policy.set_training_mode(False)
+    return Agent(settings, space, policy)
+
+
+def _no_learning(progress: float) -> float:
+    del progress
+    return 0.0
+
+
+def action_space() -> spaces.Box:
+    """The action space of all environments."""
+    return spaces.Box(-1.0, 1.0, (2,), dtype=np.float32)
+
+
+def save_config(
+    folder: Path,
+    settings: AgentSettings,
+    space: spaces.Dict,
+    predictor: Predictor | None,
+    steps: int,
+) -> None:
+    """Writes `config.json`.
+
+    Args:
+        folder: the run folder.
+        settings: the settings of the agent.
+        space: space of its observation.
+        predictor: the predictor whose forecasts are observed.
+        steps: steps of training so far.
+    """
+    boxes: dict[str, Any] = {}
+    for name, box in space.items():
+        assert isinstance(box, spaces.Box)
+        low, high = float(box.low.min()), float(box.high.max())
+        boxes[name] = {"shape": list(box.shape), "dtype": str(box.dtype)}
+        if np.isfinite([low, high]).all():
+            boxes[name] |= {"low": low, "high": high}
+    content = {
+        "settings": dataclasses.asdict(settings),
+        "observation": boxes,
+        "predictor": predictor_identity(predictor),
+        "steps": steps,
+    }
+    write_text(folder / CONFIG, json.dumps(content, indent=1))
+
+
+def predictor_identity(predictor: Predictor | None) -> dict[str, str] | None:
+    """What a run states about its predictor: its name and, if trained, the hash of its weights."""
+    if predictor is None:
+        return None
+    return {"name": predictor.name, "weights": predictor.metadata.get("weights", "")}
+
+
+def check_predictor(folder: Path, predictor: Predictor | None) -> None:
+    """Checks that a predictor is the one that an agent was trained with.
+
+    Args:
+        folder: the run folder of the agent.
+        predictor: the predictor that is to provide its forecasts.
+
+    Raises:
+        AspEnvError: it is another one, or has other weights.
+    """
+    trained_with = json.loads((folder / CONFIG).read_text())["predictor"]
+    given = predictor_identity(predictor)
+    if trained_with != given:
+        raise AspEnvError(
+            f"{folder}: trained with {_identity_text(trained_with)}, given "
+            f"{_identity_text(given)}; give the same, or train another agent"
+        )
+
+
+def _identity_text(identity: Mapping[str, str] | None) -> str:
+    if identity is None:
+        return "no predictor"
+    weights = identity["weights"]
+    return f"predictor {identity['name']}" + (f" (weights {weights})" if weights else "")
+
+
+def _read_space(content: Any, folder: Path) -> spaces.Dict:
+    try:
+        return spaces.Dict(
+            {
+                name: spaces.Box(
+                    box.get("low", -np.inf),
+                    box.get("high", np.inf),
+                    tuple(box["shape"]),
+                    dtype=np.dtype(box["dtype"]).type,
+                )
+                for name, box in content["observation"].items()
+            }
+        )
+    except (KeyError, TypeError, ValueError, AttributeError) as error:
+        raise AspEnvError(
+            f"{folder / CONFIG}: damaged ({type(error).__name__}: {error}); train the agent again"
+        ) from None
+
+
+def read_tensors(path: Path) -> dict[str, Tensor]:
+    """Reads a safetensors file.
+
+    Raises:
+        AspEnvError: there is no such file, or it is damaged.
+    """
+    try:
+        return load(path.read_bytes())
+    except FileNotFoundError:
+        raise AspEnvError(
+            f"{path}: missing, the training has not ended; resume it with asp-env rl train --resume"
+        ) from None
+    except (OSError, SafetensorError) as error:
+        raise AspEnvError(f"{path}: damaged ({error}); train the agent again") from None
+
+
+def write_tensors(path: Path, tensors: Mapping[str, Tensor]) -> None:
+    """Writes a safetensors file atomically."""
+    content = save({name: value.detach().contiguous().clone() for name, value in tensors.items()})
+    with atomic_file(path) as partial:
+        partial.write_bytes(content)
+
+
+def flatten_state(state: Mapping[str, Any], prefix: str) -> dict[str, Tensor]:
+    """Flattens nested state dictionaries of tensors and numbers; names are joined by `/`.
+
+    Args:
+        state: nested dictionaries and lists; other values than tensors and numbers are left out.
+        prefix: start of all names.
+    """
+    flat: dict[str, Tensor] = {}
+    for key, value in state.items():
+        name = f"{prefix}/{key}"
+        if isinstance(value, Mapping):
+            flat |= flatten_state(value, name)
+        elif isinstance(value, Tensor):
+            flat[name] = value
+    return flat
+
+
+def restore_optimizer(
+    optimizer: torch.optim.Optimizer, tensors: Mapping[str, Tensor], prefix: str
+) -> None:
+    """Restores the moments of an optimizer from flattened names.
+
+    Args:
+        optimizer: the optimizer of the same parameters.
+        tensors: what `flatten_state` returned.
+        prefix: start of the optimizer's names.
+    """
+    state: dict[int, dict[str, Tensor]] = {}
+    start = f"{prefix}/state/"
+    for name, value in tensors.items():
+        if name.startswith(start):
+            number, _, key = name.removeprefix(start).partition("/")
+            state.setdefault(int(number), {})[key] = value
+    full = optimizer.state_dict()
+    full["state"] = state
+    optimizer.load_state_dict(full)

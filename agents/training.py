@@ -1,0 +1,302 @@
+"""Training of agents with stable-baselines3."""
+
+from collections.abc import Callable, Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from gymnasium import spaces
+from stable_baselines3.common.base_class import BaseAlgorithm
+from stable_baselines3.common.callbacks import BaseCallback, CallbackList
+from stable_baselines3.common.logger import configure
+from stable_baselines3.common.vec_env import VecMonitor, VecNormalize
+from torch import Tensor
+
+from agents.curriculum import Curriculum
+from agents.environments import AgentObservations, make_environments
+from agents.runs import (
+    CHECKPOINT,
+    POLICY,
+    algorithm_classes,
+    check_predictor,
+    flatten_state,
+    policy_arguments,
+    read_tensors,
+    restore_optimizer,
+    save_config,
+    write_tensors,
+)
+from agents.settings import CONFIG, DEFAULTS, AgentSettings, read_settings
+from asp_env.data.predictor import Predictor
+from asp_env.errors import AspEnvError
+from asp_env.workers import one_thread
+
+LOWEST_SHARE_OF_RATE = 0.05
+"""Share of the learning rate at the end of the training. Chosen by hand."""
+
+CHECKPOINT_STEPS = 50_000
+"""Steps between checkpoints. Chosen by hand: some tens of seconds."""
+
+EPISODE_KEYS = ("progress", "collision", "at_fault", "off_road_m", "ending")
+"""Infos of finished episodes that are logged."""
+
+Progress = Callable[[int], None]
+"""Called with the number of steps so far."""
+
+
+def train_agent(
+    settings: AgentSettings,
+    out: Path,
+    *,
+    resume: bool = False,
+    privileged: bool = False,
+    progress: Progress | None = None,
+) -> None:
+    """Trains an agent and writes its run folder.
+
+    The same settings give the same weights on the same kind of machine. A resumed training goes
+    on with the weights, optimizers and reward statistics of the last checkpoint in new episodes.
+
+    Args:
+        settings: the settings of the agent.
+        out: the run folder.
+        resume: whether to go on with an interrupted run in `out`.
+        privileged: allows forecasts of a predictor that uses the recorded future.
+        progress: called after each step of all environments.
+
+    Raises:
+        AspEnvError: a setting is invalid, `out` holds another run, or there is nothing to resume.
+    """
+    done = _check_folder(settings, out, resume)
+    envs = make_environments(
+        settings.environment,
+        settings.data,
+        settings.num_envs,
+        scenarios=settings.environment.scenarios,
+        privileged=privileged,
+    )
+    monitored = VecMonitor(envs, info_keywords=EPISODE_KEYS)
+    normalized = VecNormalize(
+        monitored, norm_obs=False, norm_reward=settings.normalize_reward, gamma=settings.gamma
+    )
+    algorithm = make_algorithm(settings, normalized)
+    predictor = predictor_of(envs)
+    if done:
+        check_predictor(out, predictor)
+        done = _restore(out, algorithm, normalized)
+    else:
+        out.mkdir(parents=True, exist_ok=True)
+        space = envs.observation_space
+        assert isinstance(space, spaces.Dict)
+        save_config(out, settings, space, predictor, 0)
+        if settings.demonstrations:
+            _clone_logged_drivers(settings, algorithm, privileged)
+    left = settings.steps - done
+    algorithm.set_logger(configure(str(out), ["csv", "tensorboard"]))
+    callbacks: list[BaseCallback] = [EpisodeStatistics(), Checkpoints(out, normalized)]
+    if settings.curriculum is not None:
+        callbacks.append(Curriculum(settings.curriculum, settings.steps))
+    if progress is not None:
+        callbacks.append(_Report(progress))
+    with one_thread():
+        algorithm.learn(left, callback=CallbackList(callbacks), reset_num_timesteps=not done)
+    algorithm.logger.close()
+    write_tensors(out / POLICY, algorithm.policy.state_dict())
+    space = envs.observation_space
+    assert isinstance(space, spaces.Dict)
+    save_config(out, settings, space, predictor, algorithm.num_timesteps)
+    (out / CHECKPOINT).unlink(missing_ok=True)
+    envs.close()
+
+
+def check_environment(folder: Path, settings: AgentSettings, data: str, privileged: bool) -> None:
+    """Checks that an environment shows a trained agent the forecasts of its own predictor.
+
+    Args:
+        folder: the run folder of the agent.
+        settings: the settings of the agent, possibly with another predictor.
+        data: the data to drive in.
+        privileged: allows forecasts of a predictor that uses the recorded future.
+
+    Raises:
+        AspEnvError: the predictor is another one, or has other weights.
+    """
+    envs = make_environments(settings.environment, data, 1, scenarios="", privileged=privileged)
+    check_predictor(folder, predictor_of(envs))
+    envs.close()
+
+
+def make_algorithm(settings: AgentSettings, envs: VecNormalize) -> BaseAlgorithm:
+    """Makes the algorithm of stable-baselines3 with random weights.
+
+    Args:
+        settings: the settings of the agent.
+        envs: its environments.
+
+    Raises:
+        AspEnvError: a hyperparameter is unknown.
+    """
+    classes = algorithm_classes(settings.algorithm)
+    arguments = {**DEFAULTS[settings.algorithm], **settings.hyperparameters}
+    rate = settings.learning_rate
+    try:
+        return classes.algorithm(
+            classes.policy,
+            envs,
+            learning_rate=lambda left: rate * max(left, LOWEST_SHARE_OF_RATE),
+            gamma=settings.gamma,
+            seed=settings.seed,
+            device="cpu",
+            policy_kwargs=policy_arguments(settings),
+            **arguments,
+        )
+    except TypeError as error:
+        raise AspEnvError(f"hyperparameters of {settings.algorithm}: {error}") from None
+
+
+def predictor_of(envs: AgentObservations) -> Predictor | None:
+    """The predictor whose forecasts environments show, if any."""
+    predictors: Any = envs.get_attr("predictors", 0)[0]
+    return predictors[0] if predictors else None
+
+
+def _clone_logged_drivers(
+    settings: AgentSettings, algorithm: BaseAlgorithm, privileged: bool
+) -> None:
+    from agents.cloning import clone, logged_steps
+
+    observations, actions, episodes = logged_steps(settings, privileged=privileged)
+    clone(
+        algorithm.policy,
+        observations,
+        actions,
+        episodes,
+        epochs=settings.demonstrations,
+        seed=settings.seed,
+    )
+
+
+def _check_folder(settings: AgentSettings, out: Path, resume: bool) -> bool:
+    """Whether there is something to resume.
+
+    Raises:
+        AspEnvError: the folder does not fit.
+    """
+    if not resume:
+        if out.exists() and any(out.iterdir()):
+            raise AspEnvError(
+                f"{out} exists and is not an empty folder; choose another, or go on with --resume"
+            )
+        return False
+    if (out / POLICY).exists():
+        raise AspEnvError(f"{out}: the training has ended; there is nothing to resume")
+    if not (out / CONFIG).exists():
+        raise AspEnvError(f"{out}: no run to resume; train without --resume")
+    before = read_settings(out)
+    if before != settings:
+        names = [
+            name
+            for name in AgentSettings.__dataclass_fields__
+            if getattr(before, name) != getattr(settings, name)
+        ]
+        raise AspEnvError(
+            f"{out}: the interrupted run has other settings ({', '.join(names)}); resume with the "
+            "same, or choose another folder"
+        )
+    return (out / CHECKPOINT).exists()
+
+
+class EpisodeStatistics(BaseCallback):
+    """Logs what became of the episodes of each rollout: success, collisions, progress, comfort."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self._ended: list[Mapping[str, Any]] = []
+        self._comfort: list[float] = []
+
+    def _on_step(self) -> bool:
+        infos = self.locals["infos"]
+        self._comfort.append(float(np.mean([info["reward_terms"]["comfort"] for info in infos])))
+        self._ended += [infos[b] for b in np.flatnonzero(self.locals["dones"]).tolist()]
+        return True
+
+    def _on_rollout_end(self) -> None:
+        if self._ended:
+            endings = [info["ending"] for info in self._ended]
+            means = {
+                "success": [name == "GOAL" for name in endings],
+                "at_fault_collision": [name == "COLLISION" for name in endings],
+                "off_road": [name == "OFF_ROAD" for name in endings],
+                "progress": [info["progress"] for info in self._ended],
+                "comfort": self._comfort,
+            }
+            for name, values in means.items():
+                self.logger.record(f"episodes/{name}", float(np.mean(values)))
+        self._ended, self._comfort = [], []
+
+
+class Checkpoints(BaseCallback):
+    """Writes a checkpoint every `CHECKPOINT_STEPS` steps."""
+
+    def __init__(self, out: Path, envs: VecNormalize) -> None:
+        """Holds the run folder and the statistics of the rewards."""
+        super().__init__()
+        self._out, self._envs, self._next = out, envs, CHECKPOINT_STEPS
+
+    def _on_training_start(self) -> None:
+        self._next = self.num_timesteps + CHECKPOINT_STEPS
+
+    def _on_step(self) -> bool:
+        return True
+
+    def _on_rollout_end(self) -> None:
+        if self.num_timesteps >= self._next:
+            self._next += CHECKPOINT_STEPS
+            write_tensors(self._out / CHECKPOINT, checkpoint_of(self.model, self._envs))
+
+
+class _Report(BaseCallback):
+    """Reports the number of steps."""
+
+    def __init__(self, progress: Progress) -> None:
+        super().__init__()
+        self._progress = progress
+
+    def _on_step(self) -> bool:
+        self._progress(self.num_timesteps)
+        return True
+
+
+def checkpoint_of(algorithm: BaseAlgorithm, envs: VecNormalize) -> dict[str, Tensor]:
+    """Weights, optimizers and statistics of an algorithm under way, by flat names.
+
+    Args:
+        algorithm: the algorithm.
+        envs: its environments.
+    """
+    rewards = envs.ret_rms
+    numbers = [algorithm.num_timesteps, rewards.mean, rewards.var, rewards.count]
+    tensors = {"numbers": torch.tensor([float(number) for number in numbers], dtype=torch.float64)}
+    for name, state in algorithm.get_parameters().items():
+        tensors |= flatten_state(state, name)
+    return tensors
+
+
+def _restore(out: Path, algorithm: BaseAlgorithm, envs: VecNormalize) -> int:
+    """Restores a checkpoint; returns its number of steps."""
+    tensors = read_tensors(out / CHECKPOINT)
+    steps, mean, variance, count = tensors["numbers"].tolist()
+    envs.ret_rms.mean, envs.ret_rms.var, envs.ret_rms.count = np.float64(mean), variance, count
+    algorithm.num_timesteps = int(steps)
+    for name in algorithm.get_parameters():
+        owner: Any = algorithm
+        for part in name.split("."):
+            owner = getattr(owner, part)
+        if isinstance(owner, torch.optim.Optimizer):
+            restore_optimizer(owner, tensors, name)
+        else:
+            start = f"{name}/"
+            own = {k.removeprefix(start): v for k, v in tensors.items() if k.startswith(start)}
+            owner.load_state_dict(own)
+    return int(steps)
