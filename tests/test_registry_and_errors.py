@@ -100,7 +100,30 @@ def test_plug_that_needs_a_missing_package(monkeypatch: pytest.MonkeyPatch, tmp_
         registry.find("planners", "far")
     line = one_line(caught.value)
     assert line.startswith("planner 'far' needs the package 'no_such_package', which is not")
-    assert "pip install" in line
+    assert line.endswith("pip install no-such-package")
+
+
+@pytest.mark.parametrize(
+    ("module", "extra"),
+    [
+        ("highway_env", "highway"),
+        ("torch", "inference"),
+        ("lightning", "train"),
+        ("sumolib", "synthetic"),
+    ],
+)
+def test_missing_package_names_the_smallest_extra(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path, module: str, extra: str
+) -> None:
+    """Not `all`, which has every package."""
+    (tmp_path / "far_planner.py").write_text(f"import {module}\n")
+    monkeypatch.syspath_prepend(tmp_path)
+    monkeypatch.setitem(sys.modules, module, None)
+    monkeypatch.delitem(sys.modules, "far_planner", raising=False)
+    register(monkeypatch, "far_planner:Far")
+    with pytest.raises(AspEnvError) as caught:
+        registry.find("planners", "far")
+    assert one_line(caught.value).endswith(f"pip install 'asp-env[{extra}]'")
 
 
 @pytest.mark.parametrize(

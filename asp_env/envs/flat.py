@@ -17,7 +17,7 @@ the observation is one vector of all entries, in their order.
 """
 
 
-def flat_space(space: spaces.Dict, flatten: Flatten) -> spaces.Space[Any]:
+def flat_space(space: spaces.Space[Any], flatten: Flatten) -> spaces.Space[Any]:
     """Returns the space of flattened observations.
 
     Args:
@@ -25,10 +25,12 @@ def flat_space(space: spaces.Dict, flatten: Flatten) -> spaces.Space[Any]:
         flatten: how observations are flattened.
 
     Raises:
-        AspEnvError: `flatten` has another value.
+        AspEnvError: `flatten` has another value, or the space is no Dict.
     """
     if flatten not in (False, True, "parts"):
         raise AspEnvError(f"flatten {flatten!r}: expected False, True or 'parts'")
+    if not isinstance(space, spaces.Dict):
+        raise AspEnvError(f"observation space {space}: expected a Dict")
     if flatten == "parts":
         return spaces.Dict([(name, _flat_box(box)) for name, box in space.items()])
     return spaces.flatten_space(space) if flatten else space

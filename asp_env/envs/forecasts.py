@@ -488,7 +488,7 @@ def extended_space(
         raise AspEnvError(
             f"the observation has an entry {taken[0]!r} already: give the predictor a prefix"
         )
-    return spaces.Dict({**space.spaces, **added})
+    return spaces.Dict([*space.spaces.items(), *added.items()])  # a mapping would be sorted
 
 
 def nearest_agents(

@@ -3,6 +3,7 @@
 import functools
 import logging
 import sys
+from typing import Any
 
 import numpy as np
 from gymnasium import spaces
@@ -16,7 +17,7 @@ LEARNERS = ("stable_baselines3", "torchrl", "ray.rllib", "skrl", "tianshou", "d3
 _logger = logging.getLogger("asp_env")
 
 
-def hint_at_large_observations(space: spaces.Dict, *, is_vector: bool) -> None:
+def hint_at_large_observations(space: spaces.Space[Any], *, is_vector: bool) -> None:
     """Logs a warning, once per process, if a learner's buffer is about to hold large rasters.
 
     Args:
@@ -24,6 +25,7 @@ def hint_at_large_observations(space: spaces.Dict, *, is_vector: bool) -> None:
         is_vector: whether many environments are made at once. A single environment counts only if
             a package of `LEARNERS` has been imported.
     """
+    assert isinstance(space, spaces.Dict)
     size = sum(
         int(np.prod(box.shape)) * box.dtype.itemsize
         for box in space.values()

@@ -81,7 +81,7 @@ class Viewport:
             raise AspEnvError(
                 f"a view of {height_px}x{width_px} pixels does not show {self.height_px * scale:g} "
                 f"m x {self.width_px * scale:g} m in square pixels: give a height and a width "
-                f"such as {', '.join(suggestions)}, or twice the same number for a larger extent"
+                f"such as {', '.join(suggestions)}"
             )
         scale = height_px / self.height_px
         return Viewport(

@@ -175,10 +175,30 @@ def test_stable_baselines3_trains():
     for _ in range(10):
         actions = rng.uniform((-0.5, -0.3), (1.0, 0.3), (2, 2)).astype(np.float32)
         returned, (seen, *rest) = one.step(actions), other.step(actions)
+        for info in returned[3]:
+            info.pop("episode", None)
         same(list(returned), [_as_dict(seen), *rest])
     model = PPO("MultiInputPolicy", one, n_steps=8, batch_size=8, n_epochs=1, device="cpu")
     model.learn(16)
     assert model.num_timesteps == 16
+
+
+@every_site
+def test_a_pickle_continues_in_the_same_way(site):
+    """Of the environment itself, in the middle of an episode and through its end."""
+    env = make(highway_data(site), observations=("state",))
+    env.reset(seed=3)
+    for _ in range(5):
+        env.step(np.array([0.2, 0.0]))
+    twins = [pickle.loads(pickle.dumps(env)), copy.deepcopy(env)]
+    over = False
+    while not over:
+        returned = env.step(np.array([0.2, 0.0]))
+        for twin in twins:
+            same(list(returned), list(twin.step(np.array([0.2, 0.0]))))
+        over = returned[2] or returned[3]
+    for twin in twins:
+        same(list(env.reset()), list(twin.reset()))
 
 
 @every_site

@@ -59,6 +59,9 @@ def test_returns_the_bits_of_single_environments(crossing, mode, traffic):
         actions = rng.uniform((-0.5, -0.3), (1.0, 0.3), (COUNT, 2)).astype(np.float32)
         actions[0] = -1.0, 0.0  # This ego stands until the data end.
         returned, (seen, *rest) = one.step(actions), other.step(actions)
+        for info, over in zip(returned[3], returned[2], strict=True):
+            statistics = {"r": info["episode_return"], "l": info["episode_length"]}
+            assert info.pop("episode", None) == (statistics if over else None)
         same(list(returned), [_as_dict(seen), *rest])
         ends += int(returned[2].sum())
         limits += sum(info["TimeLimit.truncated"] for info in returned[3])

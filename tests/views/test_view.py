@@ -101,6 +101,19 @@ def test_scaling_to_the_same_size_or_none_changes_nothing() -> None:
     assert Viewport().scaled((360, 240)) == Viewport().scaled(None) == Viewport()
 
 
+@pytest.mark.parametrize("side", [360, 96, 84])
+def test_a_square_raster_shows_more_to_both_sides(side: int) -> None:
+    """72 m by 72 m: 57.6 m ahead as before, and 36 m instead of 24 m to either side."""
+    view = ChauffeurNet.make((side, side)).viewport
+    per_metre = side / 72
+    for point, expected in (
+        ((57.6, 36.0), (0, 0)),
+        ((-14.4, -36.0), (side, side)),
+        ((0.0, 0.0), (36 * per_metre, 57.6 * per_metre)),
+    ):
+        np.testing.assert_allclose(pixel(view, (0.0, 0.0, 0.0), point), expected, atol=1e-9)
+
+
 @pytest.mark.parametrize("side", [360, 180, 90, 45])
 def test_mtp_shows_the_same_extent(side: int) -> None:
     """57.6 m ahead, 14.4 m behind and 36 m to either side, in any resolution."""
@@ -134,7 +147,7 @@ def test_impossible_viewports_are_rejected(fields: dict[str, Any]) -> None:
 @pytest.mark.parametrize(
     ("view", "pixels", "good"),
     [
-        ("chauffeurnet", (90, 90), "72 m x 48 m .* 360x240, 180x120, 90x60$"),
+        ("chauffeurnet", (90, 80), "72 m x 48 m .* 360x240, 180x120, 90x60$"),
         ("chauffeurnet", (0, 0), "360x240"),
         ("chauffeurnet", (90, 61), "360x240"),
         ("mtp", (90, 60), "72 m x 72 m .* 360x360, 180x180, 90x90$"),
