@@ -25,7 +25,7 @@ def parallel_env(
     ids: Sequence[int] | None = None,
     max_agents: int | None = None,
     pad_absent: bool = False,
-    flatten: bool = False,
+    flatten: Flatten = False,
     numeric_infos: bool = False,
     render_mode: str | None = None,
     observations: Sequence[str] = ("raster", "actions", "state"),
@@ -49,7 +49,7 @@ def parallel_env(
         max_agents: the largest number of agents; those nearest to `vehicle_0` are taken.
         pad_absent: absent agents stay in `agents` for the whole episode, with zeros as observation
             and reward, and the mask `present`.
-        flatten: the observation of an agent is one flat `Box` instead of a `Dict`.
+        flatten: `True`: the observation of an agent is one vector; `"parts"`: each entry is one.
         numeric_infos: infos are numbers only, with the same keys after `reset` and `step`.
         render_mode: `rgb_array` or None.
         observations: see `ReplayEnv`, as for the following arguments.

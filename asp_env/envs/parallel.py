@@ -13,7 +13,6 @@ from typing import Any
 import gymnasium
 import numpy as np
 from gymnasium import spaces
-from gymnasium.spaces import flatten_space
 from gymnasium.utils import seeding
 from jaxtyping import Bool, Float, Int
 from pettingzoo import ParallelEnv
@@ -23,6 +22,7 @@ from asp_env.data.recording import DEFAULT_DT_S, Recording, frames_per_tick
 from asp_env.data.scenarios.scenario import Scenario, ScenarioFilter, ScenarioSet
 from asp_env.data.scene import EGO, Scene
 from asp_env.envs.episodes import RESET_OPTIONS, ReplayEpisodes, info_of, valid_actions
+from asp_env.envs.flat import Flatten, flat_space, flatten_observations
 from asp_env.envs.forecasts import ForecastSpec, PredictorSpec
 from asp_env.envs.options import ReplayOptions, suggest_options
 from asp_env.errors import AspEnvError, unknown_name
@@ -193,7 +193,7 @@ PRESENT = "present"
 """The key of the mask of `pad_absent` in observations and infos."""
 
 Observations = dict[str, Any]
-"""The observation of each agent: a dict of arrays, or with `flatten` one array."""
+"""The observation of each agent: a dict of arrays, or with `flatten=True` one array."""
 
 
 class ParallelReplayEnv(ParallelEnv[str, Any, Any]):
@@ -216,8 +216,7 @@ class ParallelReplayEnv(ParallelEnv[str, Any, Any]):
 
     ## Observation Space
     That of `ReplayEnv` for each agent. `pad_absent` adds the entry `present`, `Box(0, 1, (1,),
-    int8)`, which is 0 for an absent agent; all other entries are zeros then. `flatten` makes one
-    float32 `Box` of all entries, in their order, as `gymnasium.spaces.flatten` does.
+    int8)`, which is 0 for an absent agent; all other entries are zeros then.
 
     ## Rewards
     Those of `ReplayEnv` for each agent; 0 for an absent one.
@@ -252,9 +251,10 @@ default all |
 all |
     | `max_agents` | `None` | the largest number of agents; those nearest to `vehicle_0` are taken |
     | `pad_absent` | `False` | absent agents stay in `agents`, with zeros and the mask `present` |
-    | `flatten` | `False` | the observation of an agent is one flat `Box` instead of a `Dict` |
+    | `flatten` | `False` | `True`: the observation of an agent is one vector; `"parts"`: each \
+entry is a vector, images stay images |
     | `numeric_infos` | `False` | infos are numbers only, with the same keys after `reset` and \
-`step`; no `scenario`, `tags`, `reward_terms`, `ending` |
+`step`; no `scenario`, `ending` and `reward_terms` |
 
     ## Version History
     - v0: initial version
@@ -269,7 +269,7 @@ all |
         ids: Sequence[int] | None = None,
         max_agents: int | None = None,
         pad_absent: bool = False,
-        flatten: bool = False,
+        flatten: Flatten = False,
         numeric_infos: bool = False,
         render_mode: str | None = None,
         observations: Sequence[str] = ("raster", "actions", "state"),
@@ -323,7 +323,8 @@ all |
         simulation.driver = JointPolicyDriver(simulation.driver)
         self.possible_agents = [f"vehicle_{row}" for row in range(self._max_agents)]
         self.agents: list[str] = []
-        self._pad_absent, self._flatten = pad_absent, flatten
+        self._pad_absent = pad_absent
+        self._flatten: Flatten = flatten
         self._numeric_infos = numeric_infos
         self._rows = {name: row for row, name in enumerate(self.possible_agents)}
         self._in_episode: list[str] = []
@@ -333,8 +334,7 @@ all |
         if pad_absent:
             mask = spaces.Box(0, 1, (1,), dtype=np.int8)
             space = spaces.Dict([*self._episodes.space.items(), (PRESENT, mask)])
-        if flatten:
-            space = flatten_space(space)
+        space = flat_space(space, flatten)
         self.observation_spaces: dict[str, Any] = dict.fromkeys(self._rows, space)
         self.action_spaces: dict[str, spaces.Space[Any]] = {
             name: spaces.Box(-1.0, 1.0, (2,), dtype=np.float32) for name in self._rows
@@ -522,23 +522,22 @@ all |
             observed = {
                 name: _pad(values, rows, self._max_agents) for name, values in observed.items()
             }
-        names = self.agents
-        if self._flatten:
-            flat = np.concatenate(
-                [values.reshape(len(names), -1) for values in observed.values()],
-                axis=1,
-                dtype=np.float32,
-            )
-            return dict(zip(names, flat, strict=True))
+        observed = flatten_observations(observed, self._flatten)
+        if self._flatten is True:
+            return dict(zip(self.agents, observed, strict=True))
         return {
             agent: {name: values[row] for name, values in observed.items()}
-            for row, agent in enumerate(names)
+            for row, agent in enumerate(self.agents)
         }
 
     def _infos(self) -> dict[str, dict[str, Any]]:
         rows = self._episodes.info()
         if self._numeric_infos:
-            rows = {name: value for name, value in rows.items() if _is_numeric(value)}
+            rows = {
+                name: values
+                for name, values in rows.items()
+                if isinstance(values, np.ndarray) and values.dtype != object
+            }
         infos = {agent: info_of(rows, self._rows[agent]) for agent in self.agents}
         if self._pad_absent:
             empty = _empty(infos[self._present[0]])
@@ -572,8 +571,3 @@ def _empty(info: dict[str, Any]) -> dict[str, Any]:
         else type(value)()
         for name, value in info.items()
     }
-
-
-def _is_numeric(value: Any) -> bool:
-    """Whether an entry of the infos is one number for each agent."""
-    return isinstance(value, np.ndarray) and value.ndim == 1 and value.dtype != object

@@ -180,7 +180,7 @@ def test_numeric_infos_are_numbers_with_the_same_keys(crossing):
     env = _make(crossing, pad_absent=True, numeric_infos=True)
     _, infos = env.reset(seed=0)
     keys = list(infos["vehicle_0"])
-    assert {"tick", "progress", "collision", "present"} <= set(keys)
+    assert {"tick", "progress", "collision", "tags", "present"} <= set(keys)
     while env.agents:
         for info in infos.values():
             assert list(info) == keys
@@ -195,6 +195,9 @@ def test_flat_observations_are_those_of_gymnasium(crossing, pad_absent):
     one, other = _make(crossing, **options), _make(crossing, flatten=True, **options)
     space = one.observation_space("vehicle_0")
     assert other.observation_space("vehicle_0") == flatten_space(space)
+    parts = _make(crossing, flatten="parts", **options).observation_space("vehicle_0")
+    assert set(parts) == set(space)
+    assert all(len(box.shape) == 1 for box in parts.values())
     seen, flat = one.reset(seed=1)[0], other.reset(seed=1)[0]
     for _ in range(10):
         assert list(seen) == list(flat)
