@@ -93,8 +93,8 @@ inferred from the motion of the last 3 s, oldest first |
     | `state` | (9,) | float32 | see below | | motion, position on the route, and size of the ego |
     | `route` | (30, 2) | float32 | ±1000 | m | points 2, 4, … 60 m ahead on the route, in a \
 straight line beyond its end |
-    | `nearest` | (8, 13) | float32 | see below | | the nearest agents now: the fields of `agents`, \
-then 1 where there is an agent |
+    | `nearest` | (8, 13) | float32 | see below | | the nearest agents now: fields of \
+`agents`, then 1 where there is an agent |
     | `agents` | (16, 16, 12) | float32 | see below | | the ego and the nearest agents; \
 15 past ticks and the present one |
     | `agents_valid` | (16, 16) | int8 | 0, 1 | | mask of agents and ticks |
@@ -179,8 +179,8 @@ each divided by 5 m/s² |
     excess counts.
 
     ## Info
-    The infos of `reset` and `step` have the same keys, types and shapes, in `ReplayVectorEnv` with a
-    first axis `num_envs`.
+    The infos of `reset` and `step` have the same keys, types and shapes, in `ReplayVectorEnv` with
+    a first axis `num_envs`.
 
     | key | value |
     |---|---|
@@ -196,8 +196,8 @@ each divided by 5 m/s² |
 neither a collision at its fault nor left the road by more than 2 m |
     | `episode_return`, `episode_length` | sum of the rewards and number of steps since `reset` |
 
-    Gymnasium's `RecordEpisodeStatistics` adds its own `episode`, which is why these infos have none;
-    those of `asp_env.sb3_vec_env` have one at the end of an episode, as of a `VecMonitor`.
+    Gymnasium's `RecordEpisodeStatistics` adds its own `episode`, which is why these infos have
+    none; those of `asp_env.sb3_vec_env` have one at the end of an episode, as of a `VecMonitor`.
 
     ## Arguments
     ```python
@@ -215,8 +215,8 @@ neither a collision at its fault nor left the road by more than 2 m |
 window that shows every tick (extra `render`) |
     | `observations` | `("raster", "actions", "state")` | components of the observation |
     | `view` | `"chauffeurnet"` | view that draws the `raster`, see `asp_env.views` |
-    | `raster_px` | `None` | height and width of the `raster`, or one number for a square one, which \
-shows more to both sides of a view that is not square; the view's own by default |
+    | `raster_px` | `None` | height and width of the `raster`, or one number for a square \
+one, which shows more to both sides of a view that is not square; the view's own by default |
     | `traffic` | `None` | driver of the uncontrolled agents: `log`, `log-actions`, `idm`, … or a \
 table of drivers; `log` by default, `own` in a world with reacting traffic |
     | `dt_s` | `0.2` | length of a tick in seconds |
