@@ -1,4 +1,4 @@
-"""How fast PPO collects rollouts in an agent's environment: `python -m tests.benchmarks.rollout_rate`.
+"""How fast PPO collects rollouts: `python -m tests.benchmarks.rollout_rate`.
 
 64 environments show vectors and forecasts at constant velocity. For one and for three ticks per
 action the table has the ticks per second of CPU time of the environments alone, those of the
