@@ -22,6 +22,7 @@ from asp_env.data.scenarios.tags import TAGS
 from asp_env.data.scene import EGO, Scene, infer_actions
 from asp_env.data.snippets import HISTORY_S, Future
 from asp_env.data.source import Recordings, open_data
+from asp_env.envs.compilation import announce_compilation
 from asp_env.envs.forecasts import Present, extended_space, forecast_observers
 from asp_env.envs.options import ReplayOptions, raster_size
 from asp_env.errors import AspEnvError, unknown_name
@@ -188,6 +189,7 @@ class ReplayEpisodes:
         Raises:
             AspEnvError: an option is invalid, or the data hold no scenario.
         """
+        announce_compilation()
         history = ticks(HISTORY_S, options.dt_s)
         self.recordings = open_data(data)
         self._sampler = ScenarioSampler.choose(

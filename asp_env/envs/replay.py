@@ -93,6 +93,8 @@ inferred from the motion of the last 3 s, oldest first |
     | `state` | (9,) | float32 | see below | | motion, position on the route, and size of the ego |
     | `route` | (30, 2) | float32 | ±1000 | m | points 2, 4, … 60 m ahead on the route, in a \
 straight line beyond its end |
+    | `nearest` | (8, 13) | float32 | see below | | the nearest agents now: fields of \
+`agents`, then 1 where there is an agent |
     | `agents` | (16, 16, 12) | float32 | see below | | the ego and the nearest agents; \
 15 past ticks and the present one |
     | `agents_valid` | (16, 16) | int8 | 0, 1 | | mask of agents and ticks |
@@ -124,6 +126,22 @@ straight line beyond its end |
     | 0, 1 | x, y | -1000 | 1000 | m |
     | 2, 3 | cosine, sine of the direction | -1 | 1 | |
     | 4 to 7 | kind: lane, curb, solid line, dashed line | 0 | 1 | |
+
+    With `flatten="parts"` each entry is a vector, and rasters stay images. With `flatten=True` the
+    observation is one `Box`, the vector of all entries in their order, as of
+    `gymnasium.wrappers.FlattenObservation`. Other ids have light observations by default:
+
+    | id | observations | flatten | bytes |
+    |---|---|---|---|
+    | `asp_env/Replay-v0` | `raster`, `actions`, `state` | `False` | 1,037,000 |
+    | `asp_env/ReplayVectors-v0` | `vectors`, `state`, `route` | `"parts"` | 34,000 |
+    | `asp_env/ReplayState-v0` | `state`, `route`, `nearest` | `True` | 692 |
+
+    | index of the vector of `asp_env/ReplayState-v0` | content |
+    |---|---|
+    | 0 to 8 | `state` |
+    | 9 to 68 | `route`: x and y of each point |
+    | 69 + 13 k to 81 + 13 k | the agent number k of `nearest`, from 0 to 7 |
 
     ## Rewards
     The sum of four terms, each times its weight in `reward_weights`. `info["reward_terms"]` holds
@@ -158,8 +176,28 @@ each divided by 5 m/s² |
     | `OUT_OF_DATA` | truncated | the scenario has run its length |
 
     Where the recorded ego itself leaves the drivable area, which may be a gap in the map, only the
-    excess counts. Other keys of `info` are `scenario` (name), `tags`, `tick` (steps since the
-    start), `progress` (share of the path), `collision`, `at_fault` and `off_road_m`.
+    excess counts.
+
+    ## Info
+    The infos of `reset` and `step` have the same keys, types and shapes, in `ReplayVectorEnv` with
+    a first axis `num_envs`.
+
+    | key | value |
+    |---|---|
+    | `scenario` | name of the scenario |
+    | `tags` | (13,) bool: which of `asp_env.data.scenarios.TAGS` the scenario has |
+    | `tick` | ticks since the start |
+    | `progress` | share of the recorded ego's path |
+    | `collision`, `at_fault` | whether the ego touches an agent, and whether it is at fault |
+    | `off_road_m` | distance of the outermost corner from the drivable area, m |
+    | `reward_terms` | the terms of the last step's reward without weights; zeros after `reset` |
+    | `ending` | the reason of the end, or `RUNNING` |
+    | `is_success` | whether the episode has ended with `GOAL`: the ego reached its goal, and had \
+neither a collision at its fault nor left the road by more than 2 m |
+    | `episode_return`, `episode_length` | sum of the rewards and number of steps since `reset` |
+
+    Gymnasium's `RecordEpisodeStatistics` adds its own `episode`, which is why these infos have
+    none; those of `asp_env.sb3_vec_env` have one at the end of an episode, as of a `VecMonitor`.
 
     ## Arguments
     ```python
@@ -172,11 +210,13 @@ each divided by 5 m/s² |
     |---|---|---|
     | `data` | `"sample:intersection"` | a folder in the inD/rounD or INTERACTION layout, \
 `sample:intersection`, `sample:roundabout`, `synthetic:…`, or `highway:…` with reacting traffic |
+    | `flatten` | `False` | `True`: the observation is one vector; `"parts"`: each entry is one |
     | `render_mode` | `None` | `rgb_array`: an image of 80 m by 80 m from above; `human`: a \
 window that shows every tick (extra `render`) |
     | `observations` | `("raster", "actions", "state")` | components of the observation |
     | `view` | `"chauffeurnet"` | view that draws the `raster`, see `asp_env.views` |
-    | `raster_px` | `None` | height and width of the `raster`; the view's own by default |
+    | `raster_px` | `None` | height and width of the `raster`, or one number for a square \
+one, which shows more to both sides of a view that is not square; the view's own by default |
     | `traffic` | `None` | driver of the uncontrolled agents: `log`, `log-actions`, `idm`, … or a \
 table of drivers; `log` by default, `own` in a world with reacting traffic |
     | `dt_s` | `0.2` | length of a tick in seconds |
@@ -189,6 +229,8 @@ name; several in a mapping with their prefixes |
     An unknown argument raises a `TypeError` that names the nearest known one.
     `asp_env/HighwayIntersection-v0` and `asp_env/HighwayRoundabout-v0` are this environment with
     `data="highway:intersection"` and `data="highway:roundabout"`.
+
+    `asp_env/HighwayIntersectionVectors-v0` and the like have the light observations above.
 
     Besides Gymnasium's interface there are `scene()` for predictors and planners, `snapshot()` and
     `restore()` for search and counterfactuals, and `show()`, which draws a forecast and a plan.

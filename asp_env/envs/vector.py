@@ -83,7 +83,8 @@ class ReplayVectorEnv(SharedInSpec, VectorEnv[Any, Any, np.ndarray]):
 
     ## Arguments
     `num_envs`, the arguments of `ReplayEnv` (as `render_mode` only `rgb_array`), and
-    `autoreset_mode`, by default `NextStep`.
+    `autoreset_mode`, by default `NextStep`, and `max_episode_steps`, after which episodes are
+    truncated as by Gymnasium's `TimeLimit`.
 
     ## Version History
     - v0: initial version
