@@ -201,6 +201,10 @@ def test_invalid_resets_are_rejected(crossing, reset, message):
         _make(crossing).reset(**reset)
 
 
+@pytest.mark.skipif(
+    gymnasium.__version__ == "1.2.0",
+    reason="DictInfoToList of Gymnasium 1.2.0 fails on RecordEpisodeStatistics of Gymnasium 1.2.0",
+)
 def test_gymnasiums_wrappers_of_infos(crossing):
     """`DictInfoToList` and `RecordEpisodeStatistics`."""
     envs = DictInfoToList(RecordEpisodeStatistics(_make(crossing)))
