@@ -416,14 +416,16 @@ class ReplayEpisodes:
         self,
         rows: Int[np.ndarray, " r"] | None = None,
         targets: Int[np.ndarray, "t 2"] | None = None,
+        history: int | None = None,
     ) -> Scene:
         """Returns the scene of some episodes, by default of all, with the seeds of predictors.
 
         Args:
             rows: numbers of the episodes, which are the situations in this order.
             targets: (situation, slot) of the targets; by default all present agents but the egos.
+            history: number of past ticks; that of the world by default.
         """
-        scene = self.simulation.world.scene(rows, targets)
+        scene = self.simulation.world.scene(rows, targets, history)
         seeds = self._seeds.copy() if rows is None else self._seeds[rows]
         return dataclasses.replace(scene, seeds=seeds)
 
