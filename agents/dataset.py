@@ -61,6 +61,9 @@ class DemonstrationSteps:
     observations: Observations
     """The observations in which the actions were taken: by entry, or flat."""
     actions: Float[np.ndarray, "n 2"]
+    rewards: Float[np.ndarray, " n"]
+    terminations: Bool[np.ndarray, " n"]
+    truncations: Bool[np.ndarray, " n"]
     clipped: Bool[np.ndarray, " n"]
     """Mask of actions that the bicycle model cannot execute; their values are at the limits."""
     episode: Int[np.ndarray, " n"]
@@ -219,6 +222,9 @@ def _steps_of(groups: list[Any]) -> DemonstrationSteps:
     return DemonstrationSteps(
         observations=observations,
         actions=np.concatenate([group["actions"][()] for group in groups]),
+        rewards=np.concatenate([group["rewards"][()] for group in groups]),
+        terminations=np.concatenate([group["terminations"][()] for group in groups]),
+        truncations=np.concatenate([group["truncations"][()] for group in groups]),
         clipped=np.concatenate([group["infos/clipped"][:-1] for group in groups]),
         episode=np.repeat(np.arange(len(groups)), lengths),
         recording=np.repeat(numbers, lengths),

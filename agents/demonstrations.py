@@ -31,7 +31,7 @@ _INFOS = ("tick", "progress", "collision", "at_fault", "off_road_m")
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Demonstrations:
-    """Write the driving of the logged drivers as a data set for imitation and offline learning."""
+    """Write the logged drivers' episodes as a data set."""
 
     data: Annotated[tyro.conf.Positional[str], tyro.conf.arg(metavar="DATA")]
     """Folder in the inD/rounD or INTERACTION layout, or sample:… or synthetic:…."""

@@ -114,6 +114,16 @@ def test_steps_are_loaded_with_their_groups(dataset: Path, flat: Path) -> None:
     np.testing.assert_array_equal(flat_steps.observations[0], first)
 
 
+def test_minari_recovers_an_environment_with_flat_observations(flat: Path) -> None:
+    minari = pytest.importorskip("minari")
+    data = minari.load_dataset(str(flat))
+    env = data.recover_environment()
+    assert env.observation_space == data.observation_space
+    assert isinstance(env.observation_space, gymnasium.spaces.Box)
+    observation, _ = env.reset(options={"scenario": 0})
+    np.testing.assert_array_equal(observation, data[0].observations[0])
+
+
 def test_minari_loads_the_folder(dataset: Path) -> None:
     """By its path and by its name, and recovers the environment."""
     minari = pytest.importorskip("minari")
@@ -137,18 +147,24 @@ def test_minari_lists_the_folder(dataset: Path, monkeypatch: pytest.MonkeyPatch)
     assert minari.load_dataset("sample-v0").total_steps > 1000
 
 
-def test_d3rlpy_trains_on_flat_observations(flat: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Its behaviour cloning runs on the data and in the recovered environment."""
-    pytest.importorskip("minari")
+def test_d3rlpy_trains_on_flat_observations(flat: Path) -> None:
+    """Its data set has the same episodes, and its behaviour cloning runs on them."""
     d3rlpy = pytest.importorskip("d3rlpy")
-    monkeypatch.setenv("MINARI_DATASETS_PATH", str(flat.parent))
-    data, env = d3rlpy.datasets.get_minari("flat-v0")
-    assert isinstance(env.observation_space, gymnasium.spaces.Box)
+    steps = load_steps(flat)
+    data = d3rlpy.dataset.MDPDataset(
+        steps.observations, steps.actions, steps.rewards, steps.terminations, steps.truncations
+    )
     assert len(data.episodes) == 3
+    for number, episode in enumerate(data.episodes):
+        rows = steps.episode == number
+        np.testing.assert_array_equal(episode.observations, np.asarray(steps.observations)[rows])
+        np.testing.assert_array_equal(episode.actions, steps.actions[rows])
     algorithm = d3rlpy.algos.BCConfig(batch_size=32).create()
-    algorithm.fit(data, n_steps=2, n_steps_per_epoch=2, show_progress=False, save_interval=9)
-    observation, _ = env.reset(seed=0)
-    assert algorithm.predict(observation[None]).shape == (1, 2)
+    no_files = d3rlpy.logging.NoopAdapterFactory()
+    algorithm.fit(
+        data, n_steps=2, n_steps_per_epoch=2, show_progress=False, logger_adapter=no_files
+    )
+    assert algorithm.predict(np.asarray(steps.observations)[:1]).shape == (1, 2)
 
 
 def rejected(capsys: pytest.CaptureFixture[str], *args: str) -> str:

@@ -82,7 +82,7 @@ def test_stable_baselines3_calls_it_by_name(crossing: str) -> None:
         envs.seed(4)
         envs.reset()
     for name in ("logged_action", "logged_action_clipped"):
-        values = [list(envs.env_method(name, indices=[1, 0])) for envs in (one, other)]
-        np.testing.assert_array_equal(*values)
+        batched, single = (list(envs.env_method(name, indices=[1, 0])) for envs in (one, other))
+        np.testing.assert_array_equal(batched, single)
     with pytest.raises(AttributeError, match="logged_action, logged_action_clipped, without"):
         one.env_method("snapshot")

@@ -20,8 +20,8 @@ LENGTH_M = np.array([5.0])
 
 def act(state: list[float], logged: list[float], logged_next: list[float]) -> list[float]:
     """The action of one vehicle of 5 m at ticks of 0.2 s."""
-    rows = (np.array([each], dtype=np.float64) for each in (state, logged, logged_next))
-    return following_actions(*rows, LENGTH_M, DT_S)[0].tolist()
+    rows = np.array([[state], [logged], [logged_next]], dtype=np.float64)
+    return following_actions(rows[0], rows[1], rows[2], LENGTH_M, DT_S)[0].tolist()
 
 
 @given(
