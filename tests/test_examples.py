@@ -16,7 +16,7 @@ from examples import (
     picture,
     step_the_environment,
     traffic_that_reacts,
-    train_an_agent,
+    train_a_policy,
 )
 from tests.builders import Drive
 from tests.planning.situations import STEPS, approach, two_modes
@@ -96,4 +96,4 @@ def test_the_picture_of_the_readme_is_drawn(tmp_path: Path) -> None:
 
 def test_ppo_learns_to_reach_the_goal() -> None:
     """Coasting along the route reaches it in 21 % of the scenarios."""
-    assert train_an_agent.main(steps=30_000)["GOAL"] > 0.5
+    assert train_a_policy.main(steps=30_000)["GOAL"] > 0.5

@@ -16,9 +16,9 @@ from rich.console import Console
 from rich.table import Table
 from stable_baselines3.common.vec_env import VecMonitor, VecNormalize
 
-from agents.environments import make_environments
-from agents.settings import AgentSettings, EnvironmentSettings
-from agents.training import make_algorithm
+from policies.environments import make_environments
+from policies.settings import EnvironmentSettings, PolicySettings
+from policies.training import make_algorithm
 
 DATA = "sample:roundabout"
 STEPS = 16_384
@@ -44,7 +44,7 @@ def measure(action_repeat: int) -> tuple[float, float, float]:
     Args:
         action_repeat: ticks per action.
     """
-    settings = AgentSettings(
+    settings = PolicySettings(
         data=DATA,
         environment=EnvironmentSettings(
             predictor="constant-velocity", forecast={"modes": 1}, action_repeat=action_repeat

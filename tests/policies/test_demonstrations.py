@@ -8,11 +8,11 @@ import gymnasium
 import numpy as np
 import pytest
 
-from agents.dataset import load_steps
-from agents.demonstrations import Demonstrations, record_episodes
 from asp_env.cli import main
 from asp_env.envs import ReplayEnv, ReplayVectorEnv
 from asp_env.errors import AspEnvError, DataError
+from policies.dataset import load_steps
+from policies.demonstrations import Demonstrations, record_episodes
 from tests.envs.same import same
 
 h5py = pytest.importorskip("h5py")
@@ -206,7 +206,7 @@ def test_an_interrupted_command_writes_nothing(
     def interrupted(*_: Any) -> Any:
         raise KeyboardInterrupt
 
-    monkeypatch.setattr("agents.demonstrations.record_episodes", interrupted)
+    monkeypatch.setattr("policies.demonstrations.record_episodes", interrupted)
     with pytest.raises(KeyboardInterrupt):
         Demonstrations(data=DATA, out=tmp_path / "a-v0", observations=PARTS).run()
     assert list(tmp_path.iterdir()) == []

@@ -1,6 +1,6 @@
 """PPO of stable-baselines3 learns to drive at the roundabout of the sample.
 
-`python -m examples.train_an_agent` trains for 100,000 steps, some seconds, and prints what becomes
+`python -m examples.train_a_policy` trains for 100,000 steps, some seconds, and prints what becomes
 of the training scenarios with the most probable actions.
 """
 

@@ -1,4 +1,4 @@
-"""Training of agents with stable-baselines3."""
+"""Training of policies with stable-baselines3."""
 
 from collections.abc import Callable, Mapping
 from pathlib import Path
@@ -13,11 +13,14 @@ from stable_baselines3.common.logger import configure
 from stable_baselines3.common.vec_env import VecMonitor, VecNormalize
 from torch import Tensor
 
-from agents.cloning import clone
-from agents.curriculum import Curriculum
-from agents.environments import AgentObservations, make_environments
-from agents.logged_steps import logged_steps
-from agents.runs import (
+from asp_env.data.predictor import Predictor
+from asp_env.errors import AspEnvError
+from asp_env.workers import one_thread
+from policies.cloning import clone
+from policies.curriculum import Curriculum
+from policies.environments import PolicyObservations, make_environments
+from policies.logged_steps import logged_steps
+from policies.runs import (
     CHECKPOINT,
     POLICY,
     algorithm_classes,
@@ -29,10 +32,7 @@ from agents.runs import (
     save_config,
     write_tensors,
 )
-from agents.settings import CONFIG, DEFAULTS, AgentSettings, read_settings
-from asp_env.data.predictor import Predictor
-from asp_env.errors import AspEnvError
-from asp_env.workers import one_thread
+from policies.settings import CONFIG, DEFAULTS, PolicySettings, read_settings
 
 LOWEST_SHARE_OF_RATE = 0.05
 """Share of the learning rate at the end of the training. Chosen by hand."""
@@ -47,21 +47,21 @@ Progress = Callable[[int], None]
 """Called with the number of steps so far."""
 
 
-def train_agent(
-    settings: AgentSettings,
+def train_policy(
+    settings: PolicySettings,
     out: Path,
     *,
     resume: bool = False,
     privileged: bool = False,
     progress: Progress | None = None,
 ) -> None:
-    """Trains an agent and writes its run folder.
+    """Trains a policy and writes its run folder.
 
     The same settings give the same weights on the same kind of machine. A resumed training goes
     on with the weights, optimizers and reward statistics of the last checkpoint in new episodes.
 
     Args:
-        settings: the settings of the agent.
+        settings: the settings of the policy.
         out: the run folder.
         resume: whether to go on with an interrupted run in `out`.
         privileged: allows forecasts of a predictor that uses the recorded future.
@@ -114,12 +114,12 @@ def train_agent(
     envs.close()
 
 
-def check_environment(folder: Path, settings: AgentSettings, data: str, privileged: bool) -> None:
-    """Checks that an environment shows a trained agent the forecasts of its own predictor.
+def check_environment(folder: Path, settings: PolicySettings, data: str, privileged: bool) -> None:
+    """Checks that an environment shows a trained policy the forecasts of its own predictor.
 
     Args:
-        folder: the run folder of the agent.
-        settings: the settings of the agent, possibly with another predictor.
+        folder: the run folder of the policy.
+        settings: the settings of the policy, possibly with another predictor.
         data: the data to drive in.
         privileged: allows forecasts of a predictor that uses the recorded future.
 
@@ -131,11 +131,11 @@ def check_environment(folder: Path, settings: AgentSettings, data: str, privileg
     envs.close()
 
 
-def make_algorithm(settings: AgentSettings, envs: VecNormalize) -> BaseAlgorithm:
+def make_algorithm(settings: PolicySettings, envs: VecNormalize) -> BaseAlgorithm:
     """Makes the algorithm of stable-baselines3 with random weights.
 
     Args:
-        settings: the settings of the agent.
+        settings: the settings of the policy.
         envs: its environments.
 
     Raises:
@@ -159,14 +159,14 @@ def make_algorithm(settings: AgentSettings, envs: VecNormalize) -> BaseAlgorithm
         raise AspEnvError(f"hyperparameters of {settings.algorithm}: {error}") from None
 
 
-def predictor_of(envs: AgentObservations) -> Predictor | None:
+def predictor_of(envs: PolicyObservations) -> Predictor | None:
     """The predictor whose forecasts environments show, if any."""
     predictors: Any = envs.get_attr("predictors", 0)[0]
     return predictors[0] if predictors else None
 
 
 def _clone_logged_drivers(
-    settings: AgentSettings, algorithm: BaseAlgorithm, privileged: bool
+    settings: PolicySettings, algorithm: BaseAlgorithm, privileged: bool
 ) -> None:
     """Trains the policy to act as the logged drivers, before anything else."""
     policy: Any = algorithm.policy
@@ -187,7 +187,7 @@ def _thirds(count: int) -> np.ndarray:
     return np.arange(count) * 3 // count
 
 
-def _check_folder(settings: AgentSettings, out: Path, resume: bool) -> bool:
+def _check_folder(settings: PolicySettings, out: Path, resume: bool) -> bool:
     """Whether there is something to resume.
 
     Raises:
@@ -207,7 +207,7 @@ def _check_folder(settings: AgentSettings, out: Path, resume: bool) -> bool:
     if before != settings:
         names = [
             name
-            for name in AgentSettings.__dataclass_fields__
+            for name in PolicySettings.__dataclass_fields__
             if getattr(before, name) != getattr(settings, name)
         ]
         raise AspEnvError(

@@ -1,4 +1,4 @@
-"""Evaluation of agents in their environments, on scenarios that they were not trained on."""
+"""Evaluation of policies in their environments, on scenarios that they were not trained on."""
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
@@ -7,16 +7,16 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float
 
-from agents.environments import AgentObservations, make_environments
-from agents.observations import Observations
-from agents.runs import Agent
-from agents.settings import EnvironmentSettings
 from asp_env.data.recording import ticks
 from asp_env.data.scenarios.scenario import Scenario, ScenarioSet
 from asp_env.data.scenarios.selection import choose_scenarios
 from asp_env.data.snippets import HISTORY_S
 from asp_env.data.source import open_data
 from asp_env.evaluation.statistics import Estimate, mean
+from policies.environments import PolicyObservations, make_environments
+from policies.observations import Observations
+from policies.runs import TrainedPolicy
+from policies.settings import EnvironmentSettings
 
 MAX_ENVS = 64
 
@@ -86,13 +86,13 @@ def evaluate_policy(
     return DrivenScenarios(scenarios=chosen, values=values)
 
 
-def evaluate_agent(agent: Agent, data: str, **options: Any) -> DrivenScenarios:
-    """Drives every scenario once with a trained agent; see `evaluate_policy`."""
-    return evaluate_policy(agent.act, agent.settings.environment, data, **options)
+def evaluate_trained(trained: TrainedPolicy, data: str, **options: Any) -> DrivenScenarios:
+    """Drives every scenario once with a trained policy; see `evaluate_policy`."""
+    return evaluate_policy(trained.act, trained.settings.environment, data, **options)
 
 
 def _drive(
-    envs: AgentObservations, scenarios: Sequence[Scenario], policy: Policy, seed: int
+    envs: PolicyObservations, scenarios: Sequence[Scenario], policy: Policy, seed: int
 ) -> list[tuple[int, dict[str, float]]]:
     """Drives at most as many scenarios as environments; spare environments repeat them."""
     count, num_envs = len(scenarios), envs.num_envs

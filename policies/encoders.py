@@ -1,13 +1,13 @@
-"""The encoder of a trained predictor, reused to read the rasters of an agent."""
+"""The encoder of a trained predictor, reused to read the rasters of a policy."""
 
 from typing import Any
 
 from torch import Tensor, nn
 
-from agents.settings import EnvironmentSettings
 from asp_env.data.predictor import load_predictor
 from asp_env.errors import AspEnvError
 from asp_env.views import make_raster_view
+from policies.settings import EnvironmentSettings
 
 
 class TrainedEncoder(nn.Module):
@@ -33,7 +33,7 @@ def trained_encoder(name: str, settings: EnvironmentSettings) -> TrainedEncoder:
 
     Args:
         name: `NAME:RUN` of a predictor that reads rasters.
-        settings: the environment of the agent, whose rasters must be those of the predictor.
+        settings: the environment of the policy, whose rasters must be those of the predictor.
 
     Raises:
         AspEnvError: the predictor has no encoder of rasters, or reads other rasters.
@@ -49,7 +49,7 @@ def trained_encoder(name: str, settings: EnvironmentSettings) -> TrainedEncoder:
     view, own = predictor.view, make_raster_view(settings.view, pixels=settings.raster_px)
     if (view.name, view.shape) != (own.name, own.shape):
         raise AspEnvError(
-            f"encoder {name} reads rasters {view.shape} of the view {view.name}, the agent "
+            f"encoder {name} reads rasters {view.shape} of the view {view.name}, the policy "
             f"observes {own.shape} of {own.name}; give the same --view and --raster-px"
         )
     return TrainedEncoder(encoder)

@@ -6,8 +6,8 @@ import numpy as np
 import torch
 from gymnasium import spaces
 
-from agents.networks import RasterFeatures, TrafficFeatures, route_coordinates
-from agents.observations import NEIGHBOUR_FIELDS, STATE
+from policies.networks import RasterFeatures, TrafficFeatures, route_coordinates
+from policies.observations import NEIGHBOUR_FIELDS, STATE
 
 NEIGHBOURS = 6
 

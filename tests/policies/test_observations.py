@@ -1,14 +1,14 @@
-"""What agents observe."""
+"""What policies observe."""
 
 import numpy as np
 import pytest
 
-from agents.environments import make_environments
-from agents.observations import NEIGHBOUR_FIELDS, STATE, reduce_observations, reduced_space
-from agents.settings import EnvironmentSettings
 from asp_env import ReplayVectorEnv
 from asp_env.errors import AspEnvError
 from asp_env.sim.observation import STATE_FIELDS
+from policies.environments import make_environments
+from policies.observations import NEIGHBOUR_FIELDS, STATE, reduce_observations, reduced_space
+from policies.settings import EnvironmentSettings
 
 OBSERVATIONS = ("state", "route", "vectors")
 

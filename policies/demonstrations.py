@@ -13,7 +13,6 @@ from gymnasium.wrappers import FlattenObservation
 from rich.console import Console
 from rich.progress import track
 
-from agents.dataset import ID_PATTERN, RecordedEpisode, import_h5py, write_dataset
 from asp_env.data.recording import DEFAULT_DT_S
 from asp_env.data.source import scheme_of
 from asp_env.envs.replay import ReplayEnv
@@ -21,6 +20,7 @@ from asp_env.envs.vector import ReplayVectorEnv
 from asp_env.errors import AspEnvError
 from asp_env.files import atomic_folder
 from asp_env.sim.world import Ending, world_class
+from policies.dataset import ID_PATTERN, RecordedEpisode, import_h5py, write_dataset
 
 BATCH = 32
 """Number of episodes that are recorded side by side; the episodes do not depend on it."""

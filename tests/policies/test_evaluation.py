@@ -1,12 +1,12 @@
-"""Evaluation of policies in the environment of agents."""
+"""Evaluation of policies in the environment of trained ones."""
 
 import numpy as np
 import pytest
 
-from agents.evaluation import evaluate_policy
-from agents.held_actions import RandomActions, zero_actions
-from agents.settings import EnvironmentSettings
 from asp_env import ReplayEnv
+from policies.evaluation import evaluate_policy
+from policies.held_actions import RandomActions, zero_actions
+from policies.settings import EnvironmentSettings
 
 DATA = "sample:roundabout"
 

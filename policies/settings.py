@@ -1,4 +1,4 @@
-"""The settings of an agent: everything that a run folder states about its training."""
+"""The settings of a policy: everything that a run folder states about its training."""
 
 import dataclasses
 import json
@@ -24,7 +24,7 @@ standing, and a collision costs more than the progress that it saves."""
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class EnvironmentSettings:
-    """What an agent observes, what its actions mean, and what it is rewarded for."""
+    """What a policy observes, what its actions mean, and what it is rewarded for."""
 
     scenarios: str = ""
     """Filter of the scenarios for training."""
@@ -68,13 +68,13 @@ MAX_MAP_LINES = 64
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class AgentSettings:
-    """An agent: an algorithm, its environment, and its numbers."""
+class PolicySettings:
+    """A policy: an algorithm, its environment, and its numbers."""
 
     algorithm: str = "ppo"
     """One of `ALGORITHMS`."""
     data: str = "sample:intersection"
-    """The data that the agent is trained on."""
+    """The data that the policy is trained on."""
     environment: EnvironmentSettings = field(default_factory=EnvironmentSettings)
     steps: int = 400_000
     """Steps of training, of `action_repeat` ticks each, summed over the environments."""
@@ -144,26 +144,26 @@ DEFAULTS: Mapping[str, Mapping[str, Any]] = {
 """Arguments of the algorithms' classes. Chosen by hand on validation places."""
 
 
-def read_settings(folder: Path) -> AgentSettings:
+def read_settings(folder: Path) -> PolicySettings:
     """Reads the settings of a run folder.
 
     Raises:
-        AspEnvError: the folder holds no run of an agent, or its settings are damaged.
+        AspEnvError: the folder holds no run of a policy, or its settings are damaged.
     """
     path = folder / CONFIG
     try:
         content = json.loads(path.read_text())
     except FileNotFoundError:
         raise AspEnvError(
-            f"{folder}: no run of an agent there ({CONFIG} is missing); train one with "
+            f"{folder}: no run of a policy there ({CONFIG} is missing); train one with "
             "asp-env rl train"
         ) from None
     except (OSError, ValueError) as error:
-        raise AspEnvError(f"{path}: damaged ({error}); train the agent again") from None
+        raise AspEnvError(f"{path}: damaged ({error}); train the policy again") from None
     return settings_from(content.get("settings") if isinstance(content, dict) else None, path)
 
 
-def settings_from(content: Any, path: Path) -> AgentSettings:
+def settings_from(content: Any, path: Path) -> PolicySettings:
     """Makes settings from the content of a file.
 
     Raises:
@@ -173,7 +173,7 @@ def settings_from(content: Any, path: Path) -> AgentSettings:
         fields = dict(content)
         environment = dict(fields.pop("environment"))
         pixels = environment.pop("raster_px", None)
-        return AgentSettings(
+        return PolicySettings(
             environment=EnvironmentSettings(
                 raster_px=None if pixels is None else (int(pixels[0]), int(pixels[1])),
                 **environment,
@@ -182,6 +182,6 @@ def settings_from(content: Any, path: Path) -> AgentSettings:
         )
     except (TypeError, KeyError, ValueError) as error:
         raise AspEnvError(
-            f"{path}: not the settings of an agent ({type(error).__name__}: {error}); train the "
-            "agent again"
+            f"{path}: not the settings of a policy ({type(error).__name__}: {error}); train the "
+            "policy again"
         ) from None

@@ -1,14 +1,14 @@
-"""The steps of the logged drivers in the environment of an agent, for behaviour cloning."""
+"""The steps of the logged drivers in the environment of a policy, for behaviour cloning."""
 
 from typing import Any, NamedTuple
 
 import numpy as np
 from jaxtyping import Float, Int
 
-from agents.environments import make_environments
-from agents.observations import Observations
-from agents.settings import AgentSettings
 from asp_env.data.scenarios.scenario import ScenarioSet
+from policies.environments import make_environments
+from policies.observations import Observations
+from policies.settings import PolicySettings
 
 
 class LoggedSteps(NamedTuple):
@@ -21,11 +21,11 @@ class LoggedSteps(NamedTuple):
     recording: Int[np.ndarray, " n"]
 
 
-def logged_steps(settings: AgentSettings, *, privileged: bool = False) -> LoggedSteps:
+def logged_steps(settings: PolicySettings, *, privileged: bool = False) -> LoggedSteps:
     """Drives all scenarios of the training with the actions of the logged drivers.
 
     Args:
-        settings: the settings of the agent.
+        settings: the settings of the policy.
         privileged: allows forecasts of a predictor that uses the recorded future.
 
     Raises:

@@ -1,4 +1,4 @@
-"""Features extractors of stable-baselines3 for the observations of agents.
+"""Features extractors of stable-baselines3 for the observations of policies.
 
 `TrafficFeatures` reads neighbours, lines and forecasts as tokens; `RasterFeatures` reads rasters.
 Both divide what they read by fixed scales, so that no statistics of observations are needed.
@@ -11,9 +11,9 @@ from gymnasium import spaces
 from stable_baselines3.common.torch_layers import BaseFeaturesExtractor
 from torch import Tensor, nn
 
-from agents.observations import NEIGHBOUR_FIELDS, STATE
 from asp_env.sim.observation import ROUTE_STEP_M
 from asp_env.views.vectors import AGENT_FIELDS, LINE_FIELDS
+from policies.observations import NEIGHBOUR_FIELDS, STATE
 
 STATE_SCALES = {
     "speed_mps": 10.0,
@@ -49,7 +49,7 @@ class TrafficFeatures(BaseFeaturesExtractor):
         """Creates the network.
 
         Args:
-            space: space of an agent's observation without rasters.
+            space: space of a policy's observation without rasters.
             width: number of features of tokens.
         """
         has_lines = "lines" in space.spaces
@@ -170,7 +170,7 @@ class RasterFeatures(BaseFeaturesExtractor):
         """Creates the network.
 
         Args:
-            space: space of an agent's observation with a raster.
+            space: space of a policy's observation with a raster.
             width: number of features of the encoding.
             encoder: a trained encoder of such rasters, (B, channels, height, width) in [0, 1] to
                 (B, features), whose weights stay fixed; by default a new one is trained.

@@ -1,4 +1,4 @@
-"""The comparison of agents."""
+"""The comparison of policies."""
 
 import json
 from pathlib import Path
@@ -6,8 +6,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from agents.comparison import compare_rows, default_rows, learning_curves
 from asp_env.cli import main
+from policies.comparison import compare_rows, default_rows, learning_curves
 
 METRIC = "success"
 

@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 from gymnasium import spaces
 
-from agents.cloning import clone, hold_out
 from asp_env.errors import AspEnvError
+from policies.cloning import clone, hold_out
 
 pytest.importorskip("stable_baselines3")
 
