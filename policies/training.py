@@ -22,6 +22,7 @@ from policies.environments import PolicyObservations, make_environments
 from policies.logged_steps import logged_steps
 from policies.runs import (
     CHECKPOINT,
+    LOG_STD,
     POLICY,
     algorithm_classes,
     check_predictor,
@@ -180,6 +181,9 @@ def _clone_logged_drivers(
             epochs=settings.demonstrations,
             seed=settings.seed,
         )
+    if settings.algorithm == "ppo":  # cloning has lowered the deviation, PPO has to explore
+        with torch.no_grad():
+            policy.log_std.fill_(LOG_STD)
 
 
 def _thirds(count: int) -> np.ndarray:
