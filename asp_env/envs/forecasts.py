@@ -406,7 +406,7 @@ since the scene of each agent's forecast |
             keys.append("forecast_age")
         return keys
 
-    def _make_spaces(self, dt_s: float) -> dict[str, spaces.Box[Any]]:
+    def _make_spaces(self, dt_s: float) -> dict[str, spaces.Box]:
         options = self._options
         agents, points = options.agents, options.modes * len(self._times_ticks) * 2
         bounds = {
