@@ -45,6 +45,10 @@ class TrafficFeatures(BaseFeaturesExtractor):
     attention (as the polylines of VectorNet, Gao et al., 2020).
     """
 
+    state_scale: Tensor
+    agent_scale: Tensor
+    line_scale: Tensor
+
     def __init__(self, space: spaces.Dict, width: int = 64) -> None:
         """Creates the network.
 
@@ -54,16 +58,15 @@ class TrafficFeatures(BaseFeaturesExtractor):
         """
         has_lines = "lines" in space.spaces
         super().__init__(space, len(STATE) + width * (4 if has_lines else 3))
-        self.forecasts = nn.ModuleList(
-            ForecastTokens(prefix, space) for prefix in forecast_prefixes(space)
-        )
+        forecasts = [ForecastTokens(prefix, space) for prefix in forecast_prefixes(space)]
+        self.forecasts = nn.ModuleList(forecasts)
         route = space["route"].shape
         assert route is not None
         self.register_buffer("state_scale", torch.tensor([STATE_SCALES[name] for name in STATE]))
         agent = [AGENT_SCALES.get(name, 1.0) for name in AGENT_FIELDS]
         self.register_buffer("agent_scale", torch.tensor(agent + agent))
         self.ego = _perceptron(len(STATE) + 2 * route[0], width)
-        size = NEIGHBOUR_FIELDS - 1 + 6 + sum(each.size for each in self.forecasts)
+        size = NEIGHBOUR_FIELDS - 1 + 6 + sum(each.size for each in forecasts)
         self.neighbour = nn.Linear(size, width)
         self.context = nn.Linear(width, width, bias=False)
         self.token = nn.Linear(width, width)
@@ -163,6 +166,8 @@ class Attention(nn.Module):
 
 class RasterFeatures(BaseFeaturesExtractor):
     """The ego's state and route, and a convolutional encoding of its raster."""
+
+    state_scale: Tensor
 
     def __init__(
         self, space: spaces.Dict, width: int = 64, encoder: nn.Module | None = None

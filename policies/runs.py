@@ -64,8 +64,10 @@ def algorithm_classes(name: str) -> AlgorithmClasses:
     if name in ("ppo", "bc"):
         return AlgorithmClasses(algorithm=PPO, policy=MultiInputActorCriticPolicy)
     try:
-        from sb3_contrib import RecurrentPPO
-        from sb3_contrib.ppo_recurrent.policies import RecurrentMultiInputActorCriticPolicy
+        from sb3_contrib import RecurrentPPO  # pyright: ignore[reportMissingImports]
+        from sb3_contrib.ppo_recurrent.policies import (  # pyright: ignore[reportMissingImports]
+            RecurrentMultiInputActorCriticPolicy,
+        )
     except ModuleNotFoundError as error:
         raise MissingExtraError(str(error.name), "rl", f"the algorithm {name}") from error
     return AlgorithmClasses(algorithm=RecurrentPPO, policy=RecurrentMultiInputActorCriticPolicy)

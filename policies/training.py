@@ -145,8 +145,9 @@ def make_algorithm(settings: PolicySettings, envs: VecNormalize) -> BaseAlgorith
     classes = algorithm_classes(settings.algorithm)
     arguments = {**DEFAULTS[settings.algorithm], **settings.hyperparameters}
     rate = settings.learning_rate
+    algorithm: Any = classes.algorithm
     try:
-        return classes.algorithm(
+        return algorithm(
             classes.policy,
             envs,
             learning_rate=lambda left: rate * max(left, LOWEST_SHARE_OF_RATE),
@@ -301,7 +302,8 @@ def _restore(out: Path, algorithm: BaseAlgorithm, envs: VecNormalize) -> int:
     """Restores a checkpoint; returns its number of steps."""
     tensors = read_tensors(out / CHECKPOINT)
     steps, mean, variance, count = tensors["numbers"].tolist()
-    envs.ret_rms.mean, envs.ret_rms.var, envs.ret_rms.count = np.float64(mean), variance, count
+    rewards: Any = envs.ret_rms
+    rewards.mean, rewards.var, rewards.count = np.float64(mean), variance, count
     algorithm.num_timesteps = int(steps)
     for name in algorithm.get_parameters():
         owner: Any = algorithm

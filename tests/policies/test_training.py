@@ -46,7 +46,7 @@ def test_a_trained_policy_drives(run: Path) -> None:
 def test_an_interrupted_training_is_resumed(
     algorithm: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    changes = {"algorithm": algorithm}
+    changes: dict[str, object] = {"algorithm": algorithm}
     if algorithm == "sac":
         changes["hyperparameters"] = {"buffer_size": 500, "learning_starts": 16, "batch_size": 16}
     settings = dataclasses.replace(small_settings(), **changes)  # pyright: ignore[reportArgumentType]
