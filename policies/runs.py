@@ -130,6 +130,8 @@ class TrainedPolicy:
                     f"observation {name!r}: expected shape (B, *{box.shape}) as in training, got "
                     f"{given}"
                 )
+        if starts is not None and starts.all():
+            self._memory = None
         shown = {name: observations[name] for name in self.space.spaces}
         actions, self._memory = self._policy.predict(
             shown, state=self._memory, episode_start=starts, deterministic=True
