@@ -99,7 +99,10 @@ class ForecastOptions:
         return self.latency_ticks + self.every_ticks - 1
 
 
-PredictorSpec = str | Predictor | Mapping[str, str | Predictor]
+NamedPredictor = str | Predictor | Shared[Predictor]
+"""A predictor or its name; specifications of environments hold predictors by `Shared`."""
+
+PredictorSpec = NamedPredictor | Mapping[str, NamedPredictor]
 """A predictor or its name, or several with the prefixes of their entries."""
 
 ForecastSpec = ForecastOptions | Mapping[str, Any]
@@ -205,9 +208,7 @@ since the scene of each agent's forecast |
     Every episode depends on its own scenes only, not on which others are observed with it.
     """
 
-    def __init__(
-        self, predictor: str | Predictor | Shared[Predictor], options: ForecastOptions, dt_s: float
-    ) -> None:
+    def __init__(self, predictor: NamedPredictor, options: ForecastOptions, dt_s: float) -> None:
         """Loads the predictor and defines the spaces.
 
         Args:
@@ -438,7 +439,7 @@ since the scene of each agent's forecast |
 
 
 def forecast_observers(
-    predictor: PredictorSpec | Shared[Predictor] | None,
+    predictor: PredictorSpec | None,
     forecast: ForecastSpec | None,
     dt_s: float,
 ) -> tuple[ForecastObserver, ...]:
