@@ -171,7 +171,9 @@ def _outermost_m(
 ) -> Float[np.ndarray, "*batch"]:
     flat = np.ascontiguousarray(states.reshape(-1, 4))
     out = np.empty(len(flat), dtype=np.float32)
-    field.corners_m(flat, sizes.reshape(-1, 2), np.ones(len(flat), dtype=bool), out)
+    # A copy of sizes that are broadcast or read-only: the kernel is compiled for one kind of array.
+    boxes = np.array(sizes.reshape(-1, 2), order="C")
+    field.corners_m(flat, boxes, np.ones(len(flat), dtype=bool), out)
     return out.reshape(states.shape[:-1])
 
 

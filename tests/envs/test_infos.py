@@ -136,11 +136,13 @@ def test_stable_baselines3_reads_success_and_statistics(crossing):
     from stable_baselines3.common.callbacks import EvalCallback
     from stable_baselines3.common.vec_env import VecMonitor
 
-    envs, watched = (asp_env.sb3_vec_env(2, crossing, **OPTIONS) for _ in range(2))
-    callback = EvalCallback(VecMonitor(watched), n_eval_episodes=4, eval_freq=100, verbose=0)
+    envs, watched = (VecMonitor(asp_env.sb3_vec_env(2, crossing, **OPTIONS)) for _ in range(2))
+    callback = EvalCallback(watched, n_eval_episodes=4, eval_freq=64, verbose=0)
     model = PPO("MultiInputPolicy", envs, n_steps=64, batch_size=64, n_epochs=1, seed=0)
-    model.learn(256, callback=callback)
+    model.learn(128, callback=callback)
     assert len(callback._is_success_buffer) == 4
+    model = PPO("MultiInputPolicy", envs.venv, n_steps=64, batch_size=64, n_epochs=1, seed=0)
+    model.learn(128)
     assert model.ep_info_buffer
     assert np.isfinite([each["r"] for each in model.ep_info_buffer]).all()
     alone, monitored = (asp_env.sb3_vec_env(2, crossing, **OPTIONS) for _ in range(2))

@@ -80,8 +80,6 @@ def test_parts_are_those_of_the_wrapper(crossing):
         "actions": (30,),
         "route": (60,),
     }
-    with pytest.raises(asp_env.AspEnvError, match="expected False, True or 'parts'"):
-        ReplayEnv(crossing, flatten="all")  # pyright: ignore[reportArgumentType]
 
 
 def test_nearest_agents_are_the_present_tick_of_the_vectors(crossing):

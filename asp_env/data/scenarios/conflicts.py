@@ -129,16 +129,19 @@ def _meet(rows, first_row, stride, ego, arcs, route, size, size_o, met):
         Whether the agent is ever in the path.
     """
     ever = False
-    low_x, high_x = ego[:, 0].min() - _NEAR_M, ego[:, 0].max() + _NEAR_M
-    low_y, high_y = ego[:, 1].min() - _NEAR_M, ego[:, 1].max() + _NEAR_M
-    end = min(len(route), int(arcs.max()) + _BEYOND_M)
+    low_x, high_x, low_y, high_y, farthest = ego[0, 0], ego[0, 0], ego[0, 1], ego[0, 1], arcs[0]
+    for t in range(1, len(ego)):
+        low_x, high_x = min(low_x, ego[t, 0]), max(high_x, ego[t, 0])
+        low_y, high_y = min(low_y, ego[t, 1]), max(high_y, ego[t, 1])
+        farthest = max(farthest, arcs[t])
+    end = min(len(route), int(farthest) + _BEYOND_M)
     for t in range(len(met)):
         row = first_row + t * stride
         if row < 0 or row >= len(rows):
             continue
         x, y = rows[row, 0], rows[row, 1]
         met[t, 4] = np.inf
-        if not (low_x < x < high_x and low_y < y < high_y):
+        if not (low_x - _NEAR_M < x < high_x + _NEAR_M and low_y - _NEAR_M < y < high_y + _NEAR_M):
             continue
         nearest, best = 0, np.inf
         for j in range(0, end, _COARSE_M):
@@ -147,7 +150,8 @@ def _meet(rows, first_row, stride, ego, arcs, route, size, size_o, met):
                 nearest, best = j, dx * dx + dy * dy
         if best > _NEAR_M * _NEAR_M:
             continue
-        arc, offset, heading = project(route, len(route), x, y, nearest, 2.0 * _COARSE_M)
+        near = float(nearest)  # the type with which `project` is compiled already
+        arc, offset, heading = project(route, len(route), x, y, near, 2.0 * _COARSE_M)
         angle = wrap_scalar(rows[row, 2] - heading)
         along, across = abs(math.cos(angle)), abs(math.sin(angle))
         width = size[1] + size_o[0] * across + size_o[1] * along
@@ -176,7 +180,8 @@ def _with_agent(rows, first_row, stride, count, ego, arcs, route, size, size_o, 
         dt_s: seconds per tick.
         out: (3,) `pet_s`, `pet_behind_s` and `dttcp_s`, updated.
     """
-    met = np.full((count, 6), np.nan)
+    met = np.empty((count, 6))
+    met[:] = np.nan
     if not _meet(rows, first_row, stride, ego, arcs, route, size, size_o, met):
         return
     was_beside = False
@@ -252,7 +257,8 @@ def _smallest_dttcp(rows, first_row, stride, ego, arcs, met, tick, dt_s):
     window = int(CONFLICT_BEFORE_S / dt_s + _ROUNDING)
     sustained = max(1, int(SUSTAINED_S / dt_s + _ROUNDING))
     smallest, distance_o = np.inf, 0.0
-    differences = np.full(window, np.inf)  # from the last tick backwards
+    differences = np.empty(window)  # from the last tick backwards
+    differences[:] = np.inf
     for t in range(tick - 1, max(0, begin - window) - 1, -1):
         row = first_row + t * stride
         if row < 0:
@@ -265,5 +271,8 @@ def _smallest_dttcp(rows, first_row, stride, ego, arcs, met, tick, dt_s):
             ttcp, ttcp_o = (point - arcs[t]) / speed, distance_o / speed_o
             differences[begin - 1 - t] = abs(ttcp - ttcp_o)
     for k in range(window - sustained + 1):
-        smallest = min(smallest, differences[k : k + sustained].max())
+        largest = differences[k]
+        for t in range(k + 1, k + sustained):
+            largest = max(largest, differences[t])
+        smallest = min(smallest, largest)
     return smallest

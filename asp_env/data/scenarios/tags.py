@@ -318,8 +318,13 @@ def _describe_all(tracks, drives, stride, dt_s, ring, tags, values):
         _tag_roundabout(ego, ring, tags[i])
         tags[i, _U_TURN] &= not tags[i, _ROUNDABOUT]
         end = frame + (count - 1) * stride
-        others = np.flatnonzero((tracks.roles > 0) & (tracks.first <= end) & (tracks.last >= frame))
-        others = others[others != e]
+        others, num_others = np.empty(len(tracks.roles), dtype=np.int64), 0
+        for o in range(len(tracks.roles)):
+            present = tracks.first[o] <= end and tracks.last[o] >= frame
+            if o != e and tracks.roles[o] > 0 and present:
+                others[num_others] = o
+                num_others += 1
+        others = others[:num_others]
         placed = np.full((len(others), count, 4), np.nan)
         nearby = np.zeros(count)
         for k in range(len(others)):
@@ -328,7 +333,10 @@ def _describe_all(tracks, drives, stride, dt_s, ring, tags, values):
             values[i, _AGENTS] += _place(
                 rows, tracks.first[o], frame, stride, ego, arcs, route, placed[k], nearby
             )
-        values[i, _DENSITY], values[i, _MAX_DENSITY] = nearby.sum() / count, nearby.max()
+        total, most = 0.0, 0.0
+        for t in range(count):
+            total, most = total + nearby[t], max(most, nearby[t])
+        values[i, _DENSITY], values[i, _MAX_DENSITY] = total / count, most
         route_end = len(route) - 1 - BEYOND_M  # of the recorded part
         size, sizes, roles = tracks.sizes[e], tracks.sizes[others], tracks.roles[others]
         reach = 0.5 * (size[1] + sizes[:, 1])
@@ -442,7 +450,8 @@ def _place(rows, first, frame, stride, ego, arcs, route, placed, nearby):
             if dx * dx + dy * dy < best:
                 nearest, best = j, dx * dx + dy * dy
         if best <= _NEAR_ROUTE_M * _NEAR_ROUTE_M:
-            arc, offset, heading = project(route, len(route), x, y, nearest, 2.0 * _COARSE_M)
+            near = float(nearest)  # the type with which `project` is compiled above
+            arc, offset, heading = project(route, len(route), x, y, near, 2.0 * _COARSE_M)
             placed[t, 0], placed[t, 1] = arc, offset
             placed[t, 2], placed[t, 3] = wrap_scalar(rows[row, 2] - heading), rows[row, 3]
     return present
@@ -465,7 +474,8 @@ def _tag_following(ego, arcs, size, sizes, roles, placed, tags):
     Returns:
         (ticks,) arc length of the nearest leader, m; infinite without a leader.
     """
-    nearest = np.full(len(ego), np.inf)
+    nearest = np.empty(len(ego))
+    nearest[:] = np.inf
     ticks_moving, ticks_following = 0, 0
     for t in range(len(ego)):
         gap = np.inf
@@ -552,10 +562,14 @@ def _yields(speeds, arcs, place_m, entered, cleared, dt_s):
     if arrival == len(arcs) or not 0.0 < late_s <= YIELD_ARRIVAL_S + _ROUNDING:
         return False
     slowest = max(0, entered - int(YIELD_BEFORE_S / dt_s + _ROUNDING))
-    slowest += np.argmin(speeds[slowest : arrival + 1])
+    for t in range(slowest + 1, arrival + 1):
+        if speeds[t] < speeds[slowest]:
+            slowest = t
     slow = speeds[slowest]
     before = max(0, slowest - int(YIELD_SPEED_OVER_S / dt_s + _ROUNDING))
-    highest = speeds[before : slowest + 1].max()
+    highest = speeds[before]
+    for t in range(before + 1, slowest + 1):
+        highest = max(highest, speeds[t])
     slowed = slow < MANOEUVRE_STANDING_MPS or slow <= YIELD_SPEED_SHARE * highest
     in_time = (slowest - cleared) * dt_s <= YIELD_SLOWEST_S + _ROUNDING
     return slowed and in_time and speeds[arrival] >= slow + YIELD_SPEED_GAIN_MPS
