@@ -23,7 +23,7 @@ from asp_env.data.scenarios.scenario import Scenario, ScenarioFilter, ScenarioSe
 from asp_env.data.scene import EGO, Scene
 from asp_env.envs.episodes import RESET_OPTIONS, ReplayEpisodes, info_of, valid_actions
 from asp_env.envs.flat import Flatten, flat_space, flatten_observations
-from asp_env.envs.forecasts import ForecastSpec, PredictorSpec
+from asp_env.envs.forecasts import ForecastSpec, PredictorSpec, extended_space
 from asp_env.envs.options import ReplayOptions, suggest_options
 from asp_env.errors import AspEnvError, unknown_name
 from asp_env.render.frames import draw_frame
@@ -333,7 +333,7 @@ entry is a vector, images stay images |
         space = self._episodes.space
         if pad_absent:
             mask = spaces.Box(0, 1, (1,), dtype=np.int8)
-            space = spaces.Dict([*self._episodes.space.items(), (PRESENT, mask)])
+            space = extended_space(space, {PRESENT: mask})
         space = flat_space(space, flatten)
         self.observation_spaces: dict[str, Any] = dict.fromkeys(self._rows, space)
         self.action_spaces: dict[str, spaces.Space[Any]] = {
