@@ -52,7 +52,7 @@ class EnvSnapshot:
         return partial(EnvSnapshot, **{name: getattr(self, name) for name in names}), ()
 
 
-class ReplayEnv(SharedInSpec, gymnasium.Env[dict[str, Any], Any]):
+class ReplayEnv(SharedInSpec, gymnasium.Env[dict[str, Any], Any]):  # pyright: ignore[reportIncompatibleVariableOverride]
     """Controls one vehicle of a recording, the ego, among replayed or reacting traffic.
 
     ## Description

@@ -39,7 +39,7 @@ class VectorSnapshot:
     over: Bool[np.ndarray, " n"]
 
 
-class ReplayVectorEnv(SharedInSpec, VectorEnv[Observation, Any, np.ndarray]):
+class ReplayVectorEnv(SharedInSpec, VectorEnv[Observation, Any, np.ndarray]):  # pyright: ignore[reportIncompatibleVariableOverride]
     """`asp_env/Replay-v0` as a vector environment: one world of arrays for all episodes.
 
     ## Description
