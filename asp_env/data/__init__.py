@@ -10,10 +10,12 @@ from asp_env.data.predictor import (
     InteractivePredictor,
     Predictor,
     PredictorPlug,
+    PresentPredictor,
     feature_size,
     fill_missing,
     load_predictor,
     make_forecast,
+    reads_past,
 )
 from asp_env.data.recording import Recording
 from asp_env.data.road_map import RoadMap
@@ -39,6 +41,7 @@ __all__ = [
     "InteractivePredictor",
     "Predictor",
     "PredictorPlug",
+    "PresentPredictor",
     "Recording",
     "Recordings",
     "RoadMap",
@@ -63,4 +66,5 @@ __all__ = [
     "load_predictor",
     "make_forecast",
     "open_data",
+    "reads_past",
 ]

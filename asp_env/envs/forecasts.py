@@ -463,12 +463,12 @@ def forecast_observers(
         return (ForecastObserver(predictor, _options_of(forecast), dt_s),)
     if not predictor:
         raise AspEnvError("predictor {}: expected a predictor or a mapping with at least one")
-    own = isinstance(forecast, Mapping) and bool(set(forecast) & set(predictor))
-    if own and (unknown := sorted(set(forecast or {}) - set(predictor))):
+    own = forecast if isinstance(forecast, Mapping) and set(forecast) & set(predictor) else None
+    if unknown := sorted(set(own or {}) - set(predictor)):
         raise unknown_name("predictor in forecast", unknown[0], sorted(predictor))
     observers = []
     for prefix, each in predictor.items():
-        options = _options_of(forecast.get(prefix) if own else forecast)  # pyright: ignore[reportOptionalMemberAccess, reportAttributeAccessIssue]
+        options = _options_of(forecast if own is None else own.get(prefix))
         full = "_".join(part for part in (options.prefix, prefix) if part)
         observers.append(ForecastObserver(each, dataclasses.replace(options, prefix=full), dt_s))
     return tuple(observers)

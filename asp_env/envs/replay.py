@@ -55,7 +55,7 @@ class EnvSnapshot:
         return partial(EnvSnapshot, **{name: getattr(self, name) for name in names}), ()
 
 
-class ReplayEnv(SharedInSpec, gymnasium.Env[Any, Any]):
+class ReplayEnv(SharedInSpec, gymnasium.Env[Any, Any]):  # pyright: ignore[reportIncompatibleVariableOverride]
     """Controls one vehicle of a recording, the ego, among replayed or reacting traffic.
 
     ## Description

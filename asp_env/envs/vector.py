@@ -44,7 +44,7 @@ class VectorSnapshot:
     over: Bool[np.ndarray, " n"]
 
 
-class ReplayVectorEnv(SharedInSpec, VectorEnv[Any, Any, np.ndarray]):
+class ReplayVectorEnv(SharedInSpec, VectorEnv[Any, Any, np.ndarray]):  # pyright: ignore[reportIncompatibleVariableOverride]
     """`asp_env/Replay-v0` as a vector environment: one world of arrays for all episodes.
 
     ## Description

@@ -193,6 +193,7 @@ def test_a_moved_forecast_of_a_constant_velocity_is_the_fresh_one():
         "constant-velocity", ForecastOptions(agents=3, every_ticks=4, latency_ticks=3), 0.2
     )
     fresh = ForecastObserver("constant-velocity", ForecastOptions(agents=3), 0.2)
+    seen: dict[str, np.ndarray] = {}
     for tick in range(20):
         roads.tick = tick
         seen, expected = (each.observe(roads, np.zeros(1, dtype=int)) for each in (old, fresh))
@@ -299,8 +300,8 @@ def test_the_specification_of_named_predictors_is_json(crossing):
 
 def test_reset_seeds_stochastic_predictors(crossing):
     """The noise of the same scenario differs between seeds, and only then."""
-    options = STATE | {"predictor": "noisy-oracle:2", "forecast": {"privileged": True}}
-    env = ReplayEnv(crossing, **options)
+    options: dict[str, Any] = {"forecast": {"privileged": True}, **STATE}
+    env = ReplayEnv(crossing, predictor="noisy-oracle:2", **options)
 
     def seen(seed: int) -> bytes:
         first, _ = env.reset(seed=seed, options={"scenario": 0})
@@ -308,7 +309,7 @@ def test_reset_seeds_stochastic_predictors(crossing):
         return first["oracle_forecast"].tobytes() + second["oracle_forecast"].tobytes()
 
     assert seen(0) == seen(0) != seen(1)
-    exact = ReplayEnv(crossing, **(options | {"predictor": "oracle"}))
+    exact = ReplayEnv(crossing, predictor="oracle", **options)
     assert len({exact.reset(seed=s, options={"scenario": 0})[0]["oracle_forecast"].tobytes()
                 for s in range(3)}) == 1  # fmt: skip
 
@@ -392,6 +393,7 @@ def test_stable_baselines3_gets_the_forecasts_of_ended_episodes(crossing):
     ends = 0
     for action in _actions(4, 60):
         seen, _, over, infos = envs.step(action)
+        assert isinstance(seen, dict)
         for b in np.flatnonzero(over):
             last = infos[b]["terminal_observation"]
             assert last in envs.observation_space

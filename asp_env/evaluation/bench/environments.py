@@ -3,16 +3,18 @@
 import importlib
 import importlib.util
 from collections.abc import Sequence
+from time import process_time
 from typing import Any
 
 import gymnasium
 import numpy as np
 
-from asp_env.evaluation.bench.timing import Rate, median_s
+from asp_env.evaluation.bench.timing import REFERENCE, Rate, median_s
 
 SINGLE_STEPS = 300
 VECTOR_STEPS = 40
 RASTER_STEPS = 10
+FORECAST_STEPS = 150
 PEER_STEPS = 40
 PEER = "highway_env"
 PEER_ID = "intersection-v2"
@@ -47,11 +49,55 @@ def environment_rates(data: str, *, num_envs: int, write_bytes_per_s: float) -> 
             bytes_each=bytes_each,
             **bound,
         ),
+        *_with_forecasts(data, num_envs),
     ]
     if peer is not None:
         name = f"highway-env {PEER_ID}, {vehicles:.0f} vehicles, 5 Hz (15 Hz inside)"
         rates.append(Rate(name=name, per_s=peer, unit="steps/s"))
     return rates
+
+
+def _with_forecasts(data: str, num_envs: int) -> tuple[Rate, Rate]:
+    """Rates without and with forecasts of constant velocity, stepped in turn.
+
+    Both environments take every step one after the other, so that changes of the processor's speed
+    hardly affect the ratio.
+    """
+    pair = [
+        gymnasium.make_vec(
+            "asp_env/Replay-v0",
+            num_envs=num_envs,
+            vectorization_mode="vector_entry_point",
+            data=data,
+            observations=("vectors", "state", "route"),
+            predictor=predictor,
+        )
+        for predictor in (None, REFERENCE)
+    ]
+    actions = np.zeros((num_envs, 2), dtype=np.float32)
+    durations_s = np.zeros((2, FORECAST_STEPS))
+    for envs in pair:
+        envs.reset(seed=0)
+        envs.step(actions)
+    for step in range(FORECAST_STEPS):
+        for number, envs in enumerate(pair):
+            start = process_time()
+            envs.step(actions)
+            durations_s[number, step] = process_time() - start
+    for envs in pair:
+        envs.close()
+    without, with_forecasts = num_envs / durations_s.mean(axis=1)
+    name = f"gym.make_vec of {num_envs}, vectors, state, route"
+    return (
+        Rate(name=name, per_s=float(without), unit="steps/s"),
+        Rate(
+            name=f"… and forecasts of {REFERENCE}",
+            per_s=float(with_forecasts),
+            unit="steps/s",
+            reference_per_s=float(without),
+            reference="without forecasts",
+        ),
+    )
 
 
 def _single(data: str, observations: Sequence[str], traffic: str) -> float:
