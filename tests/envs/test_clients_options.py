@@ -1,6 +1,8 @@
 """Options as configuration files, specifications and players give them."""
 
 import pickle
+import sys
+import warnings
 from collections.abc import Iterator, Sequence
 from typing import Any
 
@@ -9,7 +11,6 @@ import numpy as np
 import pygame
 import pytest
 from gymnasium.envs.registration import EnvSpec
-from gymnasium.utils.play import play
 from gymnasium.wrappers.vector import HumanRendering
 
 import asp_env
@@ -135,6 +136,10 @@ def test_videos_have_the_frame_rate_of_the_episode(crossing, tmp_path):
 def test_play_drives_with_the_keyboard(crossing, monkeypatch):
     """W is pressed from the first frame on; the episode then runs until the window is closed."""
     monkeypatch.setenv("SDL_VIDEODRIVER", "dummy")
+    monkeypatch.setitem(sys.modules, "matplotlib", None)  # `play` would choose its backend
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        from gymnasium.utils.play import play
     seen: list[np.ndarray] = []
 
     def follow(before: Any, after: Any, action: np.ndarray, *rest: Any) -> None:
