@@ -66,8 +66,7 @@ def raster_size(raster_px: int | Sequence[int] | None) -> tuple[int, int] | None
     """
     if raster_px is None:
         return None
-    is_sequence = isinstance(raster_px, Sequence | np.ndarray) and not isinstance(raster_px, str)
-    sizes = list(raster_px) if is_sequence else [raster_px, raster_px]
+    sizes: list[Any] = [raster_px] * 2 if isinstance(raster_px, int) else list(raster_px)
     whole = [isinstance(size, int | np.integer) and not isinstance(size, bool) for size in sizes]
     if len(sizes) != 2 or not all(whole):
         raise AspEnvError(
