@@ -14,7 +14,7 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Bool, Float, Int, UInt64
 
-from asp_env.data.classes import PREDICTED
+from asp_env.data.classes import is_predicted
 from asp_env.data.predictor import Forecast, constant_velocity
 from asp_env.data.scene import Scene
 from asp_env.data.snippets import Future
@@ -55,6 +55,7 @@ class Blind:
     privileged: bool = False
     trained_on: TrainedOn | None = None
     history: int = 0
+    reads_past: bool = False
 
     @property
     def metadata(self) -> Mapping[str, str]:
@@ -97,6 +98,7 @@ class _RecordedFuture:
     privileged: bool = True
     trained_on: TrainedOn | None = None
     history: int = 0
+    reads_past: bool = False
 
     @property
     def metadata(self) -> Mapping[str, str]:
@@ -169,8 +171,9 @@ class NoisyOracle(_RecordedFuture):
     For targets that move less than three times METRES, the root of the mean squared displacement is
     METRES · (D / 3 METRES)² instead, so that parked agents do not move.
 
-    z is a function of the track id and the tick (`persistent_noise`). It changes slowly, since the
-    errors of predictors persist over consecutive forecasts.
+    z is a function of the track id, the tick and, if there is one, the episode's seed,
+    `Scene.seeds` (`persistent_noise`). It changes slowly, since the errors of predictors persist
+    over consecutive forecasts.
     """
 
     metres: float
@@ -211,7 +214,8 @@ class NoisyOracle(_RecordedFuture):
             self.metres / np.maximum(reach_m, 1e-9),
             reach_m / max(REACH_PER_METRE**2 * self.metres, 1e-9),
         )
-        z = persistent_noise(oracle.ids, oracle.tick, self.dt_s)
+        seeds = None if scene.seeds is None else scene.seeds[scene.targets[:, 0]]
+        z = persistent_noise(oracle.ids, oracle.tick, self.dt_s, seeds)
         factor = (1 + size / math.sqrt(2) * (z[:, 0] + 1j * z[:, 1]))[:, None]
         moved = ahead * factor
         states[..., 0], states[..., 1] = now[..., 0] + moved.real, now[..., 1] + moved.imag
@@ -254,7 +258,7 @@ class ShuffledOracle(_RecordedFuture):
         """
         oracle = self._oracle(scene, future)
         classes = scene.classes[scene.targets[:, 0], scene.targets[:, 1]]
-        predicted = np.isin(classes, [int(kind) for kind in PREDICTED])
+        predicted = is_predicted(classes)
         other = _next_in_circle(oracle.ids, (scene.targets[:, 0], predicted), oracle.valid)
         now = np.where(oracle.valid[:, None], scene.target_states, 0).astype(np.float64)[:, None]
         motion = states_to_frame(oracle.states[other, 0].astype(np.float64), now[other])
@@ -306,24 +310,31 @@ class InteractiveOracle(_RecordedFuture):
 
 
 def persistent_noise(
-    ids: Int[np.ndarray, " t"], tick: Int[np.ndarray, " t"], dt_s: float
+    ids: Int[np.ndarray, " t"],
+    tick: Int[np.ndarray, " t"],
+    dt_s: float,
+    seeds: UInt64[np.ndarray, " t"] | None = None,
 ) -> Float[np.ndarray, "t 2"]:
     """Noise of mean 0 and variance 1 that changes slowly with the tick.
 
     It is the interpolation of independent draws every `DRAWN_EVERY_S`, divided by its standard
-    deviation and clipped at ±3. The draws are a function of the id and their number, so that values
-    depend on neither the order nor the number of agents or ticks.
+    deviation and clipped at ±3. The draws are a function of the id, the seed and their number, so
+    that values depend on neither the order nor the number of agents or ticks.
 
     Args:
         ids: track ids.
         tick: the tick of each.
         dt_s: seconds per tick.
+        seeds: random number of each, such as that of its episode; None for the same noise in every
+            episode.
 
     Returns:
         Two independent values for each id.
     """
     every = max(1, round(DRAWN_EVERY_S / dt_s))
     streams = mixed(ids.astype(np.int64).view(np.uint64))
+    if seeds is not None:
+        streams = mixed(streams ^ seeds)
     shifted = tick + (streams % np.uint64(every)).astype(np.int64)
     number = shifted // every
     share = ((shifted - number * every) / every)[:, None]

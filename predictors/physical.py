@@ -6,7 +6,7 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Bool, Float
 
-from asp_env.data.classes import PREDICTED
+from asp_env.data.classes import is_predicted
 from asp_env.data.predictor import Forecast, constant_velocity, make_forecast
 from asp_env.data.scene import Scene
 from asp_env.data.snippets import Future
@@ -30,6 +30,7 @@ class ConstantVelocity:
     privileged: bool = False
     trained_on: TrainedOn | None = None
     history: int = 0
+    reads_past: bool = False
 
     @property
     def metadata(self) -> Mapping[str, str]:
@@ -131,6 +132,7 @@ class Oracle:
     privileged: bool = True
     trained_on: TrainedOn | None = None
     history: int = 0
+    reads_past: bool = False
 
     @property
     def metadata(self) -> Mapping[str, str]:
@@ -180,7 +182,7 @@ def predictable_targets(scene: Scene, history: int) -> Bool[np.ndarray, " t"]:
             "make the scene with a longer history"
         )
     index = (scene.targets[:, 0], scene.targets[:, 1])
-    predicted = np.isin(scene.classes[index], [int(kind) for kind in PREDICTED])
+    predicted = is_predicted(scene.classes[index])
     return predicted & scene.valid[index][:, scene.history - history :].all(axis=-1)
 
 

@@ -11,7 +11,7 @@ from pathlib import Path
 import pytest
 
 ROOT = Path(__file__).parents[1]
-PACKAGES = ("asp_env", "predictors", "scenarios", "agents")
+PACKAGES = ("asp_env", "predictors", "scenarios", "policies")
 
 ON_ALL = {"errors", "registry", "geometry", "files", "workers"}
 FOR_PREDICTORS = {"views", "metrics", "data", "dynamics"} | ON_ALL
@@ -48,7 +48,7 @@ ARROWS = {
         *FOR_PREDICTORS,
     },
     "scenarios": {"sim", "data", "dynamics"} | ON_ALL,
-    "agents": {
+    "policies": {
         *("evaluation", "planning", "sim", "envs", "views", "metrics", "data", "dynamics"),
         *ON_ALL,
     },
@@ -138,7 +138,7 @@ def loaded_by(code: str) -> set[str]:
 def test_importing_is_cheap() -> None:
     """`import asp_env` loads none of the extras, and no plug."""
     extras = {"plotly", "sumo", "traci", "sumolib", "highway_env", "selenium"}
-    extras |= {"predictors", "scenarios", "agents"}
+    extras |= {"predictors", "scenarios", "policies"}
     adapted = set(ADAPTERS.values())
     assert not loaded_by("import asp_env") & (LEARNING | RENDERING | extras | adapted)
 

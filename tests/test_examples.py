@@ -1,6 +1,5 @@
 """The examples and the code in the documentation of the environments run."""
 
-import math
 import re
 from pathlib import Path
 from typing import Any
@@ -9,17 +8,15 @@ import cv2
 import numpy as np
 import pytest
 
-from asp_env import Planner, ReplayEnv
+from asp_env import Planner
 from asp_env.data.classes import AgentClass
 from examples import (
-    held_out,
     own_predictor,
     own_view,
     picture,
     step_the_environment,
     traffic_that_reacts,
-    train_ppo_raster,
-    train_ppo_vectors,
+    train_a_policy,
 )
 from tests.builders import Drive
 from tests.planning.situations import STEPS, approach, two_modes
@@ -97,35 +94,6 @@ def test_the_picture_of_the_readme_is_drawn(tmp_path: Path) -> None:
     assert image.shape == (720, 720 + 480, 3)
 
 
-@pytest.mark.parametrize("example", [train_ppo_vectors, train_ppo_raster])
-def test_ppo_trains_and_is_compared(example) -> None:
-    """One rollout of 16 environments with its updates, then three scenarios of another place."""
-    data = "sample:roundabout"
-    scores = example.main("sample:intersection", (data,), steps=16, num_envs=16, count=3)
-    assert set(scores) == {(name, data) for name in ("PPO", "zero actions", "random actions")}
-    assert all(math.isfinite(mean) for means in scores.values() for mean in means.values())
-
-
-def test_scores_are_means_over_evenly_spaced_scenarios() -> None:
-    """The first, the 36th and the last of 72 scenarios, as in single environments."""
-    env = ReplayEnv("sample:roundabout", observations=("state",))
-    assert len(env.scenarios) == 72
-    rewards, infos = np.zeros(3), []
-    for row, scenario in enumerate((0, 35, 71)):
-        env.reset(options={"scenario": scenario})
-        over, info = False, {}
-        while not over:
-            _, reward, terminated, truncated, info = env.step(np.array([0.1, 0.0]))
-            rewards[row] += reward
-            over = terminated or truncated
-        infos.append(info)
-    assert held_out.score(
-        lambda obs: np.tile([0.1, 0.0], (len(obs["state"]), 1)),
-        "sample:roundabout",
-        3,
-        observations=("state",),
-    ) == {
-        "reward": pytest.approx(rewards.mean(), abs=1e-3),
-        "progress": pytest.approx(np.mean([info["progress"] for info in infos]), abs=1e-3),
-        "at fault": pytest.approx(np.mean([info["at_fault"] for info in infos]), abs=1e-3),
-    }
+def test_ppo_learns_to_reach_the_goal() -> None:
+    """Coasting along the route reaches it in 21 % of the scenarios."""
+    assert train_a_policy.main(steps=30_000)["GOAL"] > 0.5

@@ -3,6 +3,7 @@
 from enum import IntEnum
 
 import numpy as np
+from jaxtyping import Bool, Int
 
 from asp_env.errors import DataError
 
@@ -71,6 +72,13 @@ al. 2021), animals and trailers."""
 
 VULNERABLE = frozenset({AgentClass.BICYCLE, AgentClass.PEDESTRIAN, AgentClass.ANIMAL})
 """Vulnerable road users, whose recorded heading is unreliable."""
+
+_IS_PREDICTED = np.array([kind in PREDICTED for kind in range(max(AgentClass) + 1)])
+
+
+def is_predicted(classes: Int[np.ndarray, "*n"]) -> Bool[np.ndarray, "*n"]:
+    """Mask of the agents whose `AgentClass` is one of `PREDICTED`."""
+    return np.asarray(_IS_PREDICTED[classes])
 
 
 def parse_class(name: str) -> AgentClass:

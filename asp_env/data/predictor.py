@@ -5,10 +5,11 @@ import warnings
 from collections.abc import Mapping
 from dataclasses import dataclass
 from operator import attrgetter
-from typing import Any, Protocol, runtime_checkable
+from typing import Any, Protocol, no_type_check, runtime_checkable
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
+from numba import njit
 
 from asp_env import registry
 from asp_env.data.scene import Scene
@@ -132,6 +133,25 @@ class FeaturePredictor(Predictor, Protocol):
         ...
 
 
+@runtime_checkable
+class PresentPredictor(Predictor, Protocol):
+    """A predictor that states whether its forecasts depend on past ticks.
+
+    One that does not is given scenes without past ticks where these are made for it alone, as in
+    environments, which saves most of the time that a scene takes.
+    """
+
+    @property
+    def reads_past(self) -> bool:
+        """Whether forecasts depend on more than the last tick of a scene and the future."""
+        ...
+
+
+def reads_past(predictor: Predictor) -> bool:
+    """Whether a predictor's forecasts depend on past ticks; true if it does not state it."""
+    return not isinstance(predictor, PresentPredictor) or predictor.reads_past
+
+
 def feature_size(predictor: Predictor) -> int:
     """Number of features of each target in a predictor's forecasts; 0 if they have none."""
     return predictor.feature_size if isinstance(predictor, FeaturePredictor) else 0
@@ -220,13 +240,12 @@ def make_forecast(
         features: what a network encodes of each target, or None.
     """
     at = (scene.targets[:, 0], scene.targets[:, 1])
-    mask = valid[:, None, None, None]
     has_actions = actions is not None
     if actions is None:
-        actions = np.zeros((*states.shape[:-1], 2), dtype=states.dtype)
+        actions = np.zeros((*states.shape[:-1], 2), dtype=np.float32)
     return Forecast(
-        states=np.where(mask, states, 0).astype(np.float32),
-        actions=np.where(mask, actions, 0).astype(np.float32),
+        states=_zero_unless(valid, states),
+        actions=_zero_unless(valid, actions),
         actions_valid=valid & has_actions,
         log_probs=log_probs.astype(np.float32),
         ids=scene.ids[at],
@@ -238,6 +257,15 @@ def make_forecast(
         if features is None
         else np.where(valid[:, None], features, 0).astype(np.float32),
     )
+
+
+def _zero_unless(
+    valid: Bool[np.ndarray, " t"], values: Float[np.ndarray, "t ..."]
+) -> Float[np.ndarray, "t ..."]:
+    """The values as new 32-bit numbers, with zeros in the rows that are not valid."""
+    values = values.astype(np.float32)
+    values[~valid] = 0.0
+    return values
 
 
 def constant_velocity(scene: Scene, *, steps: int) -> Float[np.ndarray, "t steps 4"]:
@@ -252,10 +280,23 @@ def constant_velocity(scene: Scene, *, steps: int) -> Float[np.ndarray, "t steps
     # Heun's method with zero actions: twice the velocity times half the duration.
     step_m = (step_m + step_m) * (0.5 * scene.dt_s)
     states = np.empty((len(now), steps, 4), dtype=now.dtype)
-    states[:] = now[:, None]
-    states[..., :2] += np.cumsum(np.repeat(step_m[:, None], steps, axis=1), axis=1)
-    states[..., 2] = wrap_angle(now[:, None, 2])
+    _repeat_steps(now, step_m, wrap_angle(now[:, 2]), states)
     return states
+
+
+@njit(cache=True, nogil=True)
+@no_type_check
+def _repeat_steps(now, step_m, heading_rad, states):
+    """Writes the states (T, steps, 4) from `now` (T, 4) on, by a step (T, 2) in every tick."""
+    for t in range(len(now)):
+        x = y = np.float32(0.0)
+        for step in range(states.shape[1]):
+            x += step_m[t, 0]
+            y += step_m[t, 1]
+            states[t, step, 0] = now[t, 0] + x
+            states[t, step, 1] = now[t, 1] + y
+            states[t, step, 2] = heading_rad[t]
+            states[t, step, 3] = now[t, 3]
 
 
 def continued(

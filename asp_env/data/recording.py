@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
-from asp_env.data.classes import PREDICTED
+from asp_env.data.classes import is_predicted
 from asp_env.data.road_map import RoadMap
 from asp_env.data.signals import Signals
 from asp_env.errors import AspEnvError, DataError
@@ -170,7 +170,7 @@ class Recording:
     @cached_property
     def of_predicted_class(self) -> Bool[np.ndarray, " tracks"]:
         """Mask of tracks of a predicted class, parked agents included."""
-        return np.isin(self.classes, [int(kind) for kind in PREDICTED])
+        return is_predicted(self.classes)
 
     @cached_property
     def predicted(self) -> Bool[np.ndarray, " tracks"]:

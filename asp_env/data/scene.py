@@ -6,7 +6,7 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Bool, Float, Int, UInt64
 
-from asp_env.data.classes import PREDICTED
+from asp_env.data.classes import is_predicted
 from asp_env.data.road_map import RoadMap
 from asp_env.data.signals import SceneSignals
 from asp_env.dynamics import inverse
@@ -85,7 +85,7 @@ class Scene:
     def predictable(self) -> Bool[np.ndarray, " t"]:
         """Mask of targets of a predicted class that are present at every tick of the scene."""
         at = (self.targets[:, 0], self.targets[:, 1])
-        predicted = np.isin(self.classes[at], [int(kind) for kind in PREDICTED])
+        predicted = is_predicted(self.classes[at])
         return predicted & self.valid[at].all(axis=-1)
 
     def check_dt(self, dt_s: float, name: str) -> None:

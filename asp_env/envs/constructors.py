@@ -10,7 +10,6 @@ from asp_env.envs.forecasts import ForecastSpec, PredictorSpec
 from asp_env.envs.options import suggest_options
 from asp_env.envs.vector import ReplayVectorEnv
 from asp_env.errors import MissingExtraError
-from asp_env.sim.action_types import ActionType
 from asp_env.sim.traffic.assignment import TrafficSpec
 
 if TYPE_CHECKING:
@@ -34,7 +33,7 @@ def parallel_env(
     raster_px: int | Sequence[int] | None = None,
     traffic: TrafficSpec | None = None,
     dt_s: float = DEFAULT_DT_S,
-    action_type: ActionType = "direct",
+    action_type: str = "direct",
     action_repeat: int = 1,
     reward_weights: Mapping[str, float] | None = None,
     scenarios: ScenarioSet | ScenarioFilter | str = "",
@@ -110,7 +109,7 @@ def sb3_vec_env(
     raster_px: int | Sequence[int] | None = None,
     traffic: TrafficSpec | None = None,
     dt_s: float = DEFAULT_DT_S,
-    action_type: ActionType = "direct",
+    action_type: str = "direct",
     action_repeat: int = 1,
     reward_weights: Mapping[str, float] | None = None,
     scenarios: ScenarioSet | ScenarioFilter | str = "",

@@ -32,6 +32,7 @@ from asp_env.sim.action_types import (
     from_physical,
     to_physical,
 )
+from asp_env.sim.log_following import logged_actions
 from asp_env.sim.observation import Observation, Observer, ego_context
 from asp_env.sim.reward import REWARD_TERMS, reward_terms, weighted_sum, weights_from
 from asp_env.sim.simulation import Simulation, ending
@@ -415,14 +416,16 @@ class ReplayEpisodes:
         self,
         rows: Int[np.ndarray, " r"] | None = None,
         targets: Int[np.ndarray, "t 2"] | None = None,
+        history: int | None = None,
     ) -> Scene:
         """Returns the scene of some episodes, by default of all, with the seeds of predictors.
 
         Args:
             rows: numbers of the episodes, which are the situations in this order.
             targets: (situation, slot) of the targets; by default all present agents but the egos.
+            history: number of past ticks; that of the world by default.
         """
-        scene = self.simulation.world.scene(rows, targets)
+        scene = self.simulation.world.scene(rows, targets, history)
         seeds = self._seeds.copy() if rows is None else self._seeds[rows]
         return dataclasses.replace(scene, seeds=seeds)
 
@@ -468,6 +471,17 @@ class ReplayEpisodes:
             "episode_return": self._return.copy(),
             "episode_length": self._num_steps.copy(),
         }
+
+    def logged_actions(self) -> tuple[Float[np.ndarray, "b 2"], Bool[np.ndarray, " b"]]:
+        """Returns the actions of the logged drivers in [-1, 1], and a mask of the clipped ones.
+
+        Raises:
+            AspEnvError: the world has no logged drivers.
+        """
+        physical, clipped = logged_actions(self.simulation.world)
+        actions = self.actions_from(physical)
+        beyond = (np.abs(actions) > 1.0).any(axis=1)
+        return np.clip(actions, -1.0, 1.0), clipped | beyond
 
     def snapshot(self) -> Any:
         """Returns the whole state for `restore`; it holds no recordings and no rasters."""

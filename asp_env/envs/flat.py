@@ -80,7 +80,6 @@ def _is_image(shape: tuple[int, ...], dtype: np.dtype | None) -> bool:
 
 
 def _flat_box(box: spaces.Space[Any]) -> spaces.Space[Any]:
-    is_table = isinstance(box, spaces.Box) and len(box.shape) > 1
-    if not is_table or _is_image(box.shape, box.dtype):
+    if not isinstance(box, spaces.Box) or len(box.shape) < 2 or _is_image(box.shape, box.dtype):
         return box
     return spaces.Box(np.ravel(box.low), np.ravel(box.high), dtype=box.low.dtype.type)

@@ -6,6 +6,7 @@ environment; the wrappers `PredictionFeatures` and `VectorPredictionFeatures` ho
 """
 
 import dataclasses
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, Literal, NamedTuple, Protocol, no_type_check, runtime_checkable
@@ -16,13 +17,13 @@ from jaxtyping import Bool, Float, Int
 from numba import njit
 
 from asp_env.data.predictor import (
-    Forecast,
     Predictor,
     continued,
     feature_size,
     fill_missing,
     load_predictor,
     needs_simulation,
+    reads_past,
 )
 from asp_env.data.recording import ticks
 from asp_env.data.scene import EGO, Scene
@@ -98,7 +99,10 @@ class ForecastOptions:
         return self.latency_ticks + self.every_ticks - 1
 
 
-PredictorSpec = str | Predictor | Mapping[str, str | Predictor]
+NamedPredictor = str | Predictor | Shared[Predictor]
+"""A predictor or its name; specifications of environments hold predictors by `Shared`."""
+
+PredictorSpec = NamedPredictor | Mapping[str, NamedPredictor]
 """A predictor or its name, or several with the prefixes of their entries."""
 
 ForecastSpec = ForecastOptions | Mapping[str, Any]
@@ -136,8 +140,16 @@ class ForecastSource(Protocol):
         """Returns the present tick of some episodes."""
         ...
 
-    def scene(self, rows: Int[np.ndarray, " r"], targets: Int[np.ndarray, "t 2"]) -> Scene:
-        """Returns the scene of some episodes, in their order, with the targets in it."""
+    def scene(
+        self,
+        rows: Int[np.ndarray, " r"],
+        targets: Int[np.ndarray, "t 2"],
+        history: int | None = None,
+    ) -> Scene:
+        """Returns the scene of some episodes, in their order, with the targets in it.
+
+        `history` is its number of past ticks, by default the usual one.
+        """
         ...
 
     def recorded_future(self, scene: Scene, horizon: int, rows: Int[np.ndarray, " r"]) -> Future:
@@ -196,9 +208,7 @@ since the scene of each agent's forecast |
     Every episode depends on its own scenes only, not on which others are observed with it.
     """
 
-    def __init__(
-        self, predictor: str | Predictor | Shared[Predictor], options: ForecastOptions, dt_s: float
-    ) -> None:
+    def __init__(self, predictor: NamedPredictor, options: ForecastOptions, dt_s: float) -> None:
         """Loads the predictor and defines the spaces.
 
         Args:
@@ -221,6 +231,7 @@ since the scene of each agent's forecast |
             predictor = predictor.value
         _check_predictor(predictor, wanted, dt_s, options)
         self._predictor = Shared(predictor)
+        self._reads_past = reads_past(predictor)
         ages = np.arange(options.max_age_ticks + 1)
         self._stored = np.unique(self._times_ticks + ages[:, None])
         """Ticks ahead of its scene at which the positions of a forecast are stored."""
@@ -329,32 +340,27 @@ since the scene of each agent's forecast |
         if not len(situation):
             return
         targets = np.stack([situation, slots[exists]], axis=-1)
-        scene, predictor = source.scene(rows, targets), self.predictor
+        predictor = self.predictor
+        scene = source.scene(rows, targets, None if self._reads_past else 0)
         future = None
         if predictor.privileged:
             future = source.recorded_future(scene, predictor.horizon, rows)
         forecast = fill_missing(predictor.predict(scene, future), scene)
-        at = rows[situation], where[1][situation], rank
-        points, probabilities = self._most_probable(forecast)
-        made.num_modes[where] = points.shape[1]
-        made.points[(*at, slice(points.shape[1]))] = points
-        made.probabilities[(*at, slice(points.shape[1]))] = probabilities
-        if self._feature_size:
-            made.features[at] = 0.0 if forecast.features is None else forecast.features
-
-    def _most_probable(
-        self, forecast: Forecast
-    ) -> tuple[Float[np.ndarray, "t m steps 2"], Float[np.ndarray, "t m"]]:
-        """Returns the stored positions of the most probable modes, and their probabilities."""
-        states, probabilities = forecast.states, forecast.probabilities
+        states = forecast.states
         if states.shape[2] < self._stored[-1]:
             states = continued(states, int(self._stored[-1]), forecast.dt_s)
-        if states.shape[1] == 1:
-            return states[:, :, self._stored - 1, :2], probabilities
+        modes = self._options.modes
         # A stable sort keeps the predictor's order of equally probable modes.
-        order = np.argsort(-forecast.log_probs, axis=1, kind="stable")[:, : self._options.modes]
-        row = np.arange(len(order))[:, None]
-        return states[row, order][:, :, self._stored - 1, :2], probabilities[row, order]
+        order = np.argsort(-forecast.log_probs, axis=1, kind="stable")[:, :modes]
+        made.num_modes[where] = order.shape[1]
+        _store(
+            (states, forecast.probabilities, order),
+            (*where, situation, rank, self._stored - 1),
+            (made.points, made.probabilities),
+        )
+        if self._feature_size:
+            features = 0.0 if forecast.features is None else forecast.features
+            made.features[rows[situation], where[1][situation], rank] = features
 
     def _show(
         self,
@@ -369,12 +375,6 @@ since the scene of each agent's forecast |
         options, count = self._options, len(rows)
         agents, modes, times = options.agents, options.modes, len(self._times_ticks)
         ego = present.states[:, EGO]
-        straight = _StraightOn(
-            states=present.states,
-            cos=np.cos(present.states[..., 2]),
-            sin=np.sin(present.states[..., 2]),
-            times_s=(self._times_ticks * dt_s).astype(np.float32),
-        )
         values = {
             "forecast": np.zeros((count, agents, modes, times, 2), dtype=np.float32),
             "forecast_probabilities": np.zeros((count, agents, modes), dtype=np.float32),
@@ -385,8 +385,8 @@ since the scene of each agent's forecast |
         _write(
             (made.ids, made.points, made.probabilities, made.features, made.num_modes),
             (rows, place, self._places[age], (age * dt_s).astype(np.float32)),
-            (slots, present.ids, ego, np.cos(ego[:, 2]), np.sin(ego[:, 2])),
-            straight,
+            (slots, present.ids, present.states, np.cos(ego[:, 2]), np.sin(ego[:, 2])),
+            (self._times_ticks * dt_s).astype(np.float32),
             tuple(values.values()),
         )
         return {
@@ -439,7 +439,7 @@ since the scene of each agent's forecast |
 
 
 def forecast_observers(
-    predictor: PredictorSpec | Shared[Predictor] | None,
+    predictor: PredictorSpec | None,
     forecast: ForecastSpec | None,
     dt_s: float,
 ) -> tuple[ForecastObserver, ...]:
@@ -558,21 +558,33 @@ def _nearest(distances_m, valid, ids, slots):
             slots[b, at] = a
 
 
-class _StraightOn(NamedTuple):
-    """Constant velocity from now on, for agents that the forecast that is shown leaves out."""
+@njit(cache=True, nogil=True)
+@no_type_check
+def _store(forecast, where, out):
+    """Stores the most probable modes of N targets.
 
-    states: np.ndarray
-    """(R, A, 4) present states."""
-    cos: np.ndarray
-    """(R, A) of the headings."""
-    sin: np.ndarray
-    times_s: np.ndarray
-    """(times,) asked times."""
+    Args:
+        forecast: states (N, modes, ticks, 4), probabilities (N, modes), and the modes to store
+            (N, M) in their order.
+        where: rows and places (R,), situation and rank (N,) of the targets, ticks to store.
+        out: points and probabilities, see `_Made`.
+    """
+    states, probabilities, order = forecast
+    rows, places, situation, rank, steps = where
+    points, stored_probabilities = out
+    for n in range(len(order)):
+        b, s, k = rows[situation[n]], places[situation[n]], rank[n]
+        for m in range(order.shape[1]):
+            mode = order[n, m]
+            stored_probabilities[b, s, k, m] = probabilities[n, mode]
+            for i in range(len(steps)):
+                points[b, s, k, m, i, 0] = states[n, mode, steps[i], 0]
+                points[b, s, k, m, i, 1] = states[n, mode, steps[i], 1]
 
 
 @njit(cache=True, nogil=True)
 @no_type_check
-def _write(made, where, now, straight, out):
+def _write(made, where, now, times_s, out):
     """Writes the observation entries of R episodes.
 
     Args:
@@ -580,21 +592,21 @@ def _write(made, where, now, straight, out):
             `_Made`.
         where: rows (R,), places (R,), index of the asked times in the points (R, times), ages (R,)
             in seconds.
-        now: slots (R, K) of the nearest agents, ids (R, A), states of the egos (R, 4), and the
-            cosine and sine (R,) of their headings.
-        straight: a `_StraightOn`.
+        now: slots (R, K) of the nearest agents, ids (R, A), states (R, A, 4), and the cosine and
+            sine (R,) of the egos' headings.
+        times_s: asked times ahead (times,).
         out: positions, probabilities, valid, features and ages, zeros.
     """
     ids_then, points, probabilities_then, features_then, num_modes = made
     rows, places, steps, ages_s = where
-    slots, ids, egos, cosines, sines = now
+    slots, ids, states, cosines, sines = now
     positions, probabilities, valid, features, ages = out
     num_times = positions.shape[3]
     limit, most, one = np.float32(MAX_POSITION_M), np.float32(MAX_FEATURE), np.float32(1.0)
     points_now = np.empty((num_times, 2), dtype=np.float32)
     for r in range(len(rows)):
         b, s = rows[r], places[r]
-        x, y, cos, sin = egos[r, 0], egos[r, 1], cosines[r], sines[r]
+        x, y, cos, sin = states[r, EGO, 0], states[r, EGO, 1], cosines[r], sines[r]
         for k in range(slots.shape[1]):
             a = slots[r, k]
             if a < 0:
@@ -603,7 +615,7 @@ def _write(made, where, now, straight, out):
             then = _index_of(ids[r, a], ids_then[b, s])
             if then < 0:
                 probabilities[r, k, 0] = 1.0
-                _continue_straight(straight, r, a, points_now)
+                _continue_straight(states[r, a], times_s, points_now)
             else:
                 ages[r, k] = ages_s[r]
                 for f in range(features.shape[2]):
@@ -638,12 +650,12 @@ def _index_of(wanted, ids):
 
 @njit(cache=True)
 @no_type_check
-def _continue_straight(straight, r, a, points):
-    """Writes the positions (times, 2) of agent `a` of row `r` at constant velocity."""
+def _continue_straight(state, times_s, points):
+    """Writes the positions (times, 2) of an agent at constant velocity."""
+    cos, sin = math.cos(state[2]), math.sin(state[2])
     for t in range(len(points)):
-        ahead_m = straight.states[r, a, 3] * straight.times_s[t]
-        points[t, 0] = straight.states[r, a, 0] + ahead_m * straight.cos[r, a]
-        points[t, 1] = straight.states[r, a, 1] + ahead_m * straight.sin[r, a]
+        points[t, 0] = state[0] + state[3] * times_s[t] * cos
+        points[t, 1] = state[1] + state[3] * times_s[t] * sin
 
 
 def _options_of(forecast: ForecastSpec | None) -> ForecastOptions:

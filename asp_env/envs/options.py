@@ -13,7 +13,6 @@ from asp_env.data.recording import DEFAULT_DT_S
 from asp_env.data.scenarios.scenario import ScenarioFilter, ScenarioSet
 from asp_env.envs.forecasts import ForecastSpec, PredictorSpec
 from asp_env.errors import AspEnvError
-from asp_env.sim.action_types import ActionType
 from asp_env.sim.traffic.assignment import TrafficSpec
 
 Function = TypeVar("Function", bound=Callable[..., Any])
@@ -40,7 +39,7 @@ class ReplayOptions:
     world moves them."""
     dt_s: float = DEFAULT_DT_S
     """Length of a tick in seconds."""
-    action_type: ActionType = "direct"
+    action_type: str = "direct"
     """What the two numbers of an action mean, see `asp_env.sim.action_types`."""
     action_repeat: int = 1
     """Number of ticks for which each action is held; rewards are summed over them."""
@@ -67,8 +66,7 @@ def raster_size(raster_px: int | Sequence[int] | None) -> tuple[int, int] | None
     """
     if raster_px is None:
         return None
-    is_sequence = isinstance(raster_px, Sequence | np.ndarray) and not isinstance(raster_px, str)
-    sizes = list(raster_px) if is_sequence else [raster_px, raster_px]
+    sizes: list[Any] = [raster_px] * 2 if isinstance(raster_px, int) else list(raster_px)
     whole = [isinstance(size, int | np.integer) and not isinstance(size, bool) for size in sizes]
     if len(sizes) != 2 or not all(whole):
         raise AspEnvError(

@@ -28,7 +28,6 @@ from asp_env.envs.options import ReplayOptions, suggest_options
 from asp_env.errors import AspEnvError, unknown_name
 from asp_env.render.frames import draw_frame
 from asp_env.render.live import render_fps
-from asp_env.sim.action_types import ActionType
 from asp_env.sim.reward import MIN_GOAL_M
 from asp_env.sim.traffic import Control, Driver
 from asp_env.sim.traffic.assignment import TrafficSpec
@@ -278,7 +277,7 @@ entry is a vector, images stay images |
         raster_px: int | Sequence[int] | None = None,
         traffic: TrafficSpec | None = None,
         dt_s: float = DEFAULT_DT_S,
-        action_type: ActionType = "direct",
+        action_type: str = "direct",
         action_repeat: int = 1,
         reward_weights: Mapping[str, float] | None = None,
         scenarios: ScenarioSet | ScenarioFilter | str = "",

@@ -23,7 +23,6 @@ from asp_env.envs.keyboard import keyboard_actions
 from asp_env.envs.options import ReplayOptions, suggest_options
 from asp_env.envs.shared_in_spec import SharedInSpec
 from asp_env.render.live import MODES, LiveRenderer, render_fps
-from asp_env.sim.action_types import ActionType
 from asp_env.sim.traffic.assignment import TrafficSpec
 from asp_env.sim.world import World
 
@@ -233,7 +232,8 @@ name; several in a mapping with their prefixes |
     `asp_env/HighwayIntersectionVectors-v0` and the like have the light observations above.
 
     Besides Gymnasium's interface there are `scene()` for predictors and planners, `snapshot()` and
-    `restore()` for search and counterfactuals, and `show()`, which draws a forecast and a plan.
+    `restore()` for search and counterfactuals, `logged_action()` for imitation, and `show()`, which
+    draws a forecast and a plan.
 
     ## Version History
     - v0: initial version
@@ -253,7 +253,7 @@ name; several in a mapping with their prefixes |
         raster_px: int | Sequence[int] | None = None,
         traffic: TrafficSpec | None = None,
         dt_s: float = DEFAULT_DT_S,
-        action_type: ActionType = "direct",
+        action_type: str = "direct",
         action_repeat: int = 1,
         reward_weights: Mapping[str, float] | None = None,
         scenarios: ScenarioSet | ScenarioFilter | str = "",
@@ -348,6 +348,30 @@ name; several in a mapping with their prefixes |
         """
         self._check_begun()
         return self._episodes.recorded_future(scene, horizon)
+
+    def logged_action(self) -> Float[np.ndarray, " 2"]:
+        """Returns the action of the logged driver at this tick, in [-1, 1].
+
+        It leads the ego along its recorded track, and back to it where the ego has left it: see
+        `asp_env.sim.log_following`. It uses the recorded state of the next tick, which is not known
+        while driving. It is zero once the log has ended.
+
+        Raises:
+            gymnasium.error.ResetNeeded: no episode has begun.
+            AspEnvError: the world has no logged driver, as highway-env's.
+        """
+        self._world()
+        return self._episodes.logged_actions()[0][0]
+
+    def logged_action_clipped(self) -> bool:
+        """Returns whether `logged_action()` was clipped: the ego cannot follow the log there.
+
+        Raises:
+            gymnasium.error.ResetNeeded: no episode has begun.
+            AspEnvError: the world has no logged driver, as highway-env's.
+        """
+        self._world()
+        return bool(self._episodes.logged_actions()[1][0])
 
     def snapshot(self) -> EnvSnapshot:
         """Returns the whole state, including that of `np_random`, for `restore`.

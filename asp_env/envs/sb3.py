@@ -20,6 +20,11 @@ Observations = Any
 
 _PER_ENVIRONMENT = ("np_random", "np_random_seed")
 _SINGLE = ("observation_space", "action_space")
+_BATCHED_METHODS = {
+    "logged_action": "logged_actions",
+    "logged_action_clipped": "logged_actions_clipped",
+}
+"""Methods of a single environment, and those that return an array for all environments."""
 
 
 class ReplayVecEnv(VecEnv):
@@ -145,14 +150,21 @@ class ReplayVecEnv(VecEnv):
         indices: VecEnvIndices = None,
         **method_kwargs: Any,
     ) -> list[Any]:
-        """Returns the scene or the image of each environment.
+        """Calls a method of each environment.
 
         Raises:
-            AttributeError: the method is neither `scene` nor `render`, or has arguments.
+            AttributeError: the method is none of `scene`, `render`, `logged_action` and
+                `logged_action_clipped`, or has arguments.
         """
-        if method_name not in ("scene", "render") or method_args or method_kwargs:
-            raise AttributeError(f"method {method_name}: expected scene() or render()")
+        known = ("scene", "render", *_BATCHED_METHODS)
+        if method_name not in known or method_args or method_kwargs:
+            raise AttributeError(
+                f"method {method_name}: expected one of {', '.join(known)}, without arguments"
+            )
         rows = list(self._get_indices(indices))
+        if method_name in _BATCHED_METHODS:
+            values: np.ndarray = self._find_attribute(_BATCHED_METHODS[method_name])()
+            return [values[b] for b in rows]
         if method_name == "scene":
             scene: Scene = self._find_attribute("scene")()
             return [scene.situation(b) for b in rows]

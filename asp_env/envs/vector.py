@@ -10,7 +10,7 @@ import numpy as np
 from gymnasium.utils import seeding
 from gymnasium.vector import AutoresetMode, VectorEnv
 from gymnasium.vector.utils import batch_space
-from jaxtyping import Bool, Shaped
+from jaxtyping import Bool, Float, Shaped
 
 from asp_env.data.predictor import Predictor
 from asp_env.data.recording import DEFAULT_DT_S
@@ -27,7 +27,6 @@ from asp_env.envs.shared_in_spec import SharedInSpec
 from asp_env.errors import AspEnvError
 from asp_env.render.frames import draw_frame
 from asp_env.render.live import render_fps
-from asp_env.sim.action_types import ActionType
 from asp_env.sim.observation import Observation
 from asp_env.sim.traffic.assignment import TrafficSpec
 
@@ -105,7 +104,7 @@ class ReplayVectorEnv(SharedInSpec, VectorEnv[Any, Any, np.ndarray]):
         raster_px: int | Sequence[int] | None = None,
         traffic: TrafficSpec | None = None,
         dt_s: float = DEFAULT_DT_S,
-        action_type: ActionType = "direct",
+        action_type: str = "direct",
         action_repeat: int = 1,
         reward_weights: Mapping[str, float] | None = None,
         scenarios: ScenarioSet | ScenarioFilter | str = "",
@@ -258,6 +257,26 @@ class ReplayVectorEnv(SharedInSpec, VectorEnv[Any, Any, np.ndarray]):
         """
         self._check_begun()
         return self._episodes.recorded_future(scene, horizon)
+
+    def logged_actions(self) -> Float[np.ndarray, "n 2"]:
+        """Returns the action of the logged driver of each environment, see `ReplayEnv`.
+
+        Raises:
+            gymnasium.error.ResetNeeded: an episode has not begun.
+            AspEnvError: the world has no logged drivers, as highway-env's.
+        """
+        self._check_begun()
+        return self._episodes.logged_actions()[0]
+
+    def logged_actions_clipped(self) -> Bool[np.ndarray, " n"]:
+        """Returns a mask of the environments whose `logged_actions()` were clipped.
+
+        Raises:
+            gymnasium.error.ResetNeeded: an episode has not begun.
+            AspEnvError: the world has no logged drivers, as highway-env's.
+        """
+        self._check_begun()
+        return self._episodes.logged_actions()[1]
 
     def render(self) -> tuple[Any, ...] | None:
         """Returns the image of each environment, see `ReplayEnv.render`; None without a mode.

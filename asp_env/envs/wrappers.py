@@ -11,13 +11,13 @@ from gymnasium.utils import RecordConstructorArgs
 from gymnasium.vector import AutoresetMode, VectorEnv, VectorObservationWrapper
 from gymnasium.vector.utils import batch_space
 
-from asp_env.data.predictor import Predictor
 from asp_env.envs.episodes import ReplayEpisodes
 from asp_env.envs.flat import flat_space
 from asp_env.envs.forecasts import (
     FORECAST_TIMES_S,
     ForecastObserver,
     ForecastOptions,
+    NamedPredictor,
     extended_space,
 )
 from asp_env.envs.shared_in_spec import shared_predictors
@@ -78,7 +78,7 @@ since the scene of the forecast |
     def __init__(
         self,
         env: gymnasium.Env[dict[str, Any], Any],
-        predictor: str | Predictor,
+        predictor: NamedPredictor,
         *,
         agents: int = 8,
         modes: int = 3,
@@ -139,7 +139,7 @@ class VectorPredictionFeatures(VectorObservationWrapper):
     def __init__(
         self,
         env: VectorEnv,
-        predictor: str | Predictor,
+        predictor: NamedPredictor,
         *,
         agents: int = 8,
         modes: int = 3,

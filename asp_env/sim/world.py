@@ -282,19 +282,23 @@ class World(ABC):
         self,
         rows: Int[np.ndarray, " r"] | None = None,
         targets: Int[np.ndarray, "t 2"] | None = None,
+        history: int | None = None,
     ) -> Scene:
         """All that may be known now, in fresh arrays.
 
         Args:
             rows: indices of the R episodes that are its situations, in their order; all by default.
             targets: (situation, slot) of the targets; by default all present agents but the egos.
+            history: number of past ticks; that of the world by default.
         """
         episodes = self.episodes
+        history = self.history if history is None else history
         every_row = rows is None
         rows = self._rows if rows is None else rows
-        self._infer_actions(rows)
-        states, valid = last_ticks(episodes, self.now, rows, self.history)
-        past = self.now[rows, None] + np.arange(-self.history, 0)
+        if history:
+            self._infer_actions(rows)
+        states, valid = last_ticks(episodes, self.now, rows, history)
+        past = self.now[rows, None] + np.arange(-history, 0)
         actions = np.ascontiguousarray(episodes.actions[rows[:, None], past].swapaxes(1, 2))
         if targets is None:
             present = valid[..., -1].copy()
@@ -325,14 +329,17 @@ class World(ABC):
             maps=self._maps,
             map_index=self._map_index if every_row else self._map_index[rows],
             dt_s=self.dt_s,
-            signals=self.signals(rows),
+            signals=self.signals(rows, history),
         )
 
-    def signals(self, rows: Int[np.ndarray, " r"]) -> SceneSignals | None:
+    def signals(
+        self, rows: Int[np.ndarray, " r"], history: int | None = None
+    ) -> SceneSignals | None:
         """The traffic signals up to now; None if no recording of the episodes has any.
 
         Args:
             rows: indices of R episodes, which are the situations of the result.
+            history: number of past ticks; that of the world by default.
         """
         if not self._any_signals:
             return None
@@ -340,7 +347,7 @@ class World(ABC):
         return gather_signals(
             [self.recordings[int(number)] for number in episodes.recording[rows]],
             episodes.start_tick[rows] + episodes.elapsed[rows],
-            history=self.history,
+            history=self.history if history is None else history,
             dt_s=self.dt_s,
         )
 

@@ -257,7 +257,7 @@ class HighwayWorld(World):
     def __setstate__(self, state: dict[str, Any]) -> None:
         """Continues from the state of `__getstate__`."""
         saved = state["_runs"]
-        self.__dict__.update(state, _runs=[None] * len(saved))
+        vars(self).update(state, _runs=[None] * len(saved))
         self._continue_runs(saved)
 
 

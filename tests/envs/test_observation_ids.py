@@ -38,6 +38,10 @@ def test_every_world_has_light_ids(world, suffix):
 @pytest.mark.parametrize("suffix", LIGHT)
 @pytest.mark.parametrize("mode", ["NextStep", "SameStep", "Disabled"])
 def test_vector_twins_return_the_bits_of_single_environments(crossing, suffix, mode):
+    modes: list[tuple[str, dict[str, Any]]] = [
+        ("vector_entry_point", {"autoreset_mode": mode}),
+        ("sync", {"vector_kwargs": {"autoreset_mode": mode}}),
+    ]
     made: list[Any] = [
         gymnasium.make_vec(
             f"asp_env/Replay{suffix}-v0",
@@ -47,13 +51,11 @@ def test_vector_twins_return_the_bits_of_single_environments(crossing, suffix, m
             max_episode_steps=12,
             **options,
         )
-        for vectorization, options in (
-            ("vector_entry_point", {"autoreset_mode": mode}),
-            ("sync", {"vector_kwargs": {"autoreset_mode": mode}}),
-        )
+        for vectorization, options in modes
     ]
     assert made[0].observation_space == made[1].observation_space
-    assert same_through_ends(*made, AutoresetMode(mode), list(ACTIONS)) > 6
+    one, other = made
+    assert same_through_ends(one, other, AutoresetMode(mode), list(ACTIONS)) > 6
 
 
 def test_one_vector_is_what_gymnasium_flattens(crossing):

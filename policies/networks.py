@@ -1,4 +1,4 @@
-"""Features extractors of stable-baselines3 for the observations of agents.
+"""Features extractors of stable-baselines3 for the observations of policies.
 
 `TrafficFeatures` reads neighbours, lines and forecasts as tokens; `RasterFeatures` reads rasters.
 Both divide what they read by fixed scales, so that no statistics of observations are needed.
@@ -11,9 +11,9 @@ from gymnasium import spaces
 from stable_baselines3.common.torch_layers import BaseFeaturesExtractor
 from torch import Tensor, nn
 
-from agents.observations import NEIGHBOUR_FIELDS, STATE
 from asp_env.sim.observation import ROUTE_STEP_M
 from asp_env.views.vectors import AGENT_FIELDS, LINE_FIELDS
+from policies.observations import NEIGHBOUR_FIELDS, STATE
 
 STATE_SCALES = {
     "speed_mps": 10.0,
@@ -45,25 +45,28 @@ class TrafficFeatures(BaseFeaturesExtractor):
     attention (as the polylines of VectorNet, Gao et al., 2020).
     """
 
+    state_scale: Tensor
+    agent_scale: Tensor
+    line_scale: Tensor
+
     def __init__(self, space: spaces.Dict, width: int = 64) -> None:
         """Creates the network.
 
         Args:
-            space: space of an agent's observation without rasters.
+            space: space of a policy's observation without rasters.
             width: number of features of tokens.
         """
         has_lines = "lines" in space.spaces
         super().__init__(space, len(STATE) + width * (4 if has_lines else 3))
-        self.forecasts = nn.ModuleList(
-            ForecastTokens(prefix, space) for prefix in forecast_prefixes(space)
-        )
+        forecasts = [ForecastTokens(prefix, space) for prefix in forecast_prefixes(space)]
+        self.forecasts = nn.ModuleList(forecasts)
         route = space["route"].shape
         assert route is not None
         self.register_buffer("state_scale", torch.tensor([STATE_SCALES[name] for name in STATE]))
         agent = [AGENT_SCALES.get(name, 1.0) for name in AGENT_FIELDS]
         self.register_buffer("agent_scale", torch.tensor(agent + agent))
         self.ego = _perceptron(len(STATE) + 2 * route[0], width)
-        size = NEIGHBOUR_FIELDS - 1 + 6 + sum(each.size for each in self.forecasts)
+        size = NEIGHBOUR_FIELDS - 1 + 6 + sum(each.size for each in forecasts)
         self.neighbour = nn.Linear(size, width)
         self.context = nn.Linear(width, width, bias=False)
         self.token = nn.Linear(width, width)
@@ -164,13 +167,15 @@ class Attention(nn.Module):
 class RasterFeatures(BaseFeaturesExtractor):
     """The ego's state and route, and a convolutional encoding of its raster."""
 
+    state_scale: Tensor
+
     def __init__(
         self, space: spaces.Dict, width: int = 64, encoder: nn.Module | None = None
     ) -> None:
         """Creates the network.
 
         Args:
-            space: space of an agent's observation with a raster.
+            space: space of a policy's observation with a raster.
             width: number of features of the encoding.
             encoder: a trained encoder of such rasters, (B, channels, height, width) in [0, 1] to
                 (B, features), whose weights stay fixed; by default a new one is trained.

@@ -1,7 +1,7 @@
-"""`asp-env rl compare`: do forecasts make agents learn to drive better?
+"""`asp-env rl compare`: do forecasts make policies learn to drive better?
 
-Every row is an agent that observes other forecasts, trained with several seeds and equal steps.
-All agents, planners, and zero and random actions then drive the same held-out scenarios, and are
+Every row is a policy that observes other forecasts, trained with several seeds and equal steps.
+All policies, planners, and zero and random actions then drive the same held-out scenarios, and are
 scored by the same metrics.
 """
 
@@ -11,7 +11,7 @@ import json
 import os
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from functools import partial
+from functools import cache, partial
 from pathlib import Path
 from typing import Any
 
@@ -21,18 +21,12 @@ from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 from rich.table import Table
 
-from agents.evaluation import evaluate_agent, evaluate_policy
-from agents.held_actions import RandomActions, zero_actions
-from agents.planner import AgentPlanner
-from agents.runs import POLICY, load_agent
-from agents.settings import AgentSettings, EnvironmentSettings
-from agents.training import train_agent
 from asp_env.data.predictor import load_predictor
 from asp_env.data.recording import ticks
 from asp_env.data.scenarios.scenario import ScenarioSet
 from asp_env.data.scenarios.selection import choose_scenarios
 from asp_env.data.snippets import HISTORY_S
-from asp_env.data.source import open_data
+from asp_env.data.source import Recordings, open_data
 from asp_env.errors import AspEnvError
 from asp_env.evaluation.closed_loop.episodes import EpisodeSettings, drive_episodes
 from asp_env.evaluation.statistics import (
@@ -50,6 +44,12 @@ from asp_env.planning.planner import Planner, load_planner
 from asp_env.sim.traffic.assignment import make_traffic
 from asp_env.sim.world import Ending, world_class
 from asp_env.workers import WorkerPool, one_thread
+from policies.evaluation import evaluate_policy
+from policies.held_actions import RandomActions, zero_actions
+from policies.planner import PolicyPlanner
+from policies.runs import POLICY, load_policy
+from policies.settings import EnvironmentSettings, PolicySettings
+from policies.training import train_policy
 
 METRICS = ("success", "at-fault collision", "off-road", "progress", "score")
 """Share of the scenarios that reach the goal, that end with an at-fault collision or off the road;
@@ -66,7 +66,7 @@ PLANNERS = ("expert", "idm", "contingency+constant-velocity")
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Observed:
-    """What the agents of a row observe of the future."""
+    """What the policies of a row observe of the future."""
 
     predictor: str | None = None
     forecast: Mapping[str, Any] = dataclasses.field(default_factory=dict)
@@ -98,10 +98,10 @@ def default_rows(learned: str) -> dict[str, Observed]:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Cell:
-    """One agent: a row and a seed."""
+    """One policy: a row and a seed."""
 
     row: str
-    settings: AgentSettings
+    settings: PolicySettings
     privileged: bool
     folder: Path
 
@@ -121,11 +121,17 @@ class HeldOut:
         Raises:
             AspEnvError: none fits.
         """
-        recordings = open_data(self.data)
+        recordings = _recordings(self.data)
         chosen = choose_scenarios(
             recordings, self.scenarios, dt_s=dt_s, history=ticks(HISTORY_S, dt_s)
         )
         return chosen if self.max_scenarios is None else chosen.evenly_spaced(self.max_scenarios)
+
+
+@cache
+def _recordings(data: str) -> Recordings:
+    """The recordings of held-out data, once per process: what is made of their maps is reused."""
+    return open_data(data)
 
 
 Values = dict[str, Float[np.ndarray, " n"]]
@@ -144,7 +150,7 @@ def drive_held_out(planner: Planner, predictor: str, held_out: HeldOut, dt_s: fl
     Raises:
         AspEnvError: no scenario fits, or the predictor does not suit the data.
     """
-    scenarios, recordings = held_out.choose(dt_s), open_data(held_out.data)
+    scenarios, recordings = held_out.choose(dt_s), _recordings(held_out.data)
     world, rules = world_class(held_out.data), find_rules(DEFAULT_RULES)
     settings = EpisodeSettings(
         rules=rules,
@@ -176,42 +182,33 @@ def drive_held_out(planner: Planner, predictor: str, held_out: HeldOut, dt_s: fl
 
 
 def run_cell(held_out: HeldOut, cell: Cell) -> str:
-    """Trains and drives one agent, unless that is done; returns the name of its row."""
+    """Trains and drives one policy, unless that is done; returns the name of its row."""
     results = cell.folder / "held_out.json"
     if not results.exists():
         if not (cell.folder / POLICY).exists():
             resume = (cell.folder / "config.json").exists()
-            train_agent(cell.settings, cell.folder, resume=resume, privileged=cell.privileged)
-        agent = load_agent(cell.folder)
+            train_policy(cell.settings, cell.folder, resume=resume, privileged=cell.privileged)
+        trained = load_policy(cell.folder)
         environment = cell.settings.environment
         values = drive_held_out(
-            AgentPlanner(agent, cell.folder),
+            PolicyPlanner(trained, cell.folder),
             environment.predictor or "constant-velocity",
             held_out,
             environment.dt_s,
         )
-        in_environment = evaluate_agent(
-            agent,
-            held_out.data,
-            scenarios=held_out.choose(environment.dt_s),
-            privileged=cell.privileged,
-        )
-        content = {
-            "planner": {name: value.tolist() for name, value in values.items()},
-            "environment": {name: v.tolist() for name, v in in_environment.values.items()},
-        }
+        content = {name: value.tolist() for name, value in values.items()}
         write_text(results, json.dumps(content))
     return cell.row
 
 
 def baselines(held_out: HeldOut, environment: EnvironmentSettings) -> dict[str, Values]:
-    """The values of planners, and of zero and random actions in the agents' environment.
+    """The values of planners, and of zero and random actions in the policies' environment.
 
     Zero and random actions have no score: they drive in the environment, not as planners.
 
     Args:
         held_out: the scenarios.
-        environment: the environment of the agents.
+        environment: the environment of the policies.
     """
     values: dict[str, Values] = {}
     for name in PLANNERS:
@@ -228,8 +225,8 @@ def baselines(held_out: HeldOut, environment: EnvironmentSettings) -> dict[str, 
 
 
 def read_values(folder: Path) -> Values:
-    """The values of an agent as a planner, from its run folder."""
-    content = json.loads((folder / "held_out.json").read_text())["planner"]
+    """The values of a policy as a planner, from its run folder."""
+    content = json.loads((folder / "held_out.json").read_text())
     return {name: np.array(value) for name, value in content.items()}
 
 
@@ -306,34 +303,35 @@ def _progress_of(folder: Path) -> Float[np.ndarray, "points 2"]:
 
 
 def _curve(seeds: Sequence[Float[np.ndarray, "_ 2"]]) -> Float[np.ndarray, "points 4"]:
-    """Means of twenty equal sections of the training."""
+    """Means of at most twenty equal sections of the training in which every seed has a value."""
     sections = 20
     last = max(each[-1, 0] for each in seeds)
     edges = np.linspace(0, last, sections + 1)
-    means = np.full((len(seeds), sections), np.nan)
+    sums, counts = np.zeros((2, len(seeds), sections))
     for row, each in enumerate(seeds):
         index = np.clip(np.searchsorted(edges, each[:, 0]) - 1, 0, sections - 1)
-        counts = np.bincount(index, minlength=sections)
-        with np.errstate(invalid="ignore"):
-            means[row] = np.bincount(index, weights=each[:, 1], minlength=sections) / counts
+        counts[row] = np.bincount(index, minlength=sections)
+        sums[row] = np.bincount(index, weights=each[:, 1], minlength=sections)
+    known = (counts > 0).all(axis=0)
+    means = sums[:, known] / counts[:, known]
     rng = np.random.default_rng(0)
     drawn = means[rng.integers(len(seeds), size=(2_000, len(seeds)))].mean(axis=1)
-    low, high = np.nanquantile(drawn, [0.025, 0.975], axis=0)
-    return np.stack([edges[1:], means.mean(axis=0), low, high], axis=-1)
+    low, high = np.quantile(drawn, [0.025, 0.975], axis=0)
+    return np.stack([edges[1:][known], means.mean(axis=0), low, high], axis=-1)
 
 
 def run_cells(cells: Sequence[Cell], held_out: HeldOut, jobs: int, console: Console) -> None:
-    """Trains and drives all agents that are not done, `jobs` at a time.
+    """Trains and drives all policies that are not done, `jobs` at a time.
 
     Raises:
         AspEnvError: a setting is invalid, or a process has ended.
     """
-    columns = (TextColumn("agents"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())
+    columns = (TextColumn("policies"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())
     with (
         Progress(*columns, console=console) as bar,
         WorkerPool(partial(run_cell, held_out), jobs, env=_environment()) as pool,
     ):
-        task = bar.add_task("agents", total=len(cells))
+        task = bar.add_task("policies", total=len(cells))
         for _ in pool.map(cells):
             bar.advance(task)
 

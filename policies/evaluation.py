@@ -1,4 +1,4 @@
-"""Evaluation of agents in their environments, on scenarios that they were not trained on."""
+"""Evaluation of policies in their environments, on scenarios that they were not trained on."""
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
@@ -7,14 +7,18 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float
 
-from agents.environments import AgentObservations, make_environments
-from agents.observations import Observations
-from agents.runs import Agent
-from agents.settings import EnvironmentSettings
+from asp_env.data.recording import ticks
 from asp_env.data.scenarios.scenario import Scenario, ScenarioSet
+from asp_env.data.scenarios.selection import choose_scenarios
+from asp_env.data.snippets import HISTORY_S
+from asp_env.data.source import open_data
 from asp_env.evaluation.statistics import Estimate, mean
+from policies.environments import PolicyObservations, make_environments
+from policies.observations import Observations
+from policies.runs import TrainedPolicy
+from policies.settings import EnvironmentSettings
 
-NUM_ENVS = 64
+MAX_ENVS = 64
 
 METRICS = ("success", "at-fault collision", "off-road", "progress", "comfort", "reward")
 """`success`: the goal is reached, thus without an at-fault collision and on the road;
@@ -62,38 +66,42 @@ def evaluate_policy(
     Raises:
         AspEnvError: a setting is invalid, or no scenario fits.
     """
-    envs = make_environments(settings, data, NUM_ENVS, scenarios=scenarios, privileged=privileged)
-    chosen: ScenarioSet = envs.get_attr("scenarios", 0)[0]
+    chosen = scenarios
+    if isinstance(chosen, str):
+        history = ticks(HISTORY_S, settings.dt_s)
+        chosen = choose_scenarios(open_data(data), chosen, dt_s=settings.dt_s, history=history)
     if max_scenarios is not None:
         chosen = chosen.evenly_spaced(max_scenarios)
     every: Sequence[Scenario] = list(chosen)
+    num_envs = min(MAX_ENVS, len(every))
+    envs = make_environments(settings, data, num_envs, scenarios=chosen, privileged=privileged)
     values = {name: np.zeros(len(every)) for name in METRICS}
-    for start in range(0, len(every), NUM_ENVS):
-        for number, ended in _drive(envs, every[start : start + NUM_ENVS], policy, start):
+    for start in range(0, len(every), num_envs):
+        for number, ended in _drive(envs, every[start : start + num_envs], policy, start):
             for name, value in ended.items():
                 values[name][start + number] = value
         if progress is not None:
-            progress(min(start + NUM_ENVS, len(every)), len(every))
+            progress(min(start + num_envs, len(every)), len(every))
     envs.close()
     return DrivenScenarios(scenarios=chosen, values=values)
 
 
-def evaluate_agent(agent: Agent, data: str, **options: Any) -> DrivenScenarios:
-    """Drives every scenario once with a trained agent; see `evaluate_policy`."""
-    return evaluate_policy(agent.act, agent.settings.environment, data, **options)
+def evaluate_trained(trained: TrainedPolicy, data: str, **options: Any) -> DrivenScenarios:
+    """Drives every scenario once with a trained policy; see `evaluate_policy`."""
+    return evaluate_policy(trained.act, trained.settings.environment, data, **options)
 
 
 def _drive(
-    envs: AgentObservations, scenarios: Sequence[Scenario], policy: Policy, seed: int
+    envs: PolicyObservations, scenarios: Sequence[Scenario], policy: Policy, seed: int
 ) -> list[tuple[int, dict[str, float]]]:
-    """Drives at most `NUM_ENVS` scenarios side by side; spare environments repeat them."""
-    count = len(scenarios)
-    names = [scenarios[b % count].name for b in range(NUM_ENVS)]
+    """Drives at most as many scenarios as environments; spare environments repeat them."""
+    count, num_envs = len(scenarios), envs.num_envs
+    names = [scenarios[b % count].name for b in range(num_envs)]
     envs.set_options([{"scenario": name} for name in names])
     envs.seed(seed)
     observations = envs.reset()
-    starts, running = np.ones(NUM_ENVS, dtype=bool), np.arange(NUM_ENVS) < count
-    reward, comfort, steps = np.zeros((3, NUM_ENVS))
+    starts, running = np.ones(num_envs, dtype=bool), np.arange(num_envs) < count
+    reward, comfort, steps = np.zeros((3, num_envs))
     results = []
     while running.any():
         actions = policy(observations, starts)

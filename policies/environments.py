@@ -1,4 +1,4 @@
-"""Vector environments for training and evaluating agents with stable-baselines3."""
+"""Vector environments for training and evaluating policies with stable-baselines3."""
 
 from typing import Any
 
@@ -6,21 +6,21 @@ import numpy as np
 from stable_baselines3.common.vec_env import VecEnv, VecEnvWrapper
 from stable_baselines3.common.vec_env.base_vec_env import VecEnvStepReturn
 
-import asp_env
-from agents.observations import Observations, components, reduce_observations, reduced_space
-from agents.settings import EnvironmentSettings
 from asp_env.data.scenarios.scenario import ScenarioSet
+from asp_env.envs.constructors import sb3_vec_env
+from policies.observations import Observations, components, reduce_observations, reduced_space
+from policies.settings import EnvironmentSettings
 
 
-class AgentObservations(VecEnvWrapper):
-    """Reduces the observations of a vector environment to those of an agent."""
+class PolicyObservations(VecEnvWrapper):
+    """Reduces the observations of a vector environment to those of a policy."""
 
     def __init__(self, envs: VecEnv, settings: EnvironmentSettings) -> None:
         """Wraps a vector environment.
 
         Args:
-            envs: environments of asp_env with the components that the agent needs.
-            settings: what the agent observes.
+            envs: environments of asp_env with the components that the policy needs.
+            settings: what the policy observes.
         """
         super().__init__(envs, reduced_space(envs.observation_space, settings))
         self._settings = settings
@@ -51,11 +51,11 @@ def make_environments(
     *,
     scenarios: ScenarioSet | str,
     privileged: bool = False,
-) -> AgentObservations:
-    """Makes the vector environment of an agent.
+) -> PolicyObservations:
+    """Makes the vector environment of a policy.
 
     Args:
-        settings: what the agent observes and does.
+        settings: what the policy observes and does.
         data: a folder with recordings, or `scheme:argument`.
         num_envs: number of environments.
         scenarios: the scenarios to draw from, or a filter.
@@ -70,7 +70,7 @@ def make_environments(
     raster: dict[str, Any] = {}
     if settings.view is not None:
         raster = {"view": settings.view, "raster_px": settings.raster_px}
-    envs = asp_env.sb3_vec_env(
+    envs = sb3_vec_env(
         num_envs,
         data,
         observations=components(settings),
@@ -84,4 +84,4 @@ def make_environments(
         forecast=forecast,
         **raster,
     )
-    return AgentObservations(envs, settings)
+    return PolicyObservations(envs, settings)

@@ -1,8 +1,8 @@
-"""Run folders of agents, without pickles.
+"""Run folders of policies, without pickles.
 
 | file | content |
 |---|---|
-| `config.json` | `settings` (`AgentSettings`), `observation` (shape, type and bounds of each \
+| `config.json` | `settings` (`PolicySettings`), `observation` (shape, type and bounds of each \
 entry), `predictor` (name and hash of the weights), `steps` of training |
 | `policy.safetensors` | weights of the policy, written at the end of the training |
 | `checkpoint.safetensors` | during the training: weights, states of the optimizers, statistics of \
@@ -28,14 +28,18 @@ from stable_baselines3.common.policies import BasePolicy, MultiInputActorCriticP
 from stable_baselines3.sac.policies import MultiInputPolicy as SACPolicy
 from torch import Tensor, nn
 
-from agents.networks import RasterFeatures, TrafficFeatures
-from agents.settings import CONFIG, AgentSettings, read_settings
 from asp_env.data.predictor import Predictor
 from asp_env.errors import AspEnvError, MissingExtraError
 from asp_env.files import atomic_file, write_text
+from policies.networks import RasterFeatures, TrafficFeatures
+from policies.settings import CONFIG, PolicySettings, read_settings
 
 POLICY = "policy.safetensors"
 CHECKPOINT = "checkpoint.safetensors"
+
+LOG_STD = -1.0
+"""Logarithm of the deviation of actions at the start. Chosen by hand: that of stable-baselines3, 0,
+accelerates and steers at the limits a third of the time."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -50,35 +54,37 @@ def algorithm_classes(name: str) -> AlgorithmClasses:
     """The classes of an algorithm.
 
     Args:
-        name: one of `agents.settings.ALGORITHMS`.
+        name: one of `policies.settings.ALGORITHMS`.
 
     Raises:
         MissingExtraError: the algorithm needs sb3-contrib, which is not installed.
     """
     if name == "sac":
         return AlgorithmClasses(algorithm=SAC, policy=SACPolicy)
-    if name == "ppo":
+    if name in ("ppo", "bc"):
         return AlgorithmClasses(algorithm=PPO, policy=MultiInputActorCriticPolicy)
     try:
-        from sb3_contrib import RecurrentPPO
-        from sb3_contrib.ppo_recurrent.policies import RecurrentMultiInputActorCriticPolicy
+        from sb3_contrib import RecurrentPPO  # pyright: ignore[reportMissingImports]
+        from sb3_contrib.ppo_recurrent.policies import (  # pyright: ignore[reportMissingImports]
+            RecurrentMultiInputActorCriticPolicy,
+        )
     except ModuleNotFoundError as error:
         raise MissingExtraError(str(error.name), "rl", f"the algorithm {name}") from error
     return AlgorithmClasses(algorithm=RecurrentPPO, policy=RecurrentMultiInputActorCriticPolicy)
 
 
-def policy_arguments(settings: AgentSettings) -> dict[str, Any]:
+def policy_arguments(settings: PolicySettings) -> dict[str, Any]:
     """Arguments of the policy's class, besides spaces and learning rate.
 
     Args:
-        settings: the settings of the agent.
+        settings: the settings of the policy.
     """
     extractor: dict[str, Any] = {"width": settings.width}
     kind: type[nn.Module] = TrafficFeatures
     if settings.environment.view is not None:
         kind = RasterFeatures
         if settings.encoder is not None:
-            from agents.encoders import trained_encoder
+            from policies.encoders import trained_encoder
 
             extractor["encoder"] = trained_encoder(settings.encoder, settings.environment)
     arguments: dict[str, Any] = {
@@ -88,21 +94,20 @@ def policy_arguments(settings: AgentSettings) -> dict[str, Any]:
         "activation_fn": nn.ReLU,
     }
     if settings.algorithm != "sac":
-        # The default deviation of 1 would steer and accelerate at the limits half of the time.
-        arguments["log_std_init"] = -1.0
+        arguments["log_std_init"] = LOG_STD
     if settings.algorithm == "recurrent-ppo":
         arguments["lstm_hidden_size"] = settings.width
     return arguments
 
 
-class Agent:
-    """A trained agent: acts on observations, without an environment."""
+class TrainedPolicy:
+    """A trained policy: acts on observations, without an environment."""
 
-    def __init__(self, settings: AgentSettings, space: spaces.Dict, policy: BasePolicy) -> None:
+    def __init__(self, settings: PolicySettings, space: spaces.Dict, policy: BasePolicy) -> None:
         """Holds a policy.
 
         Args:
-            settings: the settings of the agent.
+            settings: the settings of the policy.
             space: space of its observation.
             policy: its policy.
         """
@@ -115,7 +120,7 @@ class Agent:
         """The most probable actions (B, 2) in [-1, 1], float32.
 
         Args:
-            observations: reduced observations (`agents.observations`) of B environments.
+            observations: reduced observations (`policies.observations`) of B environments.
             starts: (B,) bool, which episodes begin now; only recurrent policies read it.
         """
         for name, box in self.space.items():
@@ -125,6 +130,8 @@ class Agent:
                     f"observation {name!r}: expected shape (B, *{box.shape}) as in training, got "
                     f"{given}"
                 )
+        if starts is not None and starts.all():
+            self._memory = None
         shown = {name: observations[name] for name in self.space.spaces}
         actions, self._memory = self._policy.predict(
             shown, state=self._memory, episode_start=starts, deterministic=True
@@ -132,8 +139,8 @@ class Agent:
         return np.asarray(actions, dtype=np.float32)
 
 
-def load_agent(folder: Path) -> Agent:
-    """Loads a trained agent.
+def load_policy(folder: Path) -> TrainedPolicy:
+    """Loads a trained policy.
 
     Raises:
         AspEnvError: there is no finished run, or a file is damaged.
@@ -153,14 +160,14 @@ def load_agent(folder: Path) -> Agent:
     except RuntimeError as error:
         raise AspEnvError(
             f"{folder / POLICY}: does not fit {CONFIG} ({str(error).splitlines()[-1].strip()}); "
-            "train the agent again"
+            "train the policy again"
         ) from None
     policy.set_training_mode(False)
-    return Agent(settings, space, policy)
+    return TrainedPolicy(settings, space, policy)
 
 
-def _no_learning(progress: float) -> float:
-    del progress
+def _no_learning(left: float | int) -> float:
+    del left
     return 0.0
 
 
@@ -171,7 +178,7 @@ def action_space() -> spaces.Box:
 
 def save_config(
     folder: Path,
-    settings: AgentSettings,
+    settings: PolicySettings,
     space: spaces.Dict,
     predictor: Predictor | None,
     steps: int,
@@ -180,7 +187,7 @@ def save_config(
 
     Args:
         folder: the run folder.
-        settings: the settings of the agent.
+        settings: the settings of the policy.
         space: space of its observation.
         predictor: the predictor whose forecasts are observed.
         steps: steps of training so far.
@@ -209,10 +216,10 @@ def predictor_identity(predictor: Predictor | None) -> dict[str, str] | None:
 
 
 def check_predictor(folder: Path, predictor: Predictor | None) -> None:
-    """Checks that a predictor is the one that an agent was trained with.
+    """Checks that a predictor is the one that a policy was trained with.
 
     Args:
-        folder: the run folder of the agent.
+        folder: the run folder of the policy.
         predictor: the predictor that is to provide its forecasts.
 
     Raises:
@@ -223,7 +230,7 @@ def check_predictor(folder: Path, predictor: Predictor | None) -> None:
     if trained_with != given:
         raise AspEnvError(
             f"{folder}: trained with {_identity_text(trained_with)}, given "
-            f"{_identity_text(given)}; give the same, or train another agent"
+            f"{_identity_text(given)}; give the same, or train another policy"
         )
 
 
@@ -249,7 +256,7 @@ def _read_space(content: Any, folder: Path) -> spaces.Dict:
         )
     except (KeyError, TypeError, ValueError, AttributeError) as error:
         raise AspEnvError(
-            f"{folder / CONFIG}: damaged ({type(error).__name__}: {error}); train the agent again"
+            f"{folder / CONFIG}: damaged ({type(error).__name__}: {error}); train the policy again"
         ) from None
 
 
@@ -266,7 +273,7 @@ def read_tensors(path: Path) -> dict[str, Tensor]:
             f"{path}: missing, the training has not ended; resume it with asp-env rl train --resume"
         ) from None
     except (OSError, SafetensorError) as error:
-        raise AspEnvError(f"{path}: damaged ({error}); train the agent again") from None
+        raise AspEnvError(f"{path}: damaged ({error}); train the policy again") from None
 
 
 def write_tensors(path: Path, tensors: Mapping[str, Tensor]) -> None:
@@ -276,7 +283,7 @@ def write_tensors(path: Path, tensors: Mapping[str, Tensor]) -> None:
         partial.write_bytes(content)
 
 
-def flatten_state(state: Mapping[str, Any], prefix: str) -> dict[str, Tensor]:
+def flatten_state(state: Mapping[Any, Any], prefix: str) -> dict[str, Tensor]:
     """Flattens nested state dictionaries of tensors and numbers; names are joined by `/`.
 
     Args:

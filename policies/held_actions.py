@@ -1,4 +1,4 @@
-"""Policies without a network, the baselines of every comparison of agents."""
+"""Policies without a network, the baselines of every comparison of trained policies."""
 
 from collections.abc import Mapping
 

@@ -11,21 +11,21 @@ from rich.console import Console
 from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn
 from rich.table import Table
 
-from agents.settings import (
-    REWARD_WEIGHTS,
-    AgentSettings,
-    Algorithm,
-    EnvironmentSettings,
-)
 from asp_env.data.recording import DEFAULT_DT_S
 from asp_env.errors import AspEnvError, MissingExtraError, unknown_name
 from asp_env.files import write_text
 from asp_env.sim.action_types import ActionType
+from policies.settings import (
+    REWARD_WEIGHTS,
+    Algorithm,
+    EnvironmentSettings,
+    PolicySettings,
+)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class RLTrain:
-    """Train an agent with stable-baselines3; --resume goes on with an interrupted run."""
+    """Train a policy with stable-baselines3; --resume goes on with an interrupted run."""
 
     data: Annotated[tyro.conf.Positional[str], tyro.conf.arg(metavar="DATA")]
     """Folder in the inD/rounD or INTERACTION layout, or sample:…, synthetic:… or highway:…."""
@@ -82,19 +82,19 @@ class RLTrain:
     such as density, or =-pet_behind_s for large gaps first."""
     demonstrations: int = 0
     """Epochs of behaviour cloning of the logged drivers before
-    the training."""
+    the training; with --algorithm bc they are all of it."""
     privileged: bool = False
     """Allow a predictor that uses the recorded future."""
     resume: bool = False
     """Go on with an interrupted run in --out."""
 
-    def settings(self) -> AgentSettings:
-        """The settings of the agent.
+    def settings(self) -> PolicySettings:
+        """The settings of the policy.
 
         Raises:
             AspEnvError: an option is invalid.
         """
-        return AgentSettings(
+        return PolicySettings(
             algorithm=self.algorithm,
             data=self.data,
             environment=EnvironmentSettings(
@@ -124,15 +124,15 @@ class RLTrain:
         )
 
     def run(self) -> None:
-        """Trains, with a progress bar, and prints how to evaluate the agent."""
-        train_agent = _training().train_agent
+        """Trains, with a progress bar, and prints how to evaluate the policy."""
+        train_policy = _training().train_policy
         settings, console = self.settings(), Console()
         columns = (TextColumn("{task.description}"), BarColumn(), TimeRemainingColumn())
         with Progress(*columns, console=console) as bar:
             task = bar.add_task(
                 f"{settings.algorithm}, {settings.steps:,} steps", total=settings.steps
             )
-            train_agent(
+            train_policy(
                 settings,
                 self.out,
                 resume=self.resume,
@@ -144,12 +144,12 @@ class RLTrain:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class RLEvaluate:
-    """Drive scenarios with trained agents in their environment, and print what became of them."""
+    """Drive scenarios with trained policy in their environment, and print what became of them."""
 
     data: Annotated[tyro.conf.Positional[str], tyro.conf.arg(metavar="DATA")]
     """Folder in the inD/rounD or INTERACTION layout, or sample:…, synthetic:… or highway:…."""
     runs: Annotated[tuple[Path, ...], tyro.conf.arg(metavar="RUN …")]
-    """Run folders of agents."""
+    """Run folders of policies."""
     scenarios: Annotated[str, tyro.conf.arg(metavar="FILTER")] = ""
     """Tags and comparisons, such as interactive,length>=8."""
     max_scenarios: int | None = None
@@ -167,8 +167,8 @@ class RLEvaluate:
     def run(self) -> None:
         """Evaluates all runs and prints a table."""
         training = _training()
-        from agents.evaluation import METRICS, evaluate_agent
-        from agents.runs import load_agent
+        from policies.evaluation import METRICS, evaluate_trained
+        from policies.runs import load_policy
 
         if self.out is not None and self.out.exists():
             raise AspEnvError(f"{self.out} exists; choose another name or remove it")
@@ -176,17 +176,17 @@ class RLEvaluate:
         table = Table("run", "scenarios", *METRICS)
         with Progress(TextColumn("{task.description}"), BarColumn(), console=console) as bar:
             for folder in self.runs:
-                agent = load_agent(folder)
+                trained = load_policy(folder)
                 environment = dataclasses.replace(
-                    agent.settings.environment,
+                    trained.settings.environment,
                     traffic=self.traffic,
-                    predictor=self.predictor or agent.settings.environment.predictor,
+                    predictor=self.predictor or trained.settings.environment.predictor,
                 )
-                agent.settings = dataclasses.replace(agent.settings, environment=environment)
-                training.check_environment(folder, agent.settings, self.data, self.privileged)
+                trained.settings = dataclasses.replace(trained.settings, environment=environment)
+                training.check_environment(folder, trained.settings, self.data, self.privileged)
                 task = bar.add_task(str(folder), total=None)
-                driven = evaluate_agent(
-                    agent,
+                driven = evaluate_trained(
+                    trained,
                     self.data,
                     scenarios=self.scenarios,
                     max_scenarios=self.max_scenarios,
@@ -210,12 +210,13 @@ class RLEvaluate:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class RLCompare:
-    """Train agents that observe other forecasts, and drive held-out scenarios with all of them."""
+    """Train policies that observe other forecasts, and drive held-out scenarios with all."""
 
     data: Annotated[tyro.conf.Positional[str], tyro.conf.arg(metavar="DATA")]
-    """Data that all agents are trained on."""
+    """Data that all policies are trained on."""
     held_out: Annotated[str, tyro.conf.arg(metavar="DATA")]
-    """Data of other places, which all agents, planners and zero and random actions drive."""
+    """Data of other places, which all policies, planners and zero and random
+    actions drive."""
     out: Path
     """Folder of the comparison. An interrupted one goes on where it was."""
     learned: Annotated[str, tyro.conf.arg(metavar="NAME:RUN")] = "ssp-asp:pretrained"
@@ -240,7 +241,7 @@ class RLCompare:
             AspEnvError: an option is invalid.
         """
         _training()
-        from agents import comparison as c
+        from policies import comparison as c
 
         rows = c.default_rows(self.learned)
         names = self.rows or tuple(rows)
@@ -259,7 +260,7 @@ class RLCompare:
             "data": self.data,
             "held_out": dataclasses.asdict(held_out),
             "learned": self.learned,
-            "agent": dataclasses.asdict(cells[0].settings),
+            "policy": dataclasses.asdict(cells[0].settings),
         }
         c.check_out(self.out, shared)
         c.run_cells(cells, held_out, self.jobs, console)
@@ -277,9 +278,9 @@ class RLCompare:
         console.print(f"wrote {self.out}/comparison.json and curves.html")
 
     def _cell(self, name: str, observed: Any, seed: int) -> Any:
-        from agents.comparison import Cell
+        from policies.comparison import Cell
 
-        settings = AgentSettings(
+        settings = PolicySettings(
             data=self.data,
             environment=EnvironmentSettings(
                 scenarios=self.scenarios,
@@ -302,7 +303,7 @@ def _cell(estimate: Any) -> str:
 def _training() -> Any:
     """The module of training, which needs stable-baselines3 and torch."""
     try:
-        from agents import training
+        from policies import training
     except ModuleNotFoundError as error:
         raise MissingExtraError(str(error.name), "rl", "asp-env rl") from error
     return training

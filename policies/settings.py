@@ -1,4 +1,4 @@
-"""The settings of an agent: everything that a run folder states about its training."""
+"""The settings of a policy: everything that a run folder states about its training."""
 
 import dataclasses
 import json
@@ -10,9 +10,8 @@ from typing import Any, Literal, get_args
 
 from asp_env.data.recording import DEFAULT_DT_S
 from asp_env.errors import AspEnvError, unknown_name
-from asp_env.sim.action_types import ActionType
 
-Algorithm = Literal["ppo", "sac", "recurrent-ppo"]
+Algorithm = Literal["ppo", "sac", "recurrent-ppo", "bc"]
 ALGORITHMS: tuple[str, ...] = get_args(Algorithm)
 
 CONFIG = "config.json"
@@ -25,14 +24,14 @@ standing, and a collision costs more than the progress that it saves."""
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class EnvironmentSettings:
-    """What an agent observes, what its actions mean, and what it is rewarded for."""
+    """What a policy observes, what its actions mean, and what it is rewarded for."""
 
     scenarios: str = ""
     """Filter of the scenarios for training."""
     traffic: str | None = None
     """Driver of the other agents; that of the world by default."""
     dt_s: float = DEFAULT_DT_S
-    action_type: ActionType = "route"
+    action_type: str = "route"
     action_repeat: int = 3
     """Ticks for which an action is held."""
     reward_weights: Mapping[str, float] = field(default_factory=lambda: dict(REWARD_WEIGHTS))
@@ -69,12 +68,13 @@ MAX_MAP_LINES = 64
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class AgentSettings:
-    """An agent: an algorithm, its environment, and its numbers."""
+class PolicySettings:
+    """A policy: an algorithm, its environment, and its numbers."""
 
-    algorithm: Algorithm = "ppo"
+    algorithm: str = "ppo"
+    """One of `ALGORITHMS`."""
     data: str = "sample:intersection"
-    """The data that the agent is trained on."""
+    """The data that the policy is trained on."""
     environment: EnvironmentSettings = field(default_factory=EnvironmentSettings)
     steps: int = 400_000
     """Steps of training, of `action_repeat` ticks each, summed over the environments."""
@@ -95,7 +95,8 @@ class AgentSettings:
     """Column of the scenarios, such as `-pet_behind_s` for easy ones with a large time gap first;
     the share that is drawn grows from 0.3 to 1 over the first half of the training."""
     demonstrations: int = 0
-    """Epochs of behaviour cloning of the logged drivers before the training."""
+    """Epochs of behaviour cloning of the logged drivers before the training; for `bc` they are the
+    training."""
 
     def __post_init__(self) -> None:
         """Checks numbers and names.
@@ -108,6 +109,15 @@ class AgentSettings:
         for name, least in (("steps", 1), ("num_envs", 1), ("width", 1), ("demonstrations", 0)):
             if getattr(self, name) < least:
                 raise AspEnvError(f"{name} {getattr(self, name)}: expected at least {least}")
+        if self.algorithm == "bc" and not self.demonstrations:
+            raise AspEnvError(
+                "algorithm bc, behaviour cloning: give the number of epochs, such as "
+                "demonstrations=30"
+            )
+        if self.demonstrations and self.algorithm not in ("ppo", "bc"):
+            raise AspEnvError(
+                f"demonstrations {self.demonstrations}: only ppo can start from them, and bc"
+            )
         if not 0.0 <= self.gamma < 1.0:
             raise AspEnvError(f"gamma {self.gamma}: expected at least 0 and less than 1")
         if not (math.isfinite(self.learning_rate) and self.learning_rate > 0.0):
@@ -120,6 +130,7 @@ class AgentSettings:
 
 DEFAULTS: Mapping[str, Mapping[str, Any]] = {
     "ppo": {"n_steps": 32, "batch_size": 1024, "n_epochs": 10, "gae_lambda": 0.9},
+    "bc": {},
     "recurrent-ppo": {"n_steps": 32, "batch_size": 1024, "n_epochs": 5, "gae_lambda": 0.9},
     "sac": {
         "batch_size": 512,
@@ -133,26 +144,26 @@ DEFAULTS: Mapping[str, Mapping[str, Any]] = {
 """Arguments of the algorithms' classes. Chosen by hand on validation places."""
 
 
-def read_settings(folder: Path) -> AgentSettings:
+def read_settings(folder: Path) -> PolicySettings:
     """Reads the settings of a run folder.
 
     Raises:
-        AspEnvError: the folder holds no run of an agent, or its settings are damaged.
+        AspEnvError: the folder holds no run of a policy, or its settings are damaged.
     """
     path = folder / CONFIG
     try:
         content = json.loads(path.read_text())
     except FileNotFoundError:
         raise AspEnvError(
-            f"{folder}: no run of an agent there ({CONFIG} is missing); train one with "
+            f"{folder}: no run of a policy there ({CONFIG} is missing); train one with "
             "asp-env rl train"
         ) from None
     except (OSError, ValueError) as error:
-        raise AspEnvError(f"{path}: damaged ({error}); train the agent again") from None
+        raise AspEnvError(f"{path}: damaged ({error}); train the policy again") from None
     return settings_from(content.get("settings") if isinstance(content, dict) else None, path)
 
 
-def settings_from(content: Any, path: Path) -> AgentSettings:
+def settings_from(content: Any, path: Path) -> PolicySettings:
     """Makes settings from the content of a file.
 
     Raises:
@@ -162,7 +173,7 @@ def settings_from(content: Any, path: Path) -> AgentSettings:
         fields = dict(content)
         environment = dict(fields.pop("environment"))
         pixels = environment.pop("raster_px", None)
-        return AgentSettings(
+        return PolicySettings(
             environment=EnvironmentSettings(
                 raster_px=None if pixels is None else (int(pixels[0]), int(pixels[1])),
                 **environment,
@@ -171,6 +182,6 @@ def settings_from(content: Any, path: Path) -> AgentSettings:
         )
     except (TypeError, KeyError, ValueError) as error:
         raise AspEnvError(
-            f"{path}: not the settings of an agent ({type(error).__name__}: {error}); train the "
-            "agent again"
+            f"{path}: not the settings of a policy ({type(error).__name__}: {error}); train the "
+            "policy again"
         ) from None

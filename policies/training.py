@@ -1,4 +1,4 @@
-"""Training of agents with stable-baselines3."""
+"""Training of policies with stable-baselines3."""
 
 from collections.abc import Callable, Mapping
 from pathlib import Path
@@ -13,10 +13,16 @@ from stable_baselines3.common.logger import configure
 from stable_baselines3.common.vec_env import VecMonitor, VecNormalize
 from torch import Tensor
 
-from agents.curriculum import Curriculum
-from agents.environments import AgentObservations, make_environments
-from agents.runs import (
+from asp_env.data.predictor import Predictor
+from asp_env.errors import AspEnvError
+from asp_env.workers import one_thread
+from policies.cloning import clone
+from policies.curriculum import Curriculum
+from policies.environments import PolicyObservations, make_environments
+from policies.logged_steps import logged_steps
+from policies.runs import (
     CHECKPOINT,
+    LOG_STD,
     POLICY,
     algorithm_classes,
     check_predictor,
@@ -27,10 +33,7 @@ from agents.runs import (
     save_config,
     write_tensors,
 )
-from agents.settings import CONFIG, DEFAULTS, AgentSettings, read_settings
-from asp_env.data.predictor import Predictor
-from asp_env.errors import AspEnvError
-from asp_env.workers import one_thread
+from policies.settings import CONFIG, DEFAULTS, PolicySettings, read_settings
 
 LOWEST_SHARE_OF_RATE = 0.05
 """Share of the learning rate at the end of the training. Chosen by hand."""
@@ -45,21 +48,21 @@ Progress = Callable[[int], None]
 """Called with the number of steps so far."""
 
 
-def train_agent(
-    settings: AgentSettings,
+def train_policy(
+    settings: PolicySettings,
     out: Path,
     *,
     resume: bool = False,
     privileged: bool = False,
     progress: Progress | None = None,
 ) -> None:
-    """Trains an agent and writes its run folder.
+    """Trains a policy and writes its run folder.
 
     The same settings give the same weights on the same kind of machine. A resumed training goes
     on with the weights, optimizers and reward statistics of the last checkpoint in new episodes.
 
     Args:
-        settings: the settings of the agent.
+        settings: the settings of the policy.
         out: the run folder.
         resume: whether to go on with an interrupted run in `out`.
         privileged: allows forecasts of a predictor that uses the recorded future.
@@ -92,16 +95,18 @@ def train_agent(
         save_config(out, settings, space, predictor, 0)
         if settings.demonstrations:
             _clone_logged_drivers(settings, algorithm, privileged)
-    left = settings.steps - done
+    left = 0 if settings.algorithm == "bc" else settings.steps - done
     algorithm.set_logger(configure(str(out), ["csv", "tensorboard"]))
     callbacks: list[BaseCallback] = [EpisodeStatistics(), Checkpoints(out, normalized)]
     if settings.curriculum is not None:
         callbacks.append(Curriculum(settings.curriculum, settings.steps))
     if progress is not None:
         callbacks.append(_Report(progress))
-    with one_thread():
-        algorithm.learn(left, callback=CallbackList(callbacks), reset_num_timesteps=not done)
-    algorithm.logger.close()
+    try:
+        with one_thread():
+            algorithm.learn(left, callback=CallbackList(callbacks), reset_num_timesteps=not done)
+    finally:
+        algorithm.logger.close()
     write_tensors(out / POLICY, algorithm.policy.state_dict())
     space = envs.observation_space
     assert isinstance(space, spaces.Dict)
@@ -110,12 +115,12 @@ def train_agent(
     envs.close()
 
 
-def check_environment(folder: Path, settings: AgentSettings, data: str, privileged: bool) -> None:
-    """Checks that an environment shows a trained agent the forecasts of its own predictor.
+def check_environment(folder: Path, settings: PolicySettings, data: str, privileged: bool) -> None:
+    """Checks that an environment shows a trained policy the forecasts of its own predictor.
 
     Args:
-        folder: the run folder of the agent.
-        settings: the settings of the agent, possibly with another predictor.
+        folder: the run folder of the policy.
+        settings: the settings of the policy, possibly with another predictor.
         data: the data to drive in.
         privileged: allows forecasts of a predictor that uses the recorded future.
 
@@ -127,11 +132,11 @@ def check_environment(folder: Path, settings: AgentSettings, data: str, privileg
     envs.close()
 
 
-def make_algorithm(settings: AgentSettings, envs: VecNormalize) -> BaseAlgorithm:
+def make_algorithm(settings: PolicySettings, envs: VecNormalize) -> BaseAlgorithm:
     """Makes the algorithm of stable-baselines3 with random weights.
 
     Args:
-        settings: the settings of the agent.
+        settings: the settings of the policy.
         envs: its environments.
 
     Raises:
@@ -140,8 +145,9 @@ def make_algorithm(settings: AgentSettings, envs: VecNormalize) -> BaseAlgorithm
     classes = algorithm_classes(settings.algorithm)
     arguments = {**DEFAULTS[settings.algorithm], **settings.hyperparameters}
     rate = settings.learning_rate
+    algorithm: Any = classes.algorithm
     try:
-        return classes.algorithm(
+        return algorithm(
             classes.policy,
             envs,
             learning_rate=lambda left: rate * max(left, LOWEST_SHARE_OF_RATE),
@@ -155,29 +161,38 @@ def make_algorithm(settings: AgentSettings, envs: VecNormalize) -> BaseAlgorithm
         raise AspEnvError(f"hyperparameters of {settings.algorithm}: {error}") from None
 
 
-def predictor_of(envs: AgentObservations) -> Predictor | None:
+def predictor_of(envs: PolicyObservations) -> Predictor | None:
     """The predictor whose forecasts environments show, if any."""
     predictors: Any = envs.get_attr("predictors", 0)[0]
     return predictors[0] if predictors else None
 
 
 def _clone_logged_drivers(
-    settings: AgentSettings, algorithm: BaseAlgorithm, privileged: bool
+    settings: PolicySettings, algorithm: BaseAlgorithm, privileged: bool
 ) -> None:
-    from agents.cloning import clone, logged_steps
+    """Trains the policy to act as the logged drivers, before anything else."""
+    policy: Any = algorithm.policy
+    steps = logged_steps(settings, privileged=privileged)
+    with one_thread():
+        clone(
+            policy,
+            steps.observations,
+            steps.actions,
+            steps.recording if len(np.unique(steps.recording)) > 1 else _thirds(len(steps.actions)),
+            epochs=settings.demonstrations,
+            seed=settings.seed,
+        )
+    if settings.algorithm == "ppo":  # cloning has lowered the deviation, PPO has to explore
+        with torch.no_grad():
+            policy.log_std.fill_(LOG_STD)
 
-    observations, actions, episodes = logged_steps(settings, privileged=privileged)
-    clone(
-        algorithm.policy,
-        observations,
-        actions,
-        episodes,
-        epochs=settings.demonstrations,
-        seed=settings.seed,
-    )
+
+def _thirds(count: int) -> np.ndarray:
+    """Three groups of steps one after the other, for data of a single recording."""
+    return np.arange(count) * 3 // count
 
 
-def _check_folder(settings: AgentSettings, out: Path, resume: bool) -> bool:
+def _check_folder(settings: PolicySettings, out: Path, resume: bool) -> bool:
     """Whether there is something to resume.
 
     Raises:
@@ -197,7 +212,7 @@ def _check_folder(settings: AgentSettings, out: Path, resume: bool) -> bool:
     if before != settings:
         names = [
             name
-            for name in AgentSettings.__dataclass_fields__
+            for name in PolicySettings.__dataclass_fields__
             if getattr(before, name) != getattr(settings, name)
         ]
         raise AspEnvError(
@@ -287,7 +302,8 @@ def _restore(out: Path, algorithm: BaseAlgorithm, envs: VecNormalize) -> int:
     """Restores a checkpoint; returns its number of steps."""
     tensors = read_tensors(out / CHECKPOINT)
     steps, mean, variance, count = tensors["numbers"].tolist()
-    envs.ret_rms.mean, envs.ret_rms.var, envs.ret_rms.count = np.float64(mean), variance, count
+    rewards: Any = envs.ret_rms
+    rewards.mean, rewards.var, rewards.count = np.float64(mean), variance, count
     algorithm.num_timesteps = int(steps)
     for name in algorithm.get_parameters():
         owner: Any = algorithm

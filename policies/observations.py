@@ -1,4 +1,4 @@
-"""What agents observe: the environment's observation, reduced to what their networks read.
+"""What policies observe: the environment's observation, reduced to what their networks read.
 
 The environment's vectors hold 16 agents at 16 ticks and 64 pieces of lines, 33 kB; a buffer of
 steps stores less:
@@ -8,7 +8,7 @@ steps stores less:
 | `state` | (7,) | the fields `STATE` of the environment's `state` |
 | `route` | (30, 2) | as in the environment |
 | `neighbours` | (K, 25) | the K nearest agents, nearest first: `AGENT_FIELDS` of \
-`asp_env.views.vectors` now and three ticks ago, then 1 where there is an agent |
+`asp_env.views.vectors` now and three ticks ago, then 1 where there is a policy |
 | `lines` | (L, 10, 9) | pieces of lines: `LINE_FIELDS`, then 1 where the point exists |
 | `forecast…` | | as in the environment |
 
@@ -21,16 +21,16 @@ from typing import Any
 import numpy as np
 from gymnasium import spaces
 
-from agents.settings import EnvironmentSettings
 from asp_env.errors import AspEnvError
 from asp_env.sim.observation import STATE_FIELDS
 from asp_env.views.vectors import AGENT_FIELDS, LINE_FIELDS
+from policies.settings import EnvironmentSettings
 
 HIDDEN_STATE = ("route_done", "to_goal_m")
 """Fields of `state` that state how far the logged driver gets."""
 
 STATE = tuple(name for name in STATE_FIELDS if name not in HIDDEN_STATE)
-"""Fields of `state` that agents observe."""
+"""Fields of `state` that policies observe."""
 
 _SHOWN = np.array([name in STATE for name in STATE_FIELDS])
 
@@ -45,16 +45,16 @@ Observations = dict[str, np.ndarray]
 
 
 def components(settings: EnvironmentSettings) -> tuple[str, ...]:
-    """The components of the environment's observation that an agent needs."""
+    """The components of the environment's observation that a policy needs."""
     return ("state", "route", "vectors" if settings.view is None else "raster")
 
 
 def reduced_space(space: spaces.Space[Any], settings: EnvironmentSettings) -> spaces.Dict:
-    """The space of an agent's observation.
+    """The space of a policy's observation.
 
     Args:
         space: the space of the environment's observation.
-        settings: what the agent observes.
+        settings: what the policy observes.
 
     Raises:
         AspEnvError: the observation lacks a component.
@@ -83,7 +83,7 @@ def reduce_observations(
 
     Args:
         observations: the environment's observations.
-        settings: what the agent observes.
+        settings: what the policy observes.
     """
     kept = {name: value for name, value in observations.items() if name not in _VECTORS}
     kept["state"] = observations["state"][:, _SHOWN]

@@ -1,4 +1,4 @@
-"""A trained agent as a planner: `asp-env drive DATA --planner sb3:RUN`."""
+"""A trained policy as a planner: `asp-env drive DATA --planner sb3:RUN`."""
 
 import dataclasses
 from pathlib import Path
@@ -7,8 +7,6 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float, Int
 
-from agents.observations import Observations, components, reduce_observations
-from agents.runs import Agent, check_predictor, load_agent
 from asp_env.data.predictor import Forecast, Predictor
 from asp_env.data.scene import EGO, Scene
 from asp_env.data.snippets import Future
@@ -21,53 +19,55 @@ from asp_env.sim.action_types import following_steering, to_physical
 from asp_env.sim.observation import ObservationContext, Observer
 from asp_env.sim.world import Events
 from asp_env.views import make_raster_view
+from policies.observations import Observations, components, reduce_observations
+from policies.runs import TrainedPolicy, check_predictor, load_policy
 
 
-class AgentPlanner:
-    """Drives by the most probable action of a trained agent, which decides anew at every tick.
+class PolicyPlanner:
+    """Drives by the most probable action of a trained policy, which decides anew at every tick.
 
-    In its environment the agent decides every `action_repeat` ticks. The forecast must be of the
-    predictor that the agent was trained with.
+    In its environment the policy decides every `action_repeat` ticks. The forecast must be of the
+    predictor that the policy was trained with.
     """
 
     privileged = False
 
-    def __init__(self, agent: Agent, folder: Path) -> None:
-        """Makes a planner of an agent.
+    def __init__(self, trained: TrainedPolicy, folder: Path) -> None:
+        """Makes a planner of a policy.
 
         Args:
-            agent: the agent.
+            trained: the policy.
             folder: its run folder.
 
         Raises:
-            AspEnvError: the agent observes several predictors or delayed forecasts, or is
+            AspEnvError: the policy observes several predictors or delayed forecasts, or is
                 recurrent.
         """
         self.name = f"sb3:{folder}"
-        self._agent, self._folder = agent, folder
-        settings = agent.settings.environment
-        if agent.settings.algorithm == "recurrent-ppo":
+        self._trained, self._folder = trained, folder
+        settings = trained.settings.environment
+        if trained.settings.algorithm == "recurrent-ppo":
             raise AspEnvError(
-                f"{folder}: a recurrent agent has a memory, a planner has none; evaluate it with "
+                f"{folder}: a recurrent policy has a memory, a planner has none; evaluate it with "
                 "asp-env rl evaluate"
             )
         self._options = ForecastOptions(**settings.forecast)
         if self._options.max_age_ticks:
             raise AspEnvError(
-                f"{folder}: the agent observes delayed forecasts, a planner is given new ones; "
+                f"{folder}: the policy observes delayed forecasts, a planner is given new ones; "
                 "evaluate it with asp-env rl evaluate"
             )
         self.uses_forecasts = settings.predictor is not None
         self._observer: Observer | None = None
 
     @classmethod
-    def from_name(cls, argument: str) -> "AgentPlanner":
-        """Loads the agent of a run folder.
+    def from_name(cls, argument: str) -> "PolicyPlanner":
+        """Loads the policy of a run folder.
 
         Raises:
             AspEnvError: there is no finished run, or it is damaged.
         """
-        return cls(load_agent(Path(argument)), Path(argument))
+        return cls(load_policy(Path(argument)), Path(argument))
 
     def check_predictor(self, predictor: Predictor) -> None:
         """Checks that a predictor is the one of the training.
@@ -78,13 +78,13 @@ class AgentPlanner:
         check_predictor(self._folder, predictor)
 
     def plan(self, scene: Scene, forecast: Forecast) -> Plan:
-        """Plans the agent's action, held for the horizon of the forecast.
+        """Plans the policy's action, held for the horizon of the forecast.
 
         Raises:
             AspEnvError: a situation has no route, or the time step is not that of the training.
         """
-        settings = self._agent.settings.environment
-        scene.check_dt(settings.dt_s, f"the agent of {self._folder}")
+        settings = self._trained.settings.environment
+        scene.check_dt(settings.dt_s, f"the policy of {self._folder}")
         if (scene.route_valid.sum(axis=1) < 2).any():
             raise AspEnvError("a planner needs the ego's route: take the scene from a world")
         egos = np.ascontiguousarray(scene.states[:, EGO, -1])
@@ -92,7 +92,7 @@ class AgentPlanner:
             scene.route, scene.route_valid, egos, np.full(len(scene.tick), -1.0)
         )
         observations = self._observe(scene, forecast, on_route)
-        actions = self._agent.act(observations)
+        actions = self._trained.act(observations)
         lengths = np.maximum(scene.sizes[:, EGO, 0], 0.1)
         following = following_steering(
             egos, lengths, scene.route, scene.route_valid, on_route[:, 0]
@@ -106,7 +106,7 @@ class AgentPlanner:
     def _observe(
         self, scene: Scene, forecast: Forecast, on_route: Float[np.ndarray, "b 3"]
     ) -> Observations:
-        settings = self._agent.settings.environment
+        settings = self._trained.settings.environment
         if self._observer is None:
             view = "chauffeurnet" if settings.view is None else settings.view
             raster = make_raster_view(view, pixels=settings.raster_px)
@@ -117,7 +117,7 @@ class AgentPlanner:
         return reduce_observations(observed, settings)
 
     def _forecast_entries(self, scene: Scene, forecast: Forecast) -> dict[str, np.ndarray]:
-        is_privileged = any(name.startswith("oracle_") for name in self._agent.space.spaces)
+        is_privileged = any(name.startswith("oracle_") for name in self._trained.space.spaces)
         given = _GivenForecast(forecast, is_privileged, forecast.dt_s)
         options = dataclasses.replace(self._options, privileged=is_privileged)
         observer = ForecastObserver(given, options, scene.dt_s)
@@ -199,9 +199,14 @@ class _SceneSource:
             serials=rows,
         )
 
-    def scene(self, rows: Int[np.ndarray, " r"], targets: Int[np.ndarray, "t 2"]) -> Scene:
+    def scene(
+        self,
+        rows: Int[np.ndarray, " r"],
+        targets: Int[np.ndarray, "t 2"],
+        history: int | None = None,
+    ) -> Scene:
         """Returns the scene with other targets; `rows` are all its situations."""
-        del rows
+        del rows, history
         return self._scene.with_targets(targets)
 
     def recorded_future(self, scene: Scene, horizon: int, rows: Int[np.ndarray, " r"]) -> Any:
@@ -230,7 +235,7 @@ def _context(scene: Scene) -> ObservationContext:
 
 
 def _events(scene: Scene, on_route: Float[np.ndarray, "b 3"]) -> Events:
-    """What the observation reads of the events; the goal, which agents do not observe, is 0."""
+    """What the observation reads of the events; the goal, which policies do not observe, is 0."""
     count = len(scene.tick)
     nothing = np.zeros(count)
     return Events(
