@@ -23,7 +23,23 @@ def _terms(
 
 def test_all_terms_are_zero_without_progress_or_events():
     """Constant speed straight ahead, on the road, without contact or progress."""
-    assert _terms(RUNNING) == {"progress": 0.0, "comfort": 0.0, "collision": 0.0, "off_road": 0.0}
+    names = ("progress", "comfort", "collision", "off_road", "goal", "standing", "route")
+    assert _terms(RUNNING) == dict.fromkeys(names, 0.0)
+
+
+def test_goal_standing_and_route_by_hand():
+    """In 0.2 s; an offset of 1 m is a quarter of 2 m squared."""
+    reached = dataclasses.replace(RUNNING, route_m=RUNNING.goal_m + 1.0)
+    assert _terms(reached)["goal"] == 1.0
+    assert _terms(reached, before=reached)["goal"] == 0.0
+    beside = dataclasses.replace(RUNNING, route_offset_m=np.full(1, -1.0))
+    assert _terms(beside)["route"] == pytest.approx(-0.05)
+    far = dataclasses.replace(RUNNING, route_offset_m=np.full(1, 9.0))
+    assert _terms(far)["route"] == pytest.approx(-0.2)
+    against = dataclasses.replace(RUNNING, route_heading_rad=np.full(1, np.pi))
+    assert _terms(against)["route"] == pytest.approx(-0.2)
+    slow = np.array([[0.0, 0.0, 0.0, 0.4]], dtype=np.float32)
+    assert _terms(RUNNING, ended=slow)["standing"] == pytest.approx(-0.2)
 
 
 def test_progress_is_the_share_of_the_recorded_distance():
