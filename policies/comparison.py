@@ -297,9 +297,13 @@ def learning_curves(
 
 
 def _progress_of(folder: Path) -> Float[np.ndarray, "points 2"]:
-    with (folder / "progress.csv").open(newline="") as file:
-        lines = [line for line in csv.DictReader(file) if line.get(CURVE)]
-    return np.array([[float(line["time/total_timesteps"]), float(line[CURVE])] for line in lines])
+    """Steps and success of a run, from all its tables of statistics."""
+    lines: list[dict[str, str]] = []
+    for path in folder.glob("progress*.csv"):
+        with path.open(newline="") as file:
+            lines += [line for line in csv.DictReader(file) if line.get(CURVE)]
+    points = [[float(line["time/total_timesteps"]), float(line[CURVE])] for line in lines]
+    return np.array(sorted(points))
 
 
 def _curve(seeds: Sequence[Float[np.ndarray, "_ 2"]]) -> Float[np.ndarray, "points 4"]:

@@ -7,7 +7,8 @@ entry), `predictor` (name and hash of the weights), `steps` of training |
 | `policy.safetensors` | weights of the policy, written at the end of the training |
 | `checkpoint.safetensors` | during the training: weights, states of the optimizers, statistics of \
 the rewards |
-| `progress.csv`, `events…` | training statistics as a table, and for TensorBoard |
+| `progress.csv`, `events…` | training statistics as a table, and for TensorBoard; \
+`progress-N.csv` those of the first N steps of a resumed training |
 """
 
 import dataclasses

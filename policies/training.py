@@ -41,6 +41,10 @@ LOWEST_SHARE_OF_RATE = 0.05
 CHECKPOINT_STEPS = 50_000
 """Steps between checkpoints. Chosen by hand: some tens of seconds."""
 
+PROGRESS = "progress.csv"
+"""The table of training statistics. That of the first N steps of a resumed training is
+`progress-N.csv`."""
+
 EPISODE_KEYS = ("progress", "collision", "at_fault", "off_road_m", "ending")
 """Infos of finished episodes that are logged."""
 
@@ -88,6 +92,7 @@ def train_policy(
     if done:
         check_predictor(out, predictor)
         done = _restore(out, algorithm, normalized)
+        _keep_progress(out, done)
     else:
         out.mkdir(parents=True, exist_ok=True)
         space = envs.observation_space
@@ -220,6 +225,13 @@ def _check_folder(settings: PolicySettings, out: Path, resume: bool) -> bool:
             "same, or choose another folder"
         )
     return (out / CHECKPOINT).exists()
+
+
+def _keep_progress(out: Path, done: int) -> None:
+    """Renames the table of statistics, since stable-baselines3 starts a new one."""
+    table = out / PROGRESS
+    if table.exists():
+        table.rename(out / f"{table.stem}-{done}{table.suffix}")
 
 
 class EpisodeStatistics(BaseCallback):

@@ -68,6 +68,10 @@ def test_an_interrupted_training_is_resumed(
     train_policy(settings, tmp_path / "run", resume=True, progress=note)
     assert restored["first"] == int(saved["numbers"][0]) + settings.num_envs
     assert not (tmp_path / "run" / CHECKPOINT).exists()
+    steps = int(saved["numbers"][0])
+    assert {f"progress-{steps}.csv", "progress.csv"} <= {
+        path.name for path in (tmp_path / "run").iterdir()
+    }
     load_policy(tmp_path / "run")
 
 

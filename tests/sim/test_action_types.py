@@ -71,7 +71,7 @@ def test_a_held_action_is_the_same_action_in_several_steps(kind: str) -> None:
     for _ in range(4):
         action = rng.uniform(-0.3, 0.3, 2)
         seen, reward, *_, info = held.step(action)
-        rewards, last = 0.0, {}
+        rewards, last, last_seen = 0.0, {}, {}
         for _ in range(3):
             last_seen, each, terminated, truncated, last = single.step(action)
             rewards += each
