@@ -4,7 +4,8 @@ import contextlib
 import io
 import re
 import sys
-from collections.abc import Sequence
+import warnings
+from collections.abc import Iterator, Sequence
 from typing import Any
 
 import tyro
@@ -12,7 +13,7 @@ from rich.console import Console
 from rich.table import Table
 
 from asp_env import registry
-from asp_env.errors import AspEnvError
+from asp_env.errors import AspEnvError, RepairWarning
 
 BAD_INPUT = 2
 """Exit status for input that a command rejects."""
@@ -47,7 +48,8 @@ def main(argv: Sequence[str] | None = None) -> int:
     name, options = f"{group} {args[0]}".strip(), args[1:]
     try:
         command = registry.find("commands", name)
-        _parse(name, command, _with_current_names(name, options)).run()
+        with _one_line_warnings():
+            _parse(name, command, _with_current_names(name, options)).run()
     except AspEnvError as error:
         return _report(str(error))
     except OSError as error:
@@ -57,6 +59,23 @@ def main(argv: Sequence[str] | None = None) -> int:
         sys.stderr.write("asp-env: interrupted\n")
         return 130
     return 0
+
+
+@contextlib.contextmanager
+def _one_line_warnings() -> Iterator[None]:
+    """Prints warnings about DATA without the line of code that they come from."""
+    usual = warnings.formatwarning
+
+    def one_line(message: Any, category: type[Warning], *rest: Any, **named: Any) -> str:
+        if issubclass(category, RepairWarning):
+            return f"asp-env: warning: {message}\n"
+        return usual(message, category, *rest, **named)
+
+    warnings.formatwarning = one_line
+    try:
+        yield
+    finally:
+        warnings.formatwarning = usual
 
 
 def _groups() -> set[str]:

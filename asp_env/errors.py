@@ -12,6 +12,10 @@ class DataError(AspEnvError):
     """A recording, map or folder that cannot be read."""
 
 
+class RepairWarning(UserWarning):
+    """Files contain faults that a reader repaired, or parts that it left out or guessed."""
+
+
 class CheckpointError(AspEnvError):
     """A trained predictor that cannot be loaded."""
 

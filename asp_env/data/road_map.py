@@ -74,6 +74,9 @@ class RoadMap:
     """Speed limit of each lane, where `limited`."""
     limited: Bool[np.ndarray, " areas"] = field(default_factory=lambda: np.zeros(0, dtype=bool))
     """Mask of the lanes whose speed limit is in the map."""
+    region_m: tuple[float, float, float, float] | None = None
+    """Smallest x and y, largest x and y of the part of a larger map that this map covers; None if
+    it is the whole map. Lanes and lines that reach out of the region are complete."""
     repairs: tuple[str, ...] = ()
     """Repairs made by the reader, one line for each kind."""
 
@@ -107,11 +110,13 @@ class RoadMap:
 
     @property
     def extent_m(self) -> tuple[float, float, float, float]:
-        """Smallest x and y, largest x and y of lines and drivable area, metres."""
+        """Smallest x and y, largest x and y of lines and drivable area in the region, metres."""
         points = np.concatenate([self.lines.points, self.drivable.points])
         if not len(points):
             return (0.0, 0.0, 1.0, 1.0)
         low, high = points.min(axis=0), points.max(axis=0)
+        if self.region_m is not None:
+            low, high = np.maximum(low, self.region_m[:2]), np.minimum(high, self.region_m[2:])
         return (float(low[0]), float(low[1]), float(high[0]), float(high[1]))
 
 

@@ -1,5 +1,6 @@
 """`asp-env inspect`: the contents of DATA, the drift of inferred actions, and all faults."""
 
+import warnings
 from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Annotated, Literal
@@ -20,7 +21,7 @@ from asp_env.data.snippets import HISTORY_S, SNIPPET_INTERVAL_S, find_snippets
 from asp_env.data.source import Recordings, open_data
 from asp_env.dynamics import inverse, rollout
 from asp_env.dynamics.bicycle import Integrator
-from asp_env.errors import DataError
+from asp_env.errors import DataError, RepairWarning
 from asp_env.metrics.drivable import CELL_M, drivable_field
 from asp_env.metrics.forecast.errors import moving
 
@@ -153,7 +154,9 @@ class Inspect:
         )
         for number in numbers:
             try:
-                recording = recordings[number]
+                with warnings.catch_warnings():
+                    warnings.simplefilter("ignore", RepairWarning)  # repairs are listed
+                    recording = recordings[number]
             except DataError as error:
                 faults[recordings.names[number]] = str(error)
                 continue

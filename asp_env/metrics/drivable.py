@@ -34,7 +34,10 @@ _SUBPIXEL_BITS = 8
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class DrivableField:
-    """Distance to the drivable area on a grid, `MARGIN_M` outside the grid."""
+    """Distance to the drivable area on a grid, `MARGIN_M` outside the grid.
+
+    The grid covers the drivable area, or the part of it in the map's region.
+    """
 
     outside_m: Float[np.ndarray, "rows columns"]
     """0 inside the drivable area, at most `MARGIN_M`; negative inside for a signed field."""
@@ -182,8 +185,12 @@ def _draw_area(road_map: RoadMap) -> tuple[np.ndarray, tuple[float, float]]:
     points = road_map.drivable.points
     if not len(points):
         raise DataError(f"map {road_map.name}: no drivable area; expected one lanelet at least")
-    low = points.min(axis=0) - MARGIN_M
-    columns, rows = np.ceil((points.max(axis=0) + MARGIN_M - low) / CELL_M).astype(int) + 1
+    low, high = points.min(axis=0) - MARGIN_M, points.max(axis=0) + MARGIN_M
+    if road_map.region_m is not None:
+        corner = np.array(road_map.region_m[:2])
+        low = corner + np.maximum(np.floor((low - corner) / CELL_M), 0.0) * CELL_M
+        high = np.minimum(high, road_map.region_m[2:])
+    columns, rows = np.ceil((high - low) / CELL_M).astype(int) + 1
     image = np.full((rows, columns), 255, dtype=np.uint8)
     for i in range(len(road_map.drivable)):
         ring = (road_map.drivable[i] - low) / CELL_M * 2**_SUBPIXEL_BITS

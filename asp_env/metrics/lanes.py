@@ -188,6 +188,8 @@ def _crossed(
     if not len(boxes):
         return crossed
     low, high = boxes[:, :2].min(axis=0), boxes[:, 2:].max(axis=0)
+    if road_map.region_m is not None:
+        low, high = np.maximum(low, road_map.region_m[:2]), np.minimum(high, road_map.region_m[2:])
     columns = np.arange(low[0], high[0] + GRID_M, GRID_M)
     for y in np.arange(low[1], high[1] + GRID_M, GRID_M):
         points = np.stack([columns, np.full_like(columns, y)], axis=-1)

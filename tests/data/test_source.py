@@ -34,7 +34,7 @@ def folder(tmp_path: Path, cache_folder: Path) -> Path:
 def reads(monkeypatch: pytest.MonkeyPatch) -> list[str]:
     """The files that are read instead of their cache entries, in order."""
     names: list[str] = []
-    read_levelx, read_lanelet2 = opening.read_levelx, opening.read_lanelet2
+    read_levelx, parse_lanelet2 = opening.read_levelx, opening.parse_lanelet2
 
     def tracks(files):
         names.append(files.tracks.name)
@@ -42,10 +42,10 @@ def reads(monkeypatch: pytest.MonkeyPatch) -> list[str]:
 
     def lanelets(path, origin):
         names.append(path.name)
-        return read_lanelet2(path, origin)
+        return parse_lanelet2(path, origin)
 
     monkeypatch.setattr(opening, "read_levelx", tracks)
-    monkeypatch.setattr(opening, "read_lanelet2", lanelets)
+    monkeypatch.setattr(opening, "parse_lanelet2", lanelets)
     return names
 
 
@@ -69,11 +69,11 @@ def test_recordings_and_maps_are_read_at_first_access(folder: Path, reads: list[
     assert reads == []
     first = recordings[1]
     assert first.name == "01"
-    assert reads == ["location1.osm", "01_tracks.csv"]
+    assert reads == ["01_tracks.csv", "location1.osm"]
     assert recordings[1] is first
     assert recordings[-2] is first
     assert recordings[0].road_map is first.road_map
-    assert reads == ["location1.osm", "01_tracks.csv", "00_tracks.csv"]
+    assert reads == ["01_tracks.csv", "location1.osm", "00_tracks.csv"]
     with pytest.raises(IndexError):
         recordings[3]
 

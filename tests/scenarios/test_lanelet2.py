@@ -5,7 +5,8 @@ from pathlib import Path
 
 import numpy as np
 
-from asp_env.data.readers.lanelet2 import Origin, read_lanelet2
+from asp_env.data.readers.lanelet2 import read_lanelet2
+from asp_env.data.readers.positions import Origin
 from asp_env.data.road_map import LineType, RoadMap
 from scenarios.lanelet2 import Area, Border, Lanelet, Marking, to_degrees, write_map
 

@@ -1,7 +1,7 @@
 """Readers: recordings and maps from the files of published datasets."""
 
 from asp_env.data.readers.interaction import InteractionFiles, read_interaction
-from asp_env.data.readers.lanelet2 import Origin, read_lanelet2
+from asp_env.data.readers.lanelet2 import read_lanelet2
 from asp_env.data.readers.layout import TrackTable
 from asp_env.data.readers.levelx import LevelxFiles, read_levelx
 from asp_env.data.readers.opening import (
@@ -10,6 +10,7 @@ from asp_env.data.readers.opening import (
     content_hash,
     open_recording,
 )
+from asp_env.data.readers.positions import Origin
 
 __all__ = [
     "InteractionFiles",

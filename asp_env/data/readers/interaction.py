@@ -22,7 +22,6 @@ import pandas as pd
 from jaxtyping import Bool, Float, Int
 
 from asp_env.data.classes import FOOTPRINTS_M, VULNERABLE
-from asp_env.data.readers.lanelet2 import Origin
 from asp_env.data.readers.layout import (
     MAP_SUFFIXES,
     TrackTable,
@@ -34,6 +33,7 @@ from asp_env.data.readers.layout import (
     walk,
     with_parents,
 )
+from asp_env.data.readers.positions import Origin
 from asp_env.data.readers.smoothing import (
     JUMP_M,
     count_held,

@@ -9,23 +9,28 @@ head-on or tail to tail more often than in line has swapped bounds, and is rever
 """
 
 import math
-import re
-import xml.etree.ElementTree as ElementTree
-from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Collection, Iterable, Mapping, Sequence
+from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Literal
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
-from pyproj import Transformer
 
 from asp_env.data.readers.layout import shorten
+from asp_env.data.readers.osm import Osm, Relation, Way, read_osm
+from asp_env.data.readers.positions import Origin, complete_ways, locate_nodes
+from asp_env.data.readers.tags import (
+    boolean,
+    limit_texts,
+    sign_mps,
+    speed_mps,
+    two_way,
+    vehicles_allowed,
+)
 from asp_env.data.road_map import LineType, Ragged, RoadMap
 from asp_env.errors import DataError
 from asp_env.geometry import arc_lengths, points_at
-
-SPEED_UNITS = {"": 1 / 3.6, "km/h": 1 / 3.6, "kmh": 1 / 3.6, "m/s": 1.0, "mph": 0.44704}
-"""Units of speed tags in m/s. A number without a unit is in km/h, in Lanelet2 as in OSM."""
 
 VEHICLE_SUBTYPES = frozenset(
     {"", "road", "highway", "bus_lane", "play_street", "emergency_lane", "exit", "entry"}
@@ -36,6 +41,15 @@ lanes, walkways and rails are not included."""
 CROSSED_SUBTYPES = frozenset({"crosswalk"})
 """Subtypes of lanelets that vehicles may drive over, but not along."""
 
+OTHER_SUBTYPES = frozenset(
+    {
+        *("bicycle_lane", "bikelane", "bike_lane", "cycleway", "rail", "train", "tram"),
+        *("walkway", "shared_walkway", "sidewalk", "footway", "pedestrian_lane", "stairs"),
+    }
+)
+"""Subtypes of lanelets that are not for vehicles. Lanelets of any further subtype are roads if
+vehicles drive along them."""
+
 DRIVABLE_AREAS = frozenset({"freespace", "parking"})
 """Subtypes of multipolygons that are part of the drivable area."""
 
@@ -44,75 +58,17 @@ CURB_TYPES = frozenset(
 )
 """Types of ways that become curbs."""
 
-FAR_M = 100_000.0
-"""A map whose median node is farther than this from its recordings' origin belongs to another
-location. Chosen by hand."""
-
 MEETS_WITHIN_M = 0.5
 """Two lanelets that share no nodes are connected if both corners of their ends are within this
 distance. Chosen by hand: above drawing errors, below a lane's width."""
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Origin:
-    """A recording's metric frame: local = UTM(latitude, longitude) - (x, y)."""
-
-    x_m: float
-    y_m: float
-    longitude_deg: float
-    """Longitude of any point of the site. It determines the UTM zone."""
-    latitude_deg: float
-    """Latitude of any point of the site. It determines the hemisphere."""
-
-    @property
-    def epsg(self) -> int:
-        """EPSG code of the UTM zone."""
-        zone = int((self.longitude_deg + 180.0) // 6.0) % 60 + 1
-        return (32600 if self.latitude_deg >= 0 else 32700) + zone
-
-    @classmethod
-    def at(cls, *, latitude_deg: float, longitude_deg: float) -> "Origin":
-        """The frame whose origin is a point on the globe."""
-        utm = cls(x_m=0.0, y_m=0.0, longitude_deg=longitude_deg, latitude_deg=latitude_deg)
-        ((x_m, y_m),) = to_local(np.array([latitude_deg]), np.array([longitude_deg]), utm)
-        return cls(
-            x_m=float(x_m), y_m=float(y_m), longitude_deg=longitude_deg, latitude_deg=latitude_deg
-        )
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Way:
-    """A polyline of nodes."""
-
-    id: str
-    nodes: tuple[str, ...]
-    tags: Mapping[str, str]
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Relation:
-    """A lanelet, an area or a rule that consists of ways."""
-
-    id: str
-    members: tuple[tuple[str, str], ...]
-    """(role, way id) of each member."""
-    tags: Mapping[str, str]
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Osm:
-    """The content of a file. Ways have at least two nodes, all of which exist."""
-
-    nodes: Mapping[str, tuple[float, float]]
-    """(latitude, longitude) in degrees by id, or (x, y) in metres if `local`."""
-    local: bool
-    ways: Mapping[str, Way]
-    relations: tuple[Relation, ...]
-    repairs: tuple[str, ...]
+Use = Literal["along", "over", "not", "unlisted"]
+"""Whether vehicles drive along a lanelet, over it, or neither; `unlisted` if no tag decides it."""
 
 
 @dataclass(slots=True, kw_only=True)
-class _Lanelet:
+class Lanelet:
     """A lanelet whose bounds run in its direction of travel, the left one on the left.
 
     `start` and `end` are the left and the right corner at its two ends.
@@ -120,6 +76,7 @@ class _Lanelet:
 
     id: str
     subtype: str
+    use: Use
     left: Float[np.ndarray, "n 2"]
     right: Float[np.ndarray, "m 2"]
     centre: Float[np.ndarray, "k 2"] | None
@@ -140,87 +97,50 @@ class _Lanelet:
         return np.stack([self.left[-1], self.right[-1]])
 
     @property
+    def course_rad(self) -> float:
+        """Direction from the begin to the end."""
+        x, y = (self.end - self.start).mean(axis=0).tolist()
+        return math.atan2(y, x)
+
+    @property
     def ring(self) -> Float[np.ndarray, "n 2"]:
         return np.concatenate([self.left, self.right[::-1]])
 
 
-def to_local(
-    latitudes_deg: Float[np.ndarray, " n"], longitudes_deg: Float[np.ndarray, " n"], origin: Origin
-) -> Float[np.ndarray, "n 2"]:
-    """Converts latitudes and longitudes to positions (n, 2) in a local frame, metres."""
-    utm = Transformer.from_crs(4326, origin.epsg, always_xy=True)
-    x_m, y_m = utm.transform(longitudes_deg, latitudes_deg)
-    return np.stack([np.asarray(x_m) - origin.x_m, np.asarray(y_m) - origin.y_m], axis=-1)
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Lanelet2File:
+    """The content of a map file, in a recording's frame."""
+
+    path: Path
+    osm: Osm
+    ways: Mapping[str, Way]
+    """Ways with at least two nodes, all of which have a position."""
+    points: Mapping[str, Float[np.ndarray, " 2"]]
+    """Positions of nodes, metres."""
+    lanelets: tuple[Lanelet, ...]
+    areas: tuple[Float[np.ndarray, "_ 2"], ...]
+    """Outer rings of freespace and parking, metres."""
+    repairs: tuple[str, ...]
+
+    @property
+    def unlisted(self) -> list[Lanelet]:
+        """Lanelets of which no tag determines whether they are for vehicles."""
+        return [lanelet for lanelet in self.lanelets if lanelet.use == "unlisted"]
+
+    @property
+    def extent_m(self) -> tuple[float, float, float, float]:
+        """Smallest x and y, largest x and y of all lanelets for vehicles and areas, metres."""
+        uses = ("along", "over", "unlisted")
+        rings = [lanelet.ring for lanelet in self.lanelets if lanelet.use in uses]
+        points = np.concatenate([*rings, *self.areas, np.zeros((0, 2))])
+        if not len(points):
+            return (0.0, 0.0, 0.0, 0.0)
+        low, high = points.min(axis=0), points.max(axis=0)
+        return (float(low[0]), float(low[1]), float(high[0]), float(high[1]))
 
 
-def speed_mps(text: str) -> float | None:
-    """Parses the text of a speed tag, such as `50 km/h` or `30 mph`; None if it is not a speed."""
-    match = re.fullmatch(r"(\d+(?:\.\d+)?)\s*([a-z/]*)", text.strip().lower())
-    if match is None or match[2] not in SPEED_UNITS:
-        return None
-    return float(match[1]) * SPEED_UNITS[match[2]]
-
-
-def read_osm(path: Path) -> Osm:
-    """Reads a map file.
-
-    Of several elements with the same id the first is used; deleted elements are ignored. Nodes of
-    files whose names end in `.osm_xy` are in local metres instead of degrees.
-
-    Raises:
-        DataError: the file is missing or not XML.
-    """
-    nodes: dict[str, tuple[float, float]] = {}
-    raw_ways: dict[str, Way] = {}
-    relations: dict[str, Relation] = {}
-    doubles: list[str] = []
-    local = path.suffix == ".osm_xy"
-    try:
-        for _, element in ElementTree.iterparse(path):
-            if element.tag not in ("node", "way", "relation"):
-                continue
-            number = element.get("id", "")
-            elements = {"node": nodes, "way": raw_ways, "relation": relations}[element.tag]
-            if element.get("action") == "delete" or element.get("visible") == "false":
-                pass
-            elif number in elements:
-                doubles.append(f"{element.tag} {number}")
-            elif element.tag == "node":
-                _add_node(nodes, number, element, ("x", "y") if local else ("lat", "lon"))
-            elif element.tag == "way":
-                raw_ways[number] = _way(number, element)
-            else:
-                relations[number] = _relation(number, element)
-            element.clear()
-    except ElementTree.ParseError as error:
-        raise DataError(
-            f"{path}: is not XML ({error}); expected a lanelet2 map: copy the file again"
-        ) from error
-    except OSError as error:
-        raise DataError(f"{path}: cannot be read: {error.strerror or error}") from error
-    repairs = []
-    if doubles:
-        repairs.append(
-            f"{len(doubles)} ids occur twice, the first element used: {shorten(doubles)}"
-        )
-    ways = _complete(raw_ways, nodes, repairs)
-    return Osm(
-        nodes=nodes,
-        local=local,
-        ways=ways,
-        relations=tuple(relations.values()),
-        repairs=tuple(repairs),
-    )
-
-
-def read_lanelet2(path: Path, origin: Origin) -> RoadMap:
-    """Reads a map into a recording's frame.
-
-    `lines` are the bounds of vehicle lanelets and crosswalks, and all ways that are typed as a curb
-    or barrier. A bound without a type is dashed if two vehicle lanelets share it, and virtual
-    otherwise. `drivable` are vehicle lanelets, crosswalks, and the outer rings of freespace and
-    parking; holes are not cut out. A lane's speed limit is that of its tag `speed_limit` (Lanelet2)
-    or `maxspeed` (OSM).
+def parse_lanelet2(path: Path, origin: Origin) -> Lanelet2File:
+    """Reads the lanelets and areas of a map file.
 
     Args:
         path: the map file.
@@ -236,104 +156,115 @@ def read_lanelet2(path: Path, origin: Origin) -> RoadMap:
             "expected a lanelet2 map: put the right file in its place"
         )
     repairs = list(osm.repairs)
-    points = _points(osm, origin)
-    _check_near(path, osm, points, origin)
-    lanelets = _lanelets(osm, points, repairs)
-    vehicle = [lanelet for lanelet in lanelets if lanelet.subtype in VEHICLE_SUBTYPES]
-    _reverse_swapped(vehicle, repairs)
-    crossed = [lanelet for lanelet in lanelets if lanelet.subtype in CROSSED_SUBTYPES]
-    rings = [lanelet.ring for lanelet in vehicle + crossed] + _areas(osm, points)
-    lines, line_types = _lines(osm, points, vehicle, crossed)
-    if not vehicle:
-        raise DataError(
-            f"{path}: none of its {len(lanelets)} lanelets is for vehicles; "
-            "expected some of subtype 'road': put the right file in its place"
-        )
-    return RoadMap(
-        name=path.stem,
-        lines=Ragged.pack(lines),
-        line_types=np.array(line_types, dtype=np.int64),
-        drivable=Ragged.pack(rings),
-        lanes=Ragged.pack([_centre_line(lanelet) for lanelet in vehicle]),
-        successors=_successors(vehicle),
-        areas=Ragged.pack([lanelet.ring for lanelet in vehicle]),
-        two_way=np.array([lanelet.two_way for lanelet in vehicle]),
-        limits_mps=np.array([lanelet.limit_mps or 0.0 for lanelet in vehicle]),
-        limited=np.array([lanelet.limit_mps is not None for lanelet in vehicle]),
+    points = locate_nodes(osm, origin, repairs)
+    ways = complete_ways(osm.ways.values(), points, repairs)
+    lanelets = _lanelets(osm, ways, points, repairs)
+    return Lanelet2File(
+        path=path,
+        osm=osm,
+        ways=ways,
+        points=points,
+        lanelets=tuple(lanelets),
+        areas=tuple(_areas(osm, ways, points)),
         repairs=tuple(repairs),
     )
 
 
-def _add_node(
-    nodes: dict[str, tuple[float, float]],
-    number: str,
-    element: ElementTree.Element,
-    names: tuple[str, str],
-) -> None:
-    try:
-        nodes[number] = (float(element.get(names[0], "")), float(element.get(names[1], "")))
-    except ValueError:
-        return  # a node without a position counts as missing, and is reported as such
+def make_road_map(
+    content: Lanelet2File,
+    *,
+    region_m: tuple[float, float, float, float] | None = None,
+    driven: Collection[str] = (),
+) -> RoadMap:
+    """Makes the map of a file, or of the part of it that lies in a region.
 
+    `lines` are the bounds of vehicle lanelets and crosswalks, and all ways that are typed as a curb
+    or barrier. A bound without a type is dashed if two vehicle lanelets share it, and virtual
+    otherwise. `drivable` are vehicle lanelets, crosswalks, and the outer rings of freespace and
+    parking; holes are not cut out. A lane's speed limit is that of its regulatory element
+    (`speed_limit`), else of its tag `speed_limit` (Lanelet2), else of `maxspeed` (OSM).
 
-def _tags(element: ElementTree.Element) -> dict[str, str]:
-    return {tag.get("k", ""): tag.get("v", "") for tag in element.iter("tag")}
+    Args:
+        content: the file's content.
+        region_m: smallest x and y, largest x and y of the region. Lanelets, lines and areas
+            outside of it are left out. None: everything is used.
+        driven: ids of the lanelets of unlisted subtypes that are roads.
 
-
-def _way(number: str, element: ElementTree.Element) -> Way:
-    references = tuple(reference.get("ref", "") for reference in element.iter("nd"))
-    return Way(id=number, nodes=references, tags=_tags(element))
-
-
-def _relation(number: str, element: ElementTree.Element) -> Relation:
-    members = tuple(
-        (member.get("role", ""), member.get("ref", ""))
-        for member in element.iter("member")
-        if member.get("type", "way") == "way"
-    )
-    return Relation(id=number, members=members, tags=_tags(element))
-
-
-def _complete(
-    raw_ways: Mapping[str, Way], nodes: Mapping[str, tuple[float, float]], repairs: list[str]
-) -> dict[str, Way]:
-    ways: dict[str, Way] = {}
-    patched: list[str] = []
-    dropped: list[str] = []
-    for way in raw_ways.values():
-        present = tuple(node for node in way.nodes if node in nodes)
-        distinct = tuple(node for i, node in enumerate(present) if i == 0 or node != present[i - 1])
-        if len(distinct) < 2:
-            dropped.append(way.id)
-            continue
-        if len(present) < len(way.nodes):
-            patched.append(way.id)
-        ways[way.id] = Way(id=way.id, nodes=distinct, tags=way.tags)
-    if patched:
-        repairs.append(f"{len(patched)} ways refer to missing nodes: {shorten(patched)}")
-    if dropped:
-        repairs.append(
-            f"{len(dropped)} ways with fewer than two nodes left out: {shorten(dropped)}"
+    Raises:
+        DataError: no lanelet is for vehicles.
+    """
+    repairs = list(content.repairs)
+    uses = {each.id: "along" if each.id in driven else each.use for each in content.lanelets}
+    if "along" not in uses.values():
+        raise DataError(
+            f"{content.path}: none of its {len(content.lanelets)} lanelets is for vehicles; "
+            "expected some of subtype 'road': put the right file in its place"
         )
-    return ways
-
-
-def _points(osm: Osm, origin: Origin) -> dict[str, np.ndarray]:
-    nodes = np.array(list(osm.nodes.values()), dtype=np.float64).reshape(-1, 2)
-    local = nodes if osm.local else to_local(nodes[:, 0], nodes[:, 1], origin)
-    return dict(zip(osm.nodes, local, strict=True))
-
-
-def _check_near(path: Path, osm: Osm, points: Mapping[str, np.ndarray], origin: Origin) -> None:
-    if not points or math.hypot(*np.median(list(points.values()), axis=0)) < FAR_M:
-        return
-    middle = np.median(list(osm.nodes.values()), axis=0)
-    raise DataError(
-        f"{path}: lies at about {middle[0]:.4f}, {middle[1]:.4f}, expected it at its recordings' "
-        f"origin {origin.latitude_deg:.4f}, {origin.longitude_deg:.4f} (degrees; from "
-        "recordingMeta.csv, or meta_data.csv in the tracks' folder): put the right file in its "
-        "place"
+    inside = [each for each in content.lanelets if _reaches(each.ring, region_m)]
+    if len(inside) < len(content.lanelets):
+        repairs.append(
+            f"{len(content.lanelets) - len(inside)} of {len(content.lanelets)} lanelets left out, "
+            "since they are far from all tracks"
+        )
+    _report_subtypes(content, driven, repairs)
+    vehicle = [replace(lanelet) for lanelet in inside if uses[lanelet.id] == "along"]
+    _reverse_swapped(vehicle, repairs)
+    crossed = [lanelet for lanelet in inside if uses[lanelet.id] == "over"]
+    areas = [ring for ring in content.areas if _reaches(ring, region_m)]
+    lines, line_types = _lines(content, region_m, vehicle, crossed)
+    return RoadMap(
+        name=content.path.stem,
+        lines=Ragged.pack(lines),
+        line_types=np.array(line_types, dtype=np.int64),
+        drivable=Ragged.pack([lanelet.ring for lanelet in vehicle + crossed] + areas),
+        lanes=Ragged.pack([_centre_line(lanelet) for lanelet in vehicle]),
+        successors=_successors(vehicle),
+        areas=Ragged.pack([lanelet.ring for lanelet in vehicle]),
+        two_way=np.array([lanelet.two_way for lanelet in vehicle], dtype=bool),
+        limits_mps=np.array([lanelet.limit_mps or 0.0 for lanelet in vehicle], dtype=np.float64),
+        limited=np.array([lanelet.limit_mps is not None for lanelet in vehicle], dtype=bool),
+        region_m=region_m,
+        repairs=tuple(repairs),
     )
+
+
+def read_lanelet2(path: Path, origin: Origin) -> RoadMap:
+    """Reads the whole map of a file into a recording's frame; see `make_road_map`.
+
+    Args:
+        path: the map file.
+        origin: the recording's frame.
+
+    Raises:
+        DataError: the file is not a map, has no lanelets for vehicles, or lies at another location.
+    """
+    return make_road_map(parse_lanelet2(path, origin))
+
+
+def _reaches(
+    points: Float[np.ndarray, "n 2"], region_m: tuple[float, float, float, float] | None
+) -> bool:
+    """Whether the bounding box of points overlaps the region."""
+    if region_m is None:
+        return True
+    low, high = points.min(axis=0), points.max(axis=0)
+    return bool((high >= region_m[:2]).all() and (low <= region_m[2:]).all())
+
+
+def _report_subtypes(content: Lanelet2File, driven: Collection[str], repairs: list[str]) -> None:
+    for chosen, what in (
+        (
+            [each for each in content.unlisted if each.id in driven],
+            "are roads, since vehicles drive along them",
+        ),
+        (
+            [each for each in content.unlisted if each.id not in driven],
+            "left out, since no vehicle drives along them",
+        ),
+    ):
+        if chosen:
+            names = shorten(sorted({each.subtype for each in chosen}))
+            repairs.append(f"{len(chosen)} lanelets of unlisted subtypes ({names}) {what}")
 
 
 def _polyline(way: Way, points: Mapping[str, np.ndarray]) -> Float[np.ndarray, "n 2"]:
@@ -357,9 +288,13 @@ def _join(lines: Sequence[np.ndarray]) -> Float[np.ndarray, "n 2"]:
     return joined[distinct]
 
 
-def _lanelets(osm: Osm, points: Mapping[str, np.ndarray], repairs: list[str]) -> list[_Lanelet]:
-    found: list[_Lanelet] = []
+def _lanelets(
+    osm: Osm, ways: Mapping[str, Way], points: Mapping[str, np.ndarray], repairs: list[str]
+) -> list[Lanelet]:
+    found: list[Lanelet] = []
     broken: list[str] = []
+    rules = _SpeedRules(osm)
+    unknown: dict[str, list[str]] = {}
     for relation in osm.relations:
         if relation.tags.get("type") != "lanelet":
             continue
@@ -368,22 +303,29 @@ def _lanelets(osm: Osm, points: Mapping[str, np.ndarray], repairs: list[str]) ->
             for role in ("left", "right", "centerline")
         }
         present = {
-            role: [osm.ways[way] for way in ways if way in osm.ways] for role, ways in sides.items()
+            role: [ways[way] for way in of_role if way in ways] for role, of_role in sides.items()
         }
         if not (present["left"] and present["right"]):
             broken.append(relation.id)
             continue
-        found.append(_lanelet(relation, present, points))
+        found.append(_lanelet(relation, present, points, rules, unknown))
     if broken:
         repairs.append(
             f"{len(broken)} lanelets without a left or right bound left out: {shorten(broken)}"
         )
+    for what, ids in unknown.items():
+        repairs.append(f"{len(ids)} lanelets {what}: {shorten(ids)}")
+    rules.report(repairs)
     return found
 
 
 def _lanelet(
-    relation: Relation, sides: Mapping[str, Sequence[Way]], points: Mapping[str, np.ndarray]
-) -> _Lanelet:
+    relation: Relation,
+    sides: Mapping[str, Sequence[Way]],
+    points: Mapping[str, np.ndarray],
+    rules: "_SpeedRules",
+    unknown: dict[str, list[str]],
+) -> Lanelet:
     left, right = (
         _join([_polyline(way, points) for way in sides[role]]) for role in ("left", "right")
     )
@@ -396,16 +338,122 @@ def _lanelet(
         centre = _join([_polyline(way, points) for way in sides["centerline"]])
         if _end_distance(centre, left[::-1]) < _end_distance(centre, left):
             centre = centre[::-1]
-    return _Lanelet(
+    subtype = relation.tags.get("subtype", "").strip().lower()
+    use = _use(relation, subtype, unknown)
+    both_ways, understood = two_way(relation.tags)
+    if not understood:
+        unknown.setdefault("with an unknown value of one_way are one-way", []).append(relation.id)
+    return Lanelet(
         id=relation.id,
-        subtype=relation.tags.get("subtype", "").lower(),
+        subtype=subtype,
+        use=use,
         left=left,
         right=right,
         centre=centre,
         way_ids=tuple(way.id for role in ("left", "right") for way in sides[role]),
-        two_way="no" in (relation.tags.get("one_way"), relation.tags.get("oneway")),
-        limit_mps=speed_mps(relation.tags.get("speed_limit", relation.tags.get("maxspeed", ""))),
+        two_way=both_ways,
+        limit_mps=_limit_mps(relation, rules, unknown) if use in ("along", "unlisted") else None,
     )
+
+
+def _use(relation: Relation, subtype: str, unknown: dict[str, list[str]]) -> Use:
+    """How vehicles use a lanelet: by its participants, else by its subtype."""
+    of_subtype: Use = "unlisted"
+    for use, subtypes in (
+        ("along", VEHICLE_SUBTYPES),
+        ("over", CROSSED_SUBTYPES),
+        ("not", OTHER_SUBTYPES),
+    ):
+        if subtype in subtypes:
+            of_subtype = use
+    allowed = vehicles_allowed(relation.tags)
+    if allowed and of_subtype != "along":
+        what = f"of subtype {subtype!r} are roads, since a participant tag allows vehicles"
+        unknown.setdefault(what, []).append(relation.id)
+        return "along"
+    if allowed is False and of_subtype in ("along", "unlisted"):
+        what = (
+            f"of subtype {subtype or 'road'!r} left out, since no participant tag allows vehicles"
+        )
+        unknown.setdefault(what, []).append(relation.id)
+        return "not"
+    return of_subtype
+
+
+def _limit_mps(
+    relation: Relation, rules: "_SpeedRules", unknown: dict[str, list[str]]
+) -> float | None:
+    limit = rules.limit_mps(relation)
+    for text in () if limit is not None else limit_texts(relation.tags):
+        limit = speed_mps(text)
+        if limit is not None:
+            break
+        if text.strip().lower() != "none":
+            what = f"with the unknown speed limit {text!r}, which is not used"
+            unknown.setdefault(what, []).append(relation.id)
+    return limit
+
+
+class _SpeedRules:
+    """Speed limits that regulatory elements give to the lanelets that refer to them."""
+
+    def __init__(self, osm: Osm) -> None:
+        """Finds the elements of subtype `speed_limit` and the lanelets that they refer to."""
+        self._rules: dict[str, float] = {}
+        self._of_lanelet: dict[str, list[str]] = {}
+        self._fallbacks: set[str] = set()
+        self._unused: set[str] = set()
+        self._unknown: list[str] = []
+        self._dynamic: list[str] = []
+        tags_of = {way.id: way.tags for way in osm.ways.values()}
+        for relation in osm.relations:
+            kind = relation.tags.get("type"), relation.tags.get("subtype", "").lower()
+            if kind != ("regulatory_element", "speed_limit"):
+                continue
+            if boolean(relation.tags.get("dynamic", "")):
+                self._dynamic.append(relation.id)
+                continue
+            signs = [
+                tags_of[way].get("subtype", "")
+                for role, way in relation.members
+                if role == "refers" and way in tags_of
+            ]
+            speeds = [sign_mps(text) for text in (*signs, relation.tags.get("sign_type", ""))]
+            known = [speed for speed in speeds if speed is not None]
+            if not known:
+                sign = relation.tags.get("sign_type") or next(iter(signs), "")
+                self._unknown.append(f"{relation.id} ({sign!r})")
+                continue
+            self._rules[relation.id] = known[0]
+            self._unused.add(relation.id)
+            if boolean(relation.tags.get("fallback", "")):
+                self._fallbacks.add(relation.id)
+            for role, lanelet in relation.relations:
+                if role == "refers":
+                    self._of_lanelet.setdefault(lanelet, []).append(relation.id)
+
+    def limit_mps(self, lanelet: Relation) -> float | None:
+        """The limit of the first element of a lanelet that is no fallback, else of the first."""
+        named = [rule for role, rule in lanelet.relations if role == "regulatory_element"]
+        rules = [
+            rule for rule in (*named, *self._of_lanelet.get(lanelet.id, ())) if rule in self._rules
+        ]
+        self._unused.difference_update(rules)
+        first = sorted(rules, key=lambda rule: rule in self._fallbacks)[:1]
+        return self._rules[first[0]] if first else None
+
+    def report(self, repairs: list[str]) -> None:
+        """Adds the elements that are not used."""
+        for ids, why in (
+            (self._unknown, "have no known speed"),
+            (self._dynamic, "are dynamic"),
+            (sorted(self._unused), "belong to no lanelet for vehicles"),
+        ):
+            if ids:
+                repairs.append(
+                    f"{len(ids)} regulatory elements for speed left out, since they {why}: "
+                    f"{shorten(ids)}"
+                )
 
 
 def _end_distance(line: np.ndarray, other: np.ndarray) -> float:
@@ -423,7 +471,7 @@ def _meets(edge: np.ndarray, edges: Float[np.ndarray, "n 2 2"]) -> np.ndarray:
     return (np.hypot(*np.moveaxis(edges - edge, -1, 0)) <= MEETS_WITHIN_M).all(axis=-1)
 
 
-def _reverse_swapped(lanelets: Sequence[_Lanelet], repairs: list[str]) -> None:
+def _reverse_swapped(lanelets: Sequence[Lanelet], repairs: list[str]) -> None:
     """Reverses lanelets with more contradictions than each neighbour that they contradict."""
     swapped: list[str] = []
     while len(swapped) < len(lanelets):
@@ -444,7 +492,7 @@ def _reverse_swapped(lanelets: Sequence[_Lanelet], repairs: list[str]) -> None:
 
 
 def _contradictions(
-    lanelets: Sequence[_Lanelet],
+    lanelets: Sequence[Lanelet],
 ) -> tuple[Int[np.ndarray, " n"], Bool[np.ndarray, "n n"]]:
     """Compares the directions of connected lanelets.
 
@@ -461,7 +509,7 @@ def _contradictions(
     return contradicts.sum(axis=1) - in_line.sum(axis=1), contradicts
 
 
-def _centre_line(lanelet: _Lanelet) -> Float[np.ndarray, "n 2"]:
+def _centre_line(lanelet: Lanelet) -> Float[np.ndarray, "n 2"]:
     if lanelet.centre is not None:
         return lanelet.centre
     left_at, right_at = _arc_shares(lanelet.left), _arc_shares(lanelet.right)
@@ -475,7 +523,7 @@ def _arc_shares(line: Float[np.ndarray, "n 2"]) -> Float[np.ndarray, " n"]:
     return arc / arc[-1] if arc[-1] > 0 else np.linspace(0.0, 1.0, len(line))
 
 
-def _successors(lanelets: Sequence[_Lanelet]) -> Int[np.ndarray, "edges 2"]:
+def _successors(lanelets: Sequence[Lanelet]) -> Int[np.ndarray, "edges 2"]:
     starts = np.array([lanelet.start for lanelet in lanelets]).reshape(-1, 2, 2)
     edges = [
         (number, int(follower))
@@ -486,26 +534,24 @@ def _successors(lanelets: Sequence[_Lanelet]) -> Int[np.ndarray, "edges 2"]:
     return np.array(edges, dtype=np.int64).reshape(-1, 2)
 
 
-def _areas(osm: Osm, points: Mapping[str, np.ndarray]) -> list[np.ndarray]:
+def _areas(osm: Osm, ways: Mapping[str, Way], points: Mapping[str, np.ndarray]) -> list[np.ndarray]:
     rings = []
     for relation in osm.relations:
         if relation.tags.get("type") != "multipolygon":
             continue
         if relation.tags.get("subtype", "").lower() not in DRIVABLE_AREAS:
             continue
-        outer = [
-            osm.ways[way] for role, way in relation.members if role == "outer" and way in osm.ways
-        ]
+        outer = [ways[way] for role, way in relation.members if role == "outer" and way in ways]
         if outer:
             rings.append(_join([_polyline(way, points) for way in outer]))
     return rings
 
 
 def _lines(
-    osm: Osm,
-    points: Mapping[str, np.ndarray],
-    vehicle: Iterable[_Lanelet],
-    crossed: Iterable[_Lanelet],
+    content: Lanelet2File,
+    region_m: tuple[float, float, float, float] | None,
+    vehicle: Iterable[Lanelet],
+    crossed: Iterable[Lanelet],
 ) -> tuple[list[np.ndarray], list[int]]:
     uses: dict[str, int] = {}
     for lanelet in vehicle:
@@ -513,9 +559,13 @@ def _lines(
             uses[way] = uses.get(way, 0) + 1
     bounds = set(uses) | {way for lanelet in crossed for way in lanelet.way_ids}
     lines, types = [], []
-    for way in osm.ways.values():
-        if way.id in bounds or way.tags.get("type") in CURB_TYPES:
-            lines.append(_polyline(way, points))
+    for way in content.ways.values():
+        is_curb = way.tags.get("type") in CURB_TYPES
+        if way.id not in bounds and not is_curb:
+            continue
+        line = _polyline(way, content.points)
+        if way.id in bounds or _reaches(line, region_m):
+            lines.append(line)
             types.append(int(_line_type(way, uses.get(way.id, 0))))
     return lines, types
 

@@ -15,7 +15,6 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from asp_env.data.classes import FOOTPRINTS_M, VULNERABLE
-from asp_env.data.readers.lanelet2 import Origin, read_osm, to_local
 from asp_env.data.readers.layout import (
     COURSE_ABOVE_MPS,
     TrackTable,
@@ -27,6 +26,8 @@ from asp_env.data.readers.layout import (
     walk,
     with_parents,
 )
+from asp_env.data.readers.osm import read_osm
+from asp_env.data.readers.positions import Origin, locate_nodes
 from asp_env.data.readers.tables import Kind, find_line, read_columns, read_table
 from asp_env.errors import DataError
 
@@ -357,12 +358,12 @@ def _maps_near(maps: list[Path], origin: Origin) -> list[Path]:
     found = []
     for path in maps:
         try:
-            degrees = np.array(list(read_osm(path).nodes.values())).reshape(-1, 2)
+            points = locate_nodes(read_osm(path), origin, [])
         except DataError:
             continue
-        if not len(degrees):
+        if not points:
             continue
-        xy = np.median(to_local(degrees[:, 0], degrees[:, 1], origin), axis=0)
+        xy = np.median(list(points.values()), axis=0)
         distance = math.hypot(*xy)
         if distance < NEAR_M:
             found.append((distance, path))

@@ -1,10 +1,11 @@
 """Opening a recording of any layout, from its files or from the cache."""
 
+import functools
 import hashlib
 import struct
 import warnings
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -13,12 +14,20 @@ import numpy as np
 from asp_env.data import cache
 from asp_env.data.readers import interaction, levelx
 from asp_env.data.readers.interaction import InteractionFiles, InteractionMeta, read_interaction
-from asp_env.data.readers.lanelet2 import Origin, read_lanelet2
+from asp_env.data.readers.lanelet2 import Lanelet2File, make_road_map, parse_lanelet2
 from asp_env.data.readers.layout import TrackTable
 from asp_env.data.readers.levelx import LevelxFiles, RecordingMeta, read_levelx
+from asp_env.data.readers.placing import (
+    Box,
+    check_place,
+    driven_lanelets,
+    moving_vehicles,
+    used_region,
+)
+from asp_env.data.readers.positions import Origin
 from asp_env.data.recording import Background, Recording
 from asp_env.data.road_map import Ragged, RoadMap
-from asp_env.errors import DataError
+from asp_env.errors import DataError, RepairWarning
 
 RecordingFiles = LevelxFiles | InteractionFiles
 """The files of one recording, of any layout."""
@@ -29,20 +38,32 @@ Meta = RecordingMeta | InteractionMeta
 CacheEntry = tuple[dict[str, Any], dict[str, np.ndarray]]
 """Facts and arrays, the content of a cache file."""
 
+MapKey = tuple[Path, Origin, Box | None, tuple[str, ...]]
+"""File, frame, region (None: all) and the lanelets of unlisted subtypes that are roads."""
+
 _TRACK_COLUMNS = ("track_ids", "classes", "sizes", "first_frames", "starts", "states")
 _MAP_PARTS = ("lines", "drivable", "lanes", "areas")
 _MAP_COLUMNS = ("line_types", "successors", "two_way", "limits_mps", "limited")
+_NO_MAP = RoadMap(
+    name="",
+    lines=Ragged.pack([]),
+    line_types=np.zeros(0, dtype=np.int64),
+    drivable=Ragged.pack([]),
+    lanes=Ragged.pack([]),
+    successors=np.zeros((0, 2), dtype=np.int64),
+)
+"""Stands for the map until the tracks are read, on which the map depends."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class ReaderState:
-    """Results shared by the recordings of one DATA: a map per location and a search per folder.
+    """Results shared by the recordings of one DATA: maps, and a search per folder.
 
     Keys of recordings are their names.
     """
 
     recordings: dict[str, Recording] = field(default_factory=dict)
-    maps: dict[tuple[Path, Origin], RoadMap] = field(default_factory=dict)
+    maps: dict["MapKey", RoadMap] = field(default_factory=dict)
     places: dict[str, tuple[Meta, Path]] = field(default_factory=dict)
     """Metadata and path of the map of each recording."""
     hashes: dict[str, str] = field(default_factory=dict)
@@ -62,10 +83,9 @@ def open_recording(files: RecordingFiles, state: ReaderState) -> Recording:
     """
     if files.name not in state.recordings:
         meta, map_path = _place(files, state)
-        place = (map_path, meta.origin)
-        recording = _recording(files, meta, state.maps.get(place) or _road_map(*place))
-        state.maps[place] = recording.road_map
-        state.recordings[files.name] = recording
+        recording = _recording(files, meta, _NO_MAP)
+        road_map = _road_map(files, recording, map_path, meta.origin, state)
+        state.recordings[files.name] = replace(recording, road_map=road_map)
     return state.recordings[files.name]
 
 
@@ -161,27 +181,84 @@ def _scale(
     return levelx.metres_per_pixel(files, meta, size, table.states[:, :2]) if size else None
 
 
-def _road_map(path: Path, origin: Origin) -> RoadMap:
-    facts, arrays = _cached(path, [path], lambda: _map_entry(path, origin), origin)
+def _road_map(
+    files: RecordingFiles, recording: Recording, path: Path, origin: Origin, state: ReaderState
+) -> RoadMap:
+    """The map of a recording: what of the file its agents may reach.
+
+    Raises:
+        DataError: the map is damaged, or of another place.
+    """
+    content = functools.cache(lambda: parse_lanelet2(path, origin))
+    facts, survey = _cached(path, [path], lambda: _survey_entry(content()), (origin, "survey"))
+    of_tracks = "place", recording.frame_rate_hz
+    tracks, places = _cached(
+        files.tracks, files.tables, lambda: _places_entry(recording), of_tracks
+    )
+    region_m = used_region(tuple(tracks["extent_m"]), tuple(facts["extent_m"]))
+    rings = Ragged(points=survey["ring_points"], starts=survey["ring_starts"])
+    numbers = driven_lanelets(places["vehicles"], rings, survey["courses_rad"])
+    driven = tuple(facts["ids"][number] for number in numbers)
+    key = (path, origin, region_m, driven)
+    if key not in state.maps:
+        state.maps[key] = _make_map(path, origin, region_m, driven, content)
+        if repairs := state.maps[key].repairs:
+            warnings.warn(
+                f"map {path.name}: {'; '.join(repairs)} (asp-env inspect lists all repairs)",
+                RepairWarning,
+                stacklevel=2,
+            )
+
+    def check() -> CacheEntry:
+        lanes = survey["lane_points"]
+        check_place(path, files.name, places["vehicles"], state.maps[key], lanes)
+        return {}, {}
+
+    _cached(files.tracks, [*files.tables, path], check, (*of_tracks, origin, str(path)))
+    return state.maps[key]
+
+
+def _places_entry(recording: Recording) -> CacheEntry:
+    vehicles = moving_vehicles(recording.classes, recording.starts, recording.states)
+    return {"extent_m": list(recording.extent_m)}, {"vehicles": vehicles}
+
+
+def _survey_entry(content: Lanelet2File) -> CacheEntry:
+    """What has to be known of a map to choose the part of it that a recording uses."""
+    unlisted = content.unlisted
+    rings = Ragged.pack([lanelet.ring for lanelet in unlisted])
+    lanes = [each.ring for each in content.lanelets if each.use in ("along", "unlisted")]
+    facts = {"extent_m": content.extent_m, "ids": [lanelet.id for lanelet in unlisted]}
+    return facts, {
+        "ring_points": rings.points,
+        "ring_starts": rings.starts,
+        "courses_rad": np.array([lanelet.course_rad for lanelet in unlisted], dtype=np.float64),
+        "lane_points": np.concatenate([*lanes, np.zeros((0, 2))]),
+    }
+
+
+def _make_map(
+    path: Path,
+    origin: Origin,
+    region_m: Box | None,
+    driven: tuple[str, ...],
+    content: Callable[[], Lanelet2File],
+) -> RoadMap:
+    def make() -> CacheEntry:
+        road_map = make_road_map(content(), region_m=region_m, driven=driven)
+        arrays = {name: getattr(road_map, name) for name in _MAP_COLUMNS}
+        for name in _MAP_PARTS:
+            ragged = getattr(road_map, name)
+            arrays |= {f"{name}_points": ragged.points, f"{name}_starts": ragged.starts}
+        return {"repairs": list(road_map.repairs)}, arrays
+
+    facts, arrays = _cached(path, [path], make, (origin, region_m, driven))
     parts: dict[str, Any] = {name: arrays[name] for name in _MAP_COLUMNS}
     parts |= {
         name: Ragged(points=arrays[f"{name}_points"], starts=arrays[f"{name}_starts"])
         for name in _MAP_PARTS
     }
-    return RoadMap(
-        name=path.stem,
-        repairs=tuple(facts["repairs"]),
-        **parts,
-    )
-
-
-def _map_entry(path: Path, origin: Origin) -> CacheEntry:
-    road_map = read_lanelet2(path, origin)
-    arrays = {name: getattr(road_map, name) for name in _MAP_COLUMNS}
-    for name in _MAP_PARTS:
-        ragged = getattr(road_map, name)
-        arrays |= {f"{name}_points": ragged.points, f"{name}_starts": ragged.starts}
-    return {"repairs": list(road_map.repairs)}, arrays
+    return RoadMap(name=path.stem, region_m=region_m, repairs=tuple(facts["repairs"]), **parts)
 
 
 def _cached(

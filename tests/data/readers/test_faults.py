@@ -161,6 +161,30 @@ FAULTS = {
     "map that is no XML": (set_map("lat,lon\n1,2\n"), ["location1.osm", "is not XML"]),
     "map that is cut": (set_map("<osm><node id='1'"), ["location1.osm", "is not XML"]),
     "map that is empty": (set_map(""), ["location1.osm", "is not XML"]),
+    "map in an encoding of no text": (
+        set_map("<?xml version='1.0' encoding='base64'?><osm/>"),
+        ["location1.osm", "is not XML", "base64"],
+    ),
+    "map in an encoding of several bytes": (
+        set_map("<?xml version='1.0' encoding='gbk'?><osm/>"),
+        ["location1.osm", "is not XML"],
+    ),
+    "map in an unknown encoding": (
+        set_map("<?xml version='1.0' encoding='none'?><osm/>"),
+        ["location1.osm", "is not XML"],
+    ),
+    "map with entities": (
+        set_map("<!DOCTYPE osm [<!ENTITY a 'x'><!ENTITY b '&a;&a;'>]><osm>&b;</osm>"),
+        ["location1.osm", "declares the XML entity 'a'", "put the right file"],
+    ),
+    "map that names another file": (
+        set_map("<!DOCTYPE osm [<!ENTITY a SYSTEM 'file:///etc/hostname'>]><osm>&a;</osm>"),
+        ["location1.osm", "declares the XML entity 'a'"],
+    ),
+    "map that begins with an unknown entity": (
+        set_map("<!DOCTYPE osm SYSTEM 'other.dtd'><osm>&a;</osm>"),
+        ["location1.osm"],
+    ),
 }
 
 
@@ -186,12 +210,11 @@ def test_a_fault_is_found_despite_a_cached_recording(folder: Path, name: str) ->
         open_data(folder)[0]
 
 
-def test_a_failed_read_caches_no_tracks(folder: Path, tmp_path: Path) -> None:
-    """Only the map may be in the cache."""
+def test_a_failed_read_caches_nothing(folder: Path, tmp_path: Path) -> None:
     FAULTS["half a file"][0](folder)
     with pytest.raises(DataError):
         open_data(folder)[0]
-    assert [path.name[:9] for path in (tmp_path / "cache").iterdir()] == ["location1"]
+    assert not list((tmp_path / "cache").iterdir())
 
 
 @pytest.mark.parametrize("name", ["NaN position", "no recording metadata", "unknown class"])

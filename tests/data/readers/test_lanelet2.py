@@ -10,7 +10,8 @@ import numpy as np
 import pytest
 from hypothesis import given
 
-from asp_env.data.readers.lanelet2 import Origin, read_lanelet2, to_local
+from asp_env.data.readers.lanelet2 import read_lanelet2
+from asp_env.data.readers.positions import Origin, to_local
 from asp_env.data.road_map import LineType, RoadMap
 from asp_env.data.source import open_data
 from tests.data.levelx_files import ORIGIN_M, osm, two_lane_road

@@ -5,7 +5,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from asp_env.data.readers.lanelet2 import Origin, read_lanelet2, speed_mps
+from asp_env.data.readers.lanelet2 import read_lanelet2
+from asp_env.data.readers.positions import Origin
+from asp_env.data.readers.tags import speed_mps
 from asp_env.data.road_map import Ragged, RoadMap
 from asp_env.data.source import open_data
 from asp_env.errors import DataError

@@ -5,7 +5,8 @@ from pathlib import Path
 
 from highway_env.road.road import RoadNetwork
 
-from asp_env.data.readers.lanelet2 import Origin, read_lanelet2
+from asp_env.data.readers.lanelet2 import read_lanelet2
+from asp_env.data.readers.positions import Origin
 from asp_env.data.road_map import RoadMap
 from scenarios.highway.road_map import ORIGIN_LAT_LON_DEG, ORIGIN_UTM_M, write_road_map
 
