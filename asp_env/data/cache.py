@@ -18,7 +18,7 @@ import numpy as np
 from asp_env.errors import AspEnvError, DataError
 from asp_env.files import atomic_file, atomic_folder, remove_stale
 
-FORMAT = 6
+FORMAT = 7
 """Version of the readers. Raise it whenever a reader gives other results for the same files."""
 
 _MAGIC = b"asp-env\0"
