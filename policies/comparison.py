@@ -121,7 +121,7 @@ class HeldOut:
         Raises:
             AspEnvError: none fits.
         """
-        recordings = _recordings(self.data)
+        recordings = _recordings(self.data, dt_s)
         chosen = choose_scenarios(
             recordings, self.scenarios, dt_s=dt_s, history=ticks(HISTORY_S, dt_s)
         )
@@ -129,9 +129,9 @@ class HeldOut:
 
 
 @cache
-def _recordings(data: str) -> Recordings:
+def _recordings(data: str, dt_s: float) -> Recordings:
     """The recordings of held-out data, once per process: what is made of their maps is reused."""
-    return open_data(data)
+    return open_data(data, dt_s=dt_s)
 
 
 Values = dict[str, Float[np.ndarray, " n"]]
@@ -150,7 +150,7 @@ def drive_held_out(planner: Planner, predictor: str, held_out: HeldOut, dt_s: fl
     Raises:
         AspEnvError: no scenario fits, or the predictor does not suit the data.
     """
-    scenarios, recordings = held_out.choose(dt_s), _recordings(held_out.data)
+    scenarios, recordings = held_out.choose(dt_s), _recordings(held_out.data, dt_s)
     world, rules = world_class(held_out.data), find_rules(DEFAULT_RULES)
     settings = EpisodeSettings(
         rules=rules,

@@ -69,7 +69,8 @@ def evaluate_policy(
     chosen = scenarios
     if isinstance(chosen, str):
         history = ticks(HISTORY_S, settings.dt_s)
-        chosen = choose_scenarios(open_data(data), chosen, dt_s=settings.dt_s, history=history)
+        recordings = open_data(data, dt_s=settings.dt_s)
+        chosen = choose_scenarios(recordings, chosen, dt_s=settings.dt_s, history=history)
     if max_scenarios is not None:
         chosen = chosen.evenly_spaced(max_scenarios)
     every: Sequence[Scenario] = list(chosen)

@@ -1,6 +1,7 @@
 """Recordings: the tracks measured at one location, and ticks as a whole number of their frames."""
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
@@ -17,45 +18,110 @@ from asp_env.errors import AspEnvError, DataError
 DEFAULT_DT_S = 0.2
 """Default seconds per tick."""
 
+LEAST_FRAMES_PER_TICK = 0.75
+"""Recordings with fewer frames per tick are refused: most of their ticks would be interpolated.
+Chosen by hand."""
+
+SUGGESTIONS = 5
+"""Number of time steps that an error message lists."""
+
+_TIME_STEPS_S = tuple(
+    0.6 / count for count in (*(1, 2, 3, 4, 5, 6, 8, 10, 12, 15, 20, 24, 30), *(40, 60, 75, 120))
+)
+"""Time steps of which history, horizons and the interval of snippets (multiples of 0.6 s) are whole
+numbers, and which are short decimal fractions."""
+
 PARKED_WITHIN_M = 1.0
 """A track of the whole recording that stays within this distance of its start is parked. Chosen by
 hand: above the noise of measured positions."""
 
 
-def frames_per_tick(frame_rate_hz: float, dt_s: float = DEFAULT_DT_S) -> int:
-    """Number of frames per tick.
+def fits_ticks(frame_rate_hz: float, dt_s: float) -> bool:
+    """Whether a tick is a whole number of frames.
 
     Raises:
-        AspEnvError: `dt_s` is not a whole number of frames; the message lists near ones that are.
+        AspEnvError: a value is not a positive number.
     """
     if not (math.isfinite(frame_rate_hz) and frame_rate_hz > 0):
         raise AspEnvError(f"frame rate {frame_rate_hz} Hz: expected a positive number")
     if not (math.isfinite(dt_s) and dt_s > 0):
         raise AspEnvError(f"time step {dt_s} s: expected a positive number")
     frames = dt_s * frame_rate_hz
-    whole = round(frames)
-    if whole < 1 or abs(frames - whole) > 1e-4 * frames:
-        around = range(max(1, int(frames) - 1), int(frames) + 4)
-        possible = ", ".join(f"{count / frame_rate_hz:.6g}" for count in around)
+    return frames > 0.5 and abs(frames - round(frames)) <= 1e-4 * frames
+
+
+def frames_per_tick(frame_rate_hz: float, dt_s: float = DEFAULT_DT_S) -> int:
+    """Number of frames per tick.
+
+    Raises:
+        AspEnvError: `dt_s` is not a whole number of frames; the message lists near ones that are,
+            and of which 3 s are a whole number.
+    """
+    if fits_ticks(frame_rate_hz, dt_s):
+        return round(dt_s * frame_rate_hz)
+    possible = _near([step for step in _TIME_STEPS_S if fits_ticks(frame_rate_hz, step)], dt_s)
+    remedies = [f"choose one of {possible} s"] if possible else []
+    if frame_rate_hz * dt_s >= LEAST_FRAMES_PER_TICK:
+        remedies.append(f"open the data by open_data(…, dt_s={dt_s:g}), which resamples them")
+    raise AspEnvError(
+        f"time step {dt_s:g} s does not divide recordings of {frame_rate_hz:g} Hz: "
+        + ", or ".join(remedies)
+    )
+
+
+def rate_for_ticks(frame_rate_hz: float, dt_s: float) -> float:
+    """The frame rate at which a recording is read.
+
+    Args:
+        frame_rate_hz: frames per second of the files.
+        dt_s: seconds per tick.
+
+    Returns:
+        `frame_rate_hz` if a tick is a whole number of its frames, else the nearest rate for which
+        it is; of two equally near ones the higher.
+
+    Raises:
+        AspEnvError: the frames are too far apart for the tick, or a value is not a positive number.
+    """
+    if fits_ticks(frame_rate_hz, dt_s):
+        return frame_rate_hz
+    frames = frame_rate_hz * dt_s
+    if frames < LEAST_FRAMES_PER_TICK:
+        least_s = LEAST_FRAMES_PER_TICK / frame_rate_hz
+        possible = _near([step for step in _TIME_STEPS_S if step >= least_s], dt_s)
         raise AspEnvError(
-            f"time step {dt_s:g} s does not divide recordings of {frame_rate_hz:g} Hz: "
-            f"choose one of {possible}, … s"
+            f"time step {dt_s:g} s is too short for recordings of {frame_rate_hz:g} Hz: choose "
+            + (f"one of {possible} s" if possible else f"at least {least_s:g} s")
         )
-    return whole
+    return round(max(1, math.floor(frames + 0.5)) / dt_s, 9)
+
+
+def _near(steps_s: Sequence[float], dt_s: float) -> str:
+    """The time steps that are nearest to one, in increasing order."""
+    nearest = sorted(steps_s, key=lambda step: abs(step - dt_s))[:SUGGESTIONS]
+    return ", ".join(f"{step:g}" for step in sorted(nearest))
 
 
 def ticks(duration_s: float, dt_s: float) -> int:
     """Number of ticks of a duration.
 
     Raises:
-        AspEnvError: the duration is not a whole, positive number of ticks.
+        AspEnvError: the duration is not a whole, positive number of ticks. The message lists near
+            time steps, or near durations if no usual time step divides the duration.
     """
     for what, value_s in (("time step", dt_s), ("duration", duration_s)):
         if not (math.isfinite(value_s) and value_s > 0):
             raise AspEnvError(f"{what} {value_s} s: expected a positive number")
     count = round(duration_s / dt_s)
     if count < 1 or abs(count * dt_s - duration_s) > 1e-6:
-        raise AspEnvError(f"{duration_s:g} s is no whole number of ticks of {dt_s:g} s")
+        if any(math.isclose(dt_s, step) for step in _TIME_STEPS_S):
+            whole = max(math.floor(duration_s / dt_s), 1)
+            choose = f"{whole * dt_s:g} or {(whole + 1) * dt_s:g} s instead"
+        else:
+            choose = f"a time step of {_near(_TIME_STEPS_S, dt_s)} s"
+        raise AspEnvError(
+            f"{duration_s:g} s is no whole number of ticks of {dt_s:g} s: choose {choose}"
+        )
     return count
 
 
@@ -100,6 +166,9 @@ class Recording:
     """Traffic signals; None if the files contain none."""
     repairs: tuple[str, ...] = ()
     """One line for each fault of the files that the reader repaired."""
+    resampled_from_hz: float | None = None
+    """Frames per second of the files if the states are interpolated between their frames; None if
+    not."""
     start_hour: float | None = None
     """Time of day of the first frame, hours after midnight; None where the files give none."""
     weekday: str | None = None

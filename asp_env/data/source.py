@@ -5,6 +5,7 @@ import re
 import warnings
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import replace
+from functools import partial
 from importlib import resources
 from pathlib import Path
 from typing import Any, SupportsIndex, overload
@@ -12,7 +13,7 @@ from typing import Any, SupportsIndex, overload
 from asp_env import registry
 from asp_env.data.readers import interaction, levelx
 from asp_env.data.readers.opening import ReaderState, RecordingFiles, content_hash, open_recording
-from asp_env.data.recording import Recording
+from asp_env.data.recording import DEFAULT_DT_S, Recording
 from asp_env.errors import DataError, unknown_name
 
 _SCHEME = re.compile(r"^([a-z][a-z0-9-]+):(.*)$", re.DOTALL)
@@ -25,6 +26,7 @@ class Recordings(Sequence[Any]):  # not of Recording: run-time checks of its ite
         source: the data as the user named them.
         names: the recordings' ids, such as `00`.
         files: the files of each recording.
+        dt_s: seconds per tick that the recordings are opened for.
     """
 
     def __init__(
@@ -32,6 +34,7 @@ class Recordings(Sequence[Any]):  # not of Recording: run-time checks of its ite
         source: str,
         files: Sequence[RecordingFiles],
         *,
+        dt_s: float = DEFAULT_DT_S,
         opened: ReaderState | None = None,
     ) -> None:
         """Creates the sequence without reading any recording.
@@ -39,12 +42,15 @@ class Recordings(Sequence[Any]):  # not of Recording: run-time checks of its ite
         Args:
             source: the data as the user named them.
             files: the files of each recording.
-            opened: the recordings that are already open.
+            dt_s: seconds per tick. Recordings of which it is no whole number of frames are
+                resampled.
+            opened: the recordings that are already open, for the same `dt_s`.
         """
         self.source = source
         self.names = tuple(each.name for each in files)
         self.files = tuple(files)
-        self._opened = ReaderState() if opened is None else opened
+        self.dt_s = dt_s
+        self._opened = ReaderState(dt_s=dt_s) if opened is None else opened
 
     def __deepcopy__(self, memo: dict[int, Any]) -> "Recordings":
         """Returns the same object, since recordings are immutable."""
@@ -53,7 +59,7 @@ class Recordings(Sequence[Any]):  # not of Recording: run-time checks of its ite
 
     def __reduce__(self) -> tuple[Any, ...]:
         """A copy in another process opens its files again, mapped from the same cache."""
-        return Recordings, (self.source, self.files)
+        return partial(Recordings, dt_s=self.dt_s), (self.source, self.files)
 
     def __len__(self) -> int:
         """Number of recordings."""
@@ -68,6 +74,7 @@ class Recordings(Sequence[Any]):  # not of Recording: run-time checks of its ite
 
         Raises:
             DataError: the recording's files are damaged.
+            AspEnvError: its frames are too far apart for the tick.
         """
         if isinstance(index, slice):
             return self.subset(range(len(self))[index])
@@ -80,7 +87,7 @@ class Recordings(Sequence[Any]):  # not of Recording: run-time checks of its ite
     def subset(self, indices: Iterable[SupportsIndex]) -> "Recordings":
         """The recordings at some indices, sharing those that are open."""
         files = [self.files[index] for index in indices]
-        return Recordings(self.source, files, opened=self._opened)
+        return Recordings(self.source, files, dt_s=self.dt_s, opened=self._opened)
 
     def tracks_path(self, index: SupportsIndex) -> Path:
         """The file with the tracks of one recording; worlds may store more files beside it."""
@@ -94,6 +101,19 @@ class Recordings(Sequence[Any]):  # not of Recording: run-time checks of its ite
         """
         return tuple(content_hash(files, self._opened) for files in self.files)
 
+    def resampled(self) -> dict[str, dict[str, float]]:
+        """The frame rates of the recordings that are open and resampled, for manifests.
+
+        Returns:
+            By name of the recording: the rate of its files as `from_hz`, its own as `to_hz`.
+        """
+        opened = self._opened.recordings
+        return {
+            name: {"from_hz": each.resampled_from_hz, "to_hz": each.frame_rate_hz}
+            for name in self.names
+            if (each := opened.get(name)) and each.resampled_from_hz is not None
+        }
+
     def data_hash(self) -> str:
         """A hash of the content of all recordings, independent of the folder's name.
 
@@ -103,13 +123,17 @@ class Recordings(Sequence[Any]):  # not of Recording: run-time checks of its ite
         return hashlib.sha256("".join(self.hashes()).encode()).hexdigest()
 
 
-def open_data(data: str | Path) -> Recordings:
+def open_data(data: str | Path, *, dt_s: float = DEFAULT_DT_S) -> Recordings:
     """Finds recordings; each is read at its first access.
+
+    Recordings of which a tick is a whole number of frames are read as they are. The others are
+    resampled to the nearest frame rate for which it is.
 
     Args:
         data: a folder with recordings in the inD/rounD layout, the INTERACTION layout, or both;
             `sample:intersection` or `sample:roundabout`; or `scheme:argument` of a registered
             source.
+        dt_s: seconds per tick with which the recordings will be used.
 
     Returns:
         The recordings, sorted by name within each layout.
@@ -136,7 +160,7 @@ def open_data(data: str | Path) -> Recordings:
             f"data {source!r}: two recordings are called {duplicate}, expected unique names; "
             "put each layout in a folder of its own"
         )
-    return Recordings(source, files)
+    return Recordings(source, files, dt_s=dt_s)
 
 
 def join_data(parts: Sequence[Recordings]) -> Recordings:
@@ -147,10 +171,13 @@ def join_data(parts: Sequence[Recordings]) -> Recordings:
             number of their data set, counted from 1 (`2-00`), because names may be equal.
 
     Raises:
-        DataError: a recording is in two of them.
+        DataError: a recording is in two of them, or they are opened for different ticks.
     """
     if len(parts) == 1:
         return parts[0]
+    if len({part.dt_s for part in parts}) > 1:
+        steps = ", ".join(f"{part.source!r}: {part.dt_s:g} s" for part in parts)
+        raise DataError(f"data are opened for different time steps ({steps}), expected equal ones")
     files, found = [], dict[str, str]()
     for number, part in enumerate(parts, start=1):
         for each, content in zip(part.files, part.hashes(), strict=True):
@@ -161,7 +188,7 @@ def join_data(parts: Sequence[Recordings]) -> Recordings:
                 )
             found[content] = part.source
             files.append(replace(each, name=f"{number}-{each.name}"))
-    return Recordings(", ".join(part.source for part in parts), files)
+    return Recordings(", ".join(part.source for part in parts), files, dt_s=parts[0].dt_s)
 
 
 def load(path: str | Path) -> Recordings:

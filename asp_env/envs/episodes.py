@@ -192,7 +192,7 @@ class ReplayEpisodes:
         """
         announce_compilation()
         history = ticks(HISTORY_S, options.dt_s)
-        self.recordings = open_data(data)
+        self.recordings = open_data(data, dt_s=options.dt_s)
         self._sampler = ScenarioSampler.choose(
             self.recordings, options.scenarios, dt_s=options.dt_s, history=history
         )

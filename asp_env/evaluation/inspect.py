@@ -115,16 +115,17 @@ class Inspect:
     data: Annotated[tyro.conf.Positional[str], tyro.conf.arg(metavar="DATA")]
     """Folder in the inD/rounD or INTERACTION layout, or sample:…, synthetic:… or highway:…."""
     dt: float = DEFAULT_DT_S
-    """Duration of a tick in seconds; a whole number of frames."""
+    """Duration of a tick in seconds. Recordings of which it is no
+    whole number of frames are resampled."""
 
     def run(self) -> None:
         """Prints the tables; with faults, those of the recordings that can be read.
 
         Raises:
-            AspEnvError: the data do not exist, some recordings cannot be read, or a tick is no
-                whole number of frames.
+            AspEnvError: the data do not exist, some recordings cannot be read, or a tick is
+                shorter than a frame.
         """
-        recordings = open_data(self.data)
+        recordings = open_data(self.data, dt_s=self.dt)
         console = Console()
         if not console.is_terminal:
             console = Console(width=PIPED_WIDTH)
@@ -160,7 +161,6 @@ class Inspect:
             except DataError as error:
                 faults[recordings.names[number]] = str(error)
                 continue
-            frames_per_tick(recording.frame_rate_hz, self.dt)
             summaries.append(
                 RecordingSummary(
                     recording=recording,
@@ -208,7 +208,8 @@ def _recording_table(data: str, summaries: list[RecordingSummary]) -> Table:
     table = Table(
         title=f"Recordings of {data}",
         title_justify="left",
-        caption="3+3 s, 3+6 s: snippets with a history of 3 s and a horizon of 3 s or 6 s",
+        caption="3+3 s, 3+6 s: snippets with a history of 3 s and a horizon of 3 s or 6 s; Hz in "
+        "parentheses: of the files, where resampled",
         caption_justify="left",
     )
     for name in ("name", "location"):
@@ -226,7 +227,7 @@ def _recording_table(data: str, summaries: list[RecordingSummary]) -> Table:
             recording.name,
             recording.location,
             _start(recording),
-            f"{recording.frame_rate_hz:g}",
+            _rate(recording),
             f"{recording.duration_s:.1f}",
             f"{len(recording.states):,}",
             str(len(recording)),
@@ -257,6 +258,13 @@ def _recording_table(data: str, summaries: list[RecordingSummary]) -> Table:
             "",
         )
     return table
+
+
+def _rate(recording: Recording) -> str:
+    """Frames per second, with those of the files in parentheses where it is resampled."""
+    measured_hz = recording.resampled_from_hz
+    of_files = "" if measured_hz is None else f" ({measured_hz:g})"
+    return f"{recording.frame_rate_hz:g}{of_files}"
 
 
 def _start(recording: Recording) -> str:

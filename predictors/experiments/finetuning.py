@@ -143,7 +143,7 @@ class Study:
         start, _ = folder_and_chaining(name, argument)
         tuning = FineTuning() if options.epochs is None else FineTuning(epochs=options.epochs)
         config = config_from(name, start, tuning)
-        recordings = join_data([open_data(each) for each in options.data])
+        recordings = join_data([open_data(each, dt_s=config.dt_s) for each in options.data])
         index = snippets_of(recordings, config)
         if options.by == "recordings":
             group = index.recording

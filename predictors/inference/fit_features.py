@@ -90,7 +90,7 @@ def add_feature_distance(folder: Path, data: Sequence[str]) -> FeatureDistance:
     predictor = load_trained(spec, str(folder))
     if not data:
         raise AspEnvError("no DATA: expected the validation data of the run")
-    recordings = join_data([open_data(each) for each in data])
+    recordings = join_data([open_data(each, dt_s=predictor.dt_s) for each in data])
     index = index_snippets(
         recordings,
         dt_s=predictor.dt_s,

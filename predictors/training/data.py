@@ -184,11 +184,13 @@ class TrainingData:
     data_hash: str
     validation_hash: str | None
     """Hash of separate validation data, if there are any."""
+    resampled: dict[str, dict[str, float]]
+    """Frame rates of resampled recordings, as of `Recordings.resampled`."""
 
 
-def open_all(data: str | Sequence[str]) -> list[Recordings]:
-    """Opens one or several DATA."""
-    return [open_data(each) for each in ([data] if isinstance(data, str) else data)]
+def open_all(data: str | Sequence[str], *, dt_s: float) -> list[Recordings]:
+    """Opens one or several DATA for ticks of `dt_s` seconds."""
+    return [open_data(each, dt_s=dt_s) for each in ([data] if isinstance(data, str) else data)]
 
 
 def open_training_data(config: TrainingConfig, data: str | Sequence[str]) -> TrainingData:
@@ -201,7 +203,7 @@ def open_training_data(config: TrainingConfig, data: str | Sequence[str]) -> Tra
     Raises:
         AspEnvError: The data are bad, a part is empty, or a recording is in two data sets.
     """
-    opened = open_all(data)
+    opened = open_all(data, dt_s=config.dt_s)
     recordings = join_data(opened)
     index = snippets_of(recordings, config)
     if not config.validation:
@@ -212,7 +214,7 @@ def open_training_data(config: TrainingConfig, data: str | Sequence[str]) -> Tra
         )
         validation_hash = None
     else:
-        separate = join_data(open_all(config.validation))
+        separate = join_data(open_all(config.validation, dt_s=config.dt_s))
         training = DatasetSplit(recordings=recordings, snippets=index)
         validation = DatasetSplit(recordings=separate, snippets=snippets_of(separate, config))
         trained_on = _separate_parts(recordings, separate)
@@ -229,6 +231,7 @@ def open_training_data(config: TrainingConfig, data: str | Sequence[str]) -> Tra
         trained_on=trained_on,
         data_hash=recordings.data_hash(),
         validation_hash=validation_hash,
+        resampled=recordings.resampled(),
     )
 
 

@@ -215,6 +215,7 @@ def fine_tune_on(
             provenance={
                 "config": dataclasses.asdict(config),
                 "data_hash": data.data_hash,
+                **({"resampled": data.resampled} if data.resampled else {}),
                 "start": weights_hash(start),
                 "fine_tuning": {
                     "mix": list(mix),
@@ -329,7 +330,7 @@ def _with_mix(
     """The training snippets followed by those of other data, if there are any."""
     if not mix:
         return training, None
-    other = join_data(open_all(mix))
+    other = join_data(open_all(mix, dt_s=config.dt_s))
     chosen = choose_snippets(
         other,
         snippets_of(other, config),

@@ -115,6 +115,8 @@ def train_on(
     run = {"config": dataclasses.asdict(config), "data_hash": chosen.data_hash}
     if chosen.validation_hash is not None:
         run["validation_hash"] = chosen.validation_hash
+    if chosen.resampled:
+        run["resampled"] = chosen.resampled
     spec: PredictorSpec = registry.find("predictors", config.predictor)
     history = ticks(config.history_s, config.dt_s)
     view = with_history(make_view(config.view, pixels=config.pixels), history)
@@ -270,7 +272,7 @@ def _check_first_stage(
     provenance = read_config(stage).get("provenance", {})
     expected = {
         "config": json.loads(json.dumps(dataclasses.asdict(config))),
-        "data_hash": join_data(open_all(data)).data_hash(),
+        "data_hash": join_data(open_all(data, dt_s=config.dt_s)).data_hash(),
         "start": None if start is None else file_hash(start),
     }
     if other := [name for name, value in expected.items() if provenance.get(name) != value]:

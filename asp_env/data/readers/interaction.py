@@ -14,7 +14,7 @@ read: they may count frames that were left out.
 import itertools
 import re
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -34,6 +34,17 @@ from asp_env.data.readers.layout import (
     with_parents,
 )
 from asp_env.data.readers.positions import Origin
+from asp_env.data.readers.ranges import (
+    HEADING_RAD,
+    POSITION,
+    SIZE,
+    SPEED,
+    TIME_MS,
+    Limit,
+    check_duration,
+    check_extent,
+)
+from asp_env.data.readers.resampling import at_times, frames_within
 from asp_env.data.readers.smoothing import (
     JUMP_M,
     count_held,
@@ -41,7 +52,14 @@ from asp_env.data.readers.smoothing import (
     follow_heading,
     smooth,
 )
-from asp_env.data.readers.tables import Clock, Kind, find_line, read_clock, read_columns
+from asp_env.data.readers.tables import (
+    Clock,
+    Kind,
+    find_line,
+    number_ids,
+    read_clock,
+    read_columns,
+)
 from asp_env.dynamics.bicycle import AXLE_SHARE_OF_LENGTH
 from asp_env.errors import DataError
 
@@ -70,7 +88,7 @@ _META_COLUMNS: dict[str, Kind] = {
 }
 _OPTIONAL_META = frozenset({"speedLimit_kmh", "locationId"})
 _TRACKS: Mapping[str, Kind] = {
-    "track_id": "whole",
+    "track_id": "id",
     "timestamp_ms": "number",
     "agent_type": "text",
     "x": "number",
@@ -80,6 +98,15 @@ _TRACKS: Mapping[str, Kind] = {
     "width": "number",
 }
 _OPTIONAL_TRACKS = frozenset({"psi_rad", "length", "width"})
+_LIMITS: Mapping[str, Limit] = {
+    "timestamp_ms": TIME_MS,
+    "x": POSITION,
+    "y": POSITION,
+    "psi_rad": HEADING_RAD,
+    "length": SIZE,
+    "width": SIZE,
+    "speedLimit_kmh": Limit(largest=SPEED.largest * KMH_PER_MPS, unit="km/h"),
+}
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -145,6 +172,8 @@ class _Rows:
     """Length and width; 0 where the file has none."""
     sources: Mapping[int, tuple[Path, object]]
     """For tracks with new ids: their file and their id in it."""
+    repairs: list[str]
+    """A line if the ids of vehicles are new, too."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -203,7 +232,7 @@ def read_meta(files: InteractionFiles) -> InteractionMeta:
         return InteractionMeta(
             location=files.location, location_id=folder, speed_limit_mps=None, origin=origin
         )
-    for chunk in read_columns(files.meta, _META_COLUMNS, optional=_OPTIONAL_META):
+    for chunk in read_columns(files.meta, _META_COLUMNS, optional=_OPTIONAL_META, limits=_LIMITS):
         for row, number in enumerate(chunk["id"]):
             if _same_number(str(number), files.number):
                 limit_kmh = float(chunk["speedLimit_kmh"][row]) if "speedLimit_kmh" in chunk else 0
@@ -274,8 +303,14 @@ def read_interaction(files: InteractionFiles) -> tuple[TrackTable, float]:
         DataError: a file is damaged, or no frame rate fits its times.
     """
     rows = _read(files)
+    check_extent(rows.positions, ("x", "y"), lambda row: _located(files, rows, row, ""))
     clock = read_clock(rows.track, rows.time_ms, lambda row, what: _located(files, rows, row, what))
-    repairs: list[str] = []
+    check_duration(clock.frames, lambda row: _located(files, rows, row, ""))
+    repairs = list(rows.repairs)
+    resampled_from_hz = None
+    if clock.jittering is not None:
+        resampled_from_hz = clock.mean_hz
+        rows, clock = _without_jitter(rows, clock, repairs)
     pieces = _pieces(rows, clock, repairs)
     if not pieces:
         raise DataError(
@@ -302,6 +337,7 @@ def read_interaction(files: InteractionFiles) -> tuple[TrackTable, float]:
         starts=starts,
         states=states,
         repairs=tuple(repairs),
+        resampled_from_hz=resampled_from_hz,
     )
     return table, clock.rate_hz
 
@@ -322,13 +358,17 @@ def _same_number(one: str, other: str) -> bool:
 
 def _read(files: InteractionFiles) -> _Rows:
     vehicles = _columns(files.tracks, _TRACKS)
-    sources: dict[int, tuple[Path, object]] = {}
+    numbered = number_ids(vehicles["track_id"])
+    vehicles["track_id"] = numbered.columns[0]
+    sources: dict[int, tuple[Path, object]] = {
+        number: (files.tracks, name) for number, name in enumerate(numbered.originals or ())
+    }
     tables = [vehicles]
     if files.pedestrians:
         pedestrians = _columns(files.pedestrians, {**_TRACKS, "track_id": "text"})
         codes, ids = pd.factorize(pedestrians["track_id"])
         first = int(vehicles["track_id"].max()) + 1
-        sources = {first + code: (files.pedestrians, name) for code, name in enumerate(ids)}
+        sources |= {first + code: (files.pedestrians, name) for code, name in enumerate(ids)}
         tables.append({**pedestrians, "track_id": first + codes})
     all_rows = {name: np.concatenate([table[name] for table in tables]) for name in vehicles}
     order = np.lexsort((all_rows["timestamp_ms"], all_rows["track_id"]))
@@ -341,6 +381,7 @@ def _read(files: InteractionFiles) -> _Rows:
         heading=columns["psi_rad"],
         sizes=np.stack([columns["length"], columns["width"]], axis=-1),
         sources=sources,
+        repairs=numbered.repairs,
     )
     same = (np.diff(rows.track) == 0) & (np.diff(rows.time_ms) == 0)
     if same.any():
@@ -356,7 +397,7 @@ def _columns(path: Path, columns: Mapping[str, Kind]) -> dict[str, np.ndarray]:
     """Columns of a file, with agent types as classes and missing columns as unknown values."""
     chunks: dict[str, list[np.ndarray]] = {name: [] for name in columns}
     unknown = {"psi_rad": np.nan, "length": 0.0, "width": 0.0}
-    for chunk in read_columns(path, columns, optional=_OPTIONAL_TRACKS):
+    for chunk in read_columns(path, columns, optional=_OPTIONAL_TRACKS, limits=_LIMITS):
         chunk["agent_type"] = classes_of(path, "agent_type", chunk["agent_type"])
         for name, cells in chunks.items():
             cells.append(chunk.get(name, np.full(len(chunk["x"]), unknown.get(name))))
@@ -407,6 +448,38 @@ def _pieces(rows: _Rows, clock: Clock, repairs: list[str]) -> list[_Piece]:
     _report_tracks(held, "tracks repeat their first position, repeated rows left out", repairs)
     _report_tracks(short, f"tracks have pieces under {MIN_PIECE_S:g} s, these left out", repairs)
     return pieces + later
+
+
+def _without_jitter(rows: _Rows, clock: Clock, repairs: list[str]) -> tuple[_Rows, Clock]:
+    """Rows at whole frames, from rows whose times jitter; tracks have the same gaps as before."""
+    assert clock.jittering is not None
+    begin_ms = float(rows.time_ms.min())
+    nearest, positions, frames = [], [], []
+    after = (np.diff(rows.track) != 0) | (np.diff(clock.frames) > 1)
+    for first, end in _stretches(after):
+        times = clock.jittering[first:end]
+        wanted = frames_within(times)
+        frames.append(wanted)
+        positions.append(at_times(rows.positions[first:end], times, wanted.astype(np.float64)))
+        middles = 0.5 * (times[1:] + times[:-1])
+        nearest.append(first + np.searchsorted(middles, wanted))
+    row = np.concatenate(nearest)
+    frame = np.concatenate(frames)
+    off_ms = 1000.0 / clock.rate_hz * np.abs(clock.jittering - np.round(clock.jittering)).max()
+    repairs.append(
+        f"timestamp_ms is up to {off_ms:.3g} ms off frames of {clock.rate_hz:g} Hz: positions "
+        "interpolated at these frames"
+    )
+    on_frames = replace(
+        rows,
+        track=rows.track[row],
+        time_ms=begin_ms + frame * 1000.0 / clock.rate_hz,
+        kind=rows.kind[row],
+        positions=np.concatenate(positions),
+        heading=rows.heading[row],
+        sizes=rows.sizes[row],
+    )
+    return on_frames, replace(clock, frames=frame, jittering=None)
 
 
 def _stretches(ends_after: Bool[np.ndarray, " steps"]) -> list[tuple[int, int]]:

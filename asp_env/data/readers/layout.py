@@ -40,6 +40,10 @@ class TrackTable:
     """One line for each kind of repair."""
     accelerations: Float[np.ndarray, " rows"] | None = None
     """Accelerations along the direction of motion, m/s²; None if the files have none."""
+    frames_per_row: int = 1
+    """Frames of the files from one row of a track to the next."""
+    resampled_from_hz: float | None = None
+    """Frames per second of the files where the rows are interpolated; None where they are not."""
 
 
 def walk(root: Path) -> list[tuple[Path, list[str]]]:

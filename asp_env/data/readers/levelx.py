@@ -8,7 +8,7 @@ for each recording, not for each location: the origin differs between recordings
 import math
 import re
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -28,7 +28,27 @@ from asp_env.data.readers.layout import (
 )
 from asp_env.data.readers.osm import read_osm
 from asp_env.data.readers.positions import Origin, locate_nodes
-from asp_env.data.readers.tables import Kind, find_line, read_columns, read_table
+from asp_env.data.readers.ranges import (
+    ACCELERATION,
+    HEADING_DEG,
+    MAX_FRAMES,
+    POSITION,
+    SIZE,
+    SPEED,
+    Limit,
+    check_duration,
+    check_extent,
+)
+from asp_env.data.readers.tables import (
+    HIGHEST_HZ,
+    LOWEST_HZ,
+    Kind,
+    NumberedIds,
+    find_line,
+    number_ids,
+    read_columns,
+    read_table,
+)
 from asp_env.errors import DataError
 
 CONSTRUCTION_RECORDINGS = frozenset(range(11, 18))
@@ -52,7 +72,7 @@ Chosen by hand."""
 _PART = re.compile(r"^(.+)_(recordingMeta\.csv|tracksMeta\.csv|tracks\.csv(?:\.gz)?)$")
 _TIME = re.compile(r"^(\d{1,2}(?:\.\d*)?)(?::([0-5]\d)(?::[0-5]\d)?)?$")
 _META: Mapping[str, Kind] = {
-    "trackId": "whole",
+    "trackId": "id",
     "initialFrame": "whole",
     "finalFrame": "whole",
     "width": "number",
@@ -60,7 +80,7 @@ _META: Mapping[str, Kind] = {
     "class": "text",
 }
 _TRACKS: Mapping[str, Kind] = {
-    "trackId": "whole",
+    "trackId": "id",
     "frame": "whole",
     "xCenter": "number",
     "yCenter": "number",
@@ -72,6 +92,20 @@ _TRACKS: Mapping[str, Kind] = {
 }
 _ACCELERATIONS = ("xAcceleration", "yAcceleration", "lonAcceleration")
 _MEASURED = ("xCenter", "yCenter", "heading", "xVelocity", "yVelocity")
+_LIMITS: Mapping[str, Limit] = {
+    "xCenter": POSITION,
+    "yCenter": POSITION,
+    "heading": HEADING_DEG,
+    "xVelocity": SPEED,
+    "yVelocity": SPEED,
+    "width": SIZE,
+    "length": SIZE,
+    **dict.fromkeys(_ACCELERATIONS, ACCELERATION),
+    "xUtmOrigin": POSITION,
+    "yUtmOrigin": POSITION,
+    "latLocation": Limit(largest=90.0, unit="degrees"),
+    "lonLocation": Limit(largest=180.0, unit="degrees"),
+}
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -180,15 +214,18 @@ def read_recording_meta(path: Path) -> RecordingMeta:
             **dict.fromkeys(needed[2:], "number"),
             **dict.fromkeys(("latLocation", "lonLocation"), "number"),
         },
+        limits=_LIMITS,
     )
     rate = float(table["frameRate"][0])
-    if rate <= 0:
-        raise DataError(f"{path}, line 2: frameRate is {rate:g}, expected a positive number of Hz")
+    if not LOWEST_HZ <= rate <= HIGHEST_HZ:
+        raise DataError(
+            f"{path}, line 2: frameRate is {rate:g}, expected {LOWEST_HZ:g} to {HIGHEST_HZ:g} Hz"
+        )
     return RecordingMeta(
         number=int(table["recordingId"][0]),
         location=int(table["locationId"][0]),
         frame_rate_hz=rate,
-        speed_limit_mps=_positive_or_none(path, "speedLimit"),
+        speed_limit_mps=_speed_limit(path),
         metres_per_ortho_pixel=_positive_or_none(path, "orthoPxToMeter"),
         origin=Origin(
             x_m=float(table["xUtmOrigin"][0]),
@@ -288,14 +325,19 @@ def read_levelx(files: LevelxFiles) -> TrackTable:
     Raises:
         DataError: a file is damaged, or the two tables list different tracks.
     """
-    meta = read_table(files.tracks_meta, _META)
-    _check_unique(files, meta["trackId"])
-    order = np.argsort(meta["trackId"])
-    ids = meta["trackId"][order]
+    meta = read_table(files.tracks_meta, _META, limits=_LIMITS)
+    rows, numbered = _read_rows(files, meta["trackId"])
+    ids_in_meta = numbered.columns[1]
+    _check_unique(files, ids_in_meta, numbered)
+    order = np.argsort(ids_in_meta)
+    ids = ids_in_meta[order]
     classes = classes_of(files.tracks_meta, "class", meta["class"])[order]
-    rows = _read_rows(files)
-    _check_same_tracks(files, rows, ids)
-    repairs: list[str] = []
+    _check_same_tracks(files, rows, ids, numbered)
+    check_extent(
+        rows.measured[:, :2], ("xCenter", "yCenter"), lambda row: _line(files, rows, row, numbered)
+    )
+    repairs = numbered.repairs
+    rows, step = _count_frames(files, rows, meta, numbered, repairs)
     begins = np.flatnonzero(np.diff(rows.track, prepend=rows.track[0] - 1))
     _compare_frames(rows, begins, meta, order, repairs)
     sizes = _sizes(rows.sizes[begins], meta, order, classes)
@@ -321,6 +363,7 @@ def read_levelx(files: LevelxFiles) -> TrackTable:
         starts=np.concatenate([[0], np.cumsum(lengths[by_id])]).astype(np.int64),
         states=states,
         accelerations=accelerations,
+        frames_per_row=step,
         repairs=tuple(repairs),
     )
 
@@ -379,6 +422,16 @@ def _positive_or_none(path: Path, column: str) -> float | None:
     return value if value > 0 else None
 
 
+def _speed_limit(path: Path) -> float | None:
+    limit = _positive_or_none(path, "speedLimit")
+    if limit is not None and limit > SPEED.largest:
+        raise DataError(
+            f"{path}, line 2: speedLimit is {limit:g}, expected at most {SPEED.largest:g} m/s, or "
+            "-1 for none: correct the cell"
+        )
+    return limit
+
+
 def _text_or_none(path: Path, column: str) -> str | None:
     """The cell of an optional column, without spaces around it; None if it is empty."""
     try:
@@ -396,10 +449,12 @@ def _hour(text: str | None) -> float | None:
     return hour if hour < 24 else None
 
 
-def _check_unique(files: LevelxFiles, ids: Int[np.ndarray, " metas"]) -> None:
+def _check_unique(
+    files: LevelxFiles, ids: Int[np.ndarray, " metas"], numbered: NumberedIds
+) -> None:
     values, counts = np.unique(ids, return_counts=True)
     if len(values) < len(ids):
-        double = int(values[counts > 1][0])
+        double = numbered.original(int(values[counts > 1][0]))
         line = find_line(files.tracks_meta, {"trackId": double}, occurrence=2)
         raise DataError(
             f"{files.tracks_meta}, line {line}: track {double} is listed twice, expected once; "
@@ -407,13 +462,14 @@ def _check_unique(files: LevelxFiles, ids: Int[np.ndarray, " metas"]) -> None:
         )
 
 
-def _read_rows(files: LevelxFiles) -> _Rows:
+def _read_rows(files: LevelxFiles, ids_in_meta: np.ndarray) -> tuple[_Rows, NumberedIds]:
+    """The rows, and the ids of tracks; the second column of the ids is `ids_in_meta`."""
     track, frame, measured, sizes, accelerations = [], [], [], [], []
     columns: dict[str, Kind] = {**_TRACKS, **dict.fromkeys(_ACCELERATIONS, "number")}
     optional = frozenset({"width", "length", *_ACCELERATIONS})
-    for chunk in read_columns(files.tracks, columns, optional=optional):
-        track.append(chunk["trackId"].astype(np.int32))
-        frame.append(chunk["frame"].astype(np.int32))
+    for chunk in read_columns(files.tracks, columns, optional=optional, limits=_LIMITS):
+        track.append(chunk["trackId"])
+        frame.append(chunk["frame"])
         measured.append(np.stack([chunk[name] for name in _MEASURED], axis=-1).astype(np.float32))
         unknown = np.zeros(len(chunk["frame"]))
         size = [chunk.get("length", unknown), chunk.get("width", unknown)]
@@ -422,17 +478,18 @@ def _read_rows(files: LevelxFiles) -> _Rows:
             missing = np.full(len(chunk["frame"]), np.nan)
             found = [chunk.get(name, missing) for name in _ACCELERATIONS]
             accelerations.append(np.stack(found, axis=-1).astype(np.float32))
+    numbered = number_ids(np.concatenate(track), ids_in_meta)
     rows = _Rows(
-        track=np.concatenate(track),
+        track=numbered.columns[0],
         frame=np.concatenate(frame),
         measured=np.concatenate(measured),
         sizes=np.concatenate(sizes),
         accelerations=np.concatenate(accelerations) if accelerations else None,
     )
-    return _sorted(files, rows)
+    return _sorted(files, rows, numbered), numbered
 
 
-def _sorted(files: LevelxFiles, rows: _Rows) -> _Rows:
+def _sorted(files: LevelxFiles, rows: _Rows, numbered: NumberedIds) -> _Rows:
     step, later = np.diff(rows.track), np.diff(rows.frame)
     if not ((step > 0) | ((step == 0) & (later > 0))).all():
         order = np.lexsort((rows.frame, rows.track))
@@ -446,11 +503,10 @@ def _sorted(files: LevelxFiles, rows: _Rows) -> _Rows:
         same = (np.diff(rows.track) == 0) & (np.diff(rows.frame) == 0)
         if same.any():
             row = int(same.argmax())
-            values = {"trackId": int(rows.track[row]), "frame": int(rows.frame[row])}
-            line = find_line(files.tracks, values, occurrence=2)
             raise DataError(
-                f"{files.tracks}, line {line}: a second row for track {values['trackId']} at frame "
-                f"{values['frame']}, expected one; remove one of the two"
+                f"{_line(files, rows, row, numbered, occurrence=2)}: a second row for track "
+                f"{numbered.original(int(rows.track[row]))} at frame {rows.frame[row]}, expected "
+                "one; remove one of the two"
             )
     if rows.frame.min() < 0:
         first = int(rows.frame.min())
@@ -459,22 +515,80 @@ def _sorted(files: LevelxFiles, rows: _Rows) -> _Rows:
     return rows
 
 
-def _check_same_tracks(files: LevelxFiles, rows: _Rows, ids: Int[np.ndarray, " metas"]) -> None:
+def _line(
+    files: LevelxFiles, rows: _Rows, row: int, numbered: NumberedIds, *, occurrence: int = 1
+) -> str:
+    """File and line of a row, with frames as in the file."""
+    cells = {"trackId": numbered.original(int(rows.track[row])), "frame": int(rows.frame[row])}
+    return f"{files.tracks}, line {find_line(files.tracks, cells, occurrence=occurrence)}"
+
+
+def _count_frames(
+    files: LevelxFiles,
+    rows: _Rows,
+    meta: dict[str, np.ndarray],
+    numbered: NumberedIds,
+    repairs: list[str],
+) -> tuple[_Rows, int]:
+    """Rows with frames that count rows of a track, and the frames of the file per row.
+
+    Frames beyond `MAX_FRAMES`, such as time stamps, count from the first row. Frames in
+    milliseconds are converted by the frame rate. Where all tracks have only every n-th frame, these
+    are counted. The frames in `meta` are converted likewise.
+    """
+    names = ("initialFrame", "finalFrame")
+    frames = {"frame": rows.frame, **{name: meta[name] for name in names}}
+    first = int(rows.frame.min())
+    if int(rows.frame.max()) >= MAX_FRAMES:
+        check_duration(rows.frame, lambda row: _line(files, rows, row, numbered))
+        frames = {name: column - first for name, column in frames.items()}
+        repairs.append(f"frames begin at {first}: counted from there")
+    steps = np.diff(rows.frame)[np.diff(rows.track) == 0]
+    usual = int(np.median(steps)) if len(steps) else 1
+    step = 1
+    if usual > 1:
+        rate_hz = read_recording_meta(files.recording_meta).frame_rate_hz
+        if abs(usual - 1000.0 / rate_hz) <= 1.0:
+            frames = {
+                name: np.round(column * (rate_hz / 1000.0)).astype(np.int64)
+                for name, column in frames.items()
+            }
+            repairs.append(f"frames count milliseconds: converted to frames of {rate_hz:g} Hz")
+        elif not ((rows.frame - first) % usual).any() and rate_hz / usual >= LOWEST_HZ:
+            step = usual
+            frames = {name: column // step for name, column in frames.items()}
+            repairs.append(f"rows have every {step}th frame of {rate_hz:g} Hz: these are counted")
+    meta |= {name: frames[name] for name in names}
+    same = (np.diff(rows.track) == 0) & (np.diff(frames["frame"]) == 0)
+    if same.any():
+        row = int(same.argmax()) + 1
+        raise DataError(
+            f"{_line(files, rows, row, numbered)}: frame is {rows.frame[row]}, less than a frame "
+            "after the row before; expected steps as between most rows: remove one of the two"
+        )
+    return replace(rows, frame=frames["frame"]), step
+
+
+def _check_same_tracks(
+    files: LevelxFiles, rows: _Rows, ids: Int[np.ndarray, " metas"], numbered: NumberedIds
+) -> None:
     present = np.unique(rows.track)
     unlisted = np.setdiff1d(present, ids)
     if len(unlisted):
-        line = find_line(files.tracks, {"trackId": int(unlisted[0])})
+        track = numbered.original(int(unlisted[0]))
+        line = find_line(files.tracks, {"trackId": track})
         raise DataError(
-            f"{files.tracks}, line {line}: track {unlisted[0]} is not in "
+            f"{files.tracks}, line {line}: track {track} is not in "
             f"{files.tracks_meta.name}, expected all tracks there; "
             "the files belong to different recordings or are damaged"
         )
     absent = np.setdiff1d(ids, present)
     if len(absent):
-        line = find_line(files.tracks_meta, {"trackId": int(absent[0])})
+        track = numbered.original(int(absent[0]))
+        line = find_line(files.tracks_meta, {"trackId": track})
         raise DataError(
             f"{files.tracks}: has no row for {len(absent)} tracks of {files.tracks_meta.name}, "
-            f"the first of which is {absent[0]} (line {line} there); the file is truncated: "
+            f"the first of which is {track} (line {line} there); the file is truncated: "
             "copy it again"
         )
 

@@ -25,7 +25,8 @@ from asp_env.data.readers.placing import (
     used_region,
 )
 from asp_env.data.readers.positions import Origin
-from asp_env.data.recording import Background, Recording
+from asp_env.data.readers.resampling import resample
+from asp_env.data.recording import DEFAULT_DT_S, Background, Recording, rate_for_ticks
 from asp_env.data.road_map import Ragged, RoadMap
 from asp_env.errors import DataError, RepairWarning
 
@@ -62,6 +63,8 @@ class ReaderState:
     Keys of recordings are their names.
     """
 
+    dt_s: float = DEFAULT_DT_S
+    """Seconds per tick. Recordings whose rate does not fit are resampled."""
     recordings: dict[str, Recording] = field(default_factory=dict)
     maps: dict["MapKey", RoadMap] = field(default_factory=dict)
     places: dict[str, tuple[Meta, Path]] = field(default_factory=dict)
@@ -80,10 +83,11 @@ def open_recording(files: RecordingFiles, state: ReaderState) -> Recording:
 
     Raises:
         DataError: its files are damaged.
+        AspEnvError: its frames are too far apart for the tick.
     """
     if files.name not in state.recordings:
         meta, map_path = _place(files, state)
-        recording = _recording(files, meta, _NO_MAP)
+        recording = _recording(files, meta, _NO_MAP, state.dt_s)
         road_map = _road_map(files, recording, map_path, meta.origin, state)
         state.recordings[files.name] = replace(recording, road_map=road_map)
     return state.recordings[files.name]
@@ -125,9 +129,19 @@ def _place(files: RecordingFiles, state: ReaderState) -> tuple[Meta, Path]:
     return state.places[files.name]
 
 
-def _recording(files: RecordingFiles, meta: Meta, road_map: RoadMap) -> Recording:
+def _recording(files: RecordingFiles, meta: Meta, road_map: RoadMap, dt_s: float) -> Recording:
     sources = [*files.tables, *([files.background] if files.background else [])]
     facts, arrays = _cached(files.tracks, sources, lambda: _track_entry(files, meta), "tracks")
+    rate_hz = facts["frame_rate_hz"]
+    fitting_hz = rate_for_ticks(rate_hz, dt_s)
+    if fitting_hz != rate_hz:
+        measured = facts, arrays
+        facts, arrays = _cached(
+            files.tracks,
+            sources,
+            lambda: _resampled(files, *measured, fitting_hz),
+            ("tracks", fitting_hz),
+        )
     scale = facts["metres_per_pixel"]
     columns: dict[str, Any] = arrays
     background = None
@@ -142,6 +156,7 @@ def _recording(files: RecordingFiles, meta: Meta, road_map: RoadMap) -> Recordin
         road_map=road_map,
         background=background,
         repairs=tuple(facts["repairs"]),
+        resampled_from_hz=facts["resampled_from_hz"],
         start_hour=meta.start_hour if isinstance(meta, RecordingMeta) else None,
         weekday=meta.weekday if isinstance(meta, RecordingMeta) else None,
         **columns,
@@ -149,29 +164,49 @@ def _recording(files: RecordingFiles, meta: Meta, road_map: RoadMap) -> Recordin
 
 
 def _track_entry(files: RecordingFiles, meta: Meta) -> CacheEntry:
-    scale = None
     if isinstance(files, InteractionFiles):
         table, rate_hz = read_interaction(files)
-        repairs = list(table.repairs)
-    else:
-        assert isinstance(meta, RecordingMeta)
-        table, rate_hz = read_levelx(files), meta.frame_rate_hz
-        repairs = list(table.repairs)
-        if files.background is not None:
-            scale = _scale(files, files.background, meta, table)
-            if scale is None:
-                repairs.append(f"{files.background.name} left out: its scale is unknown")
+        return _entry(table, rate_hz, None)
+    assert isinstance(meta, RecordingMeta)
+    table, scale = read_levelx(files), None
+    if files.background is not None:
+        scale = _scale(files, files.background, meta, table)
+        if scale is None:
+            line = f"{files.background.name} left out: its scale is unknown"
+            table = replace(table, repairs=(*table.repairs, line))
+    return _entry(table, meta.frame_rate_hz / table.frames_per_row, scale)
+
+
+def _entry(table: TrackTable, rate_hz: float, metres_per_pixel: float | None) -> CacheEntry:
     last_frames = table.first_frames + np.diff(table.starts) - 1
     facts = {
         "frame_rate_hz": rate_hz,
+        "resampled_from_hz": table.resampled_from_hz,
         "num_frames": int(last_frames.max()) + 1,
-        "metres_per_pixel": scale,
-        "repairs": repairs,
+        "metres_per_pixel": metres_per_pixel,
+        "repairs": list(table.repairs),
     }
     arrays = {name: getattr(table, name) for name in _TRACK_COLUMNS}
     if table.accelerations is not None:
         arrays["accelerations"] = table.accelerations
     return facts, arrays
+
+
+def _resampled(
+    files: RecordingFiles, facts: dict[str, Any], arrays: dict[str, Any], to_hz: float
+) -> CacheEntry:
+    measured = TrackTable(
+        **arrays,
+        repairs=tuple(facts["repairs"]),
+        resampled_from_hz=facts["resampled_from_hz"],
+    )
+    table = resample(measured, facts["frame_rate_hz"], to_hz)
+    if not len(table.track_ids):
+        raise DataError(
+            f"{files.tracks}: no track lasts a frame of {to_hz:g} Hz, expected longer tracks; copy "
+            "it again or remove the recording"
+        )
+    return _entry(table, to_hz, facts["metres_per_pixel"])
 
 
 def _scale(

@@ -3,10 +3,12 @@
 import csv
 import gzip
 import io
+import itertools
 import math
 import zlib
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
+from decimal import Decimal
 from pathlib import Path
 from typing import Literal
 
@@ -14,10 +16,15 @@ import numpy as np
 import pandas as pd
 from jaxtyping import Float, Int
 
+from asp_env.data.readers.ranges import Limit
 from asp_env.errors import DataError
 
-Kind = Literal["whole", "number", "text"]
-"""What the cells of a column must be: whole numbers, finite numbers, or any text."""
+Kind = Literal["id", "whole", "number", "text"]
+"""What the cells of a column must be: whole numbers of any size, whole numbers below `EXACT`,
+finite numbers, or any text."""
+
+EXACT = 2**53
+"""Whole numbers below are exact in double precision, in which cells are parsed."""
 
 ROWS_PER_CHUNK = 250_000
 """Rows that are parsed at a time, which bounds memory. Chosen by hand."""
@@ -29,12 +36,16 @@ HIGHEST_HZ = 250.0
 ROUNDING_MS = 1.0
 """Error of a time, since times are whole milliseconds."""
 
-JITTER = 0.1
-"""Error of a time in addition, as a share of a frame. Chosen by hand: above the jitter of cameras,
-far below half a frame."""
+JITTER = 0.3
+"""Error of a step between two times in addition, as a share of a frame. Chosen by hand: above the
+jitter of cameras, below half a frame."""
+
+WHOLE_WITHIN = 0.01
+"""Jittering times are read at a whole number of frames per second if their mean rate differs by
+less than this share. Chosen by hand."""
 
 _BLOCK_BYTES = 1 << 22
-_DTYPES = {"whole": np.dtype(np.int64), "number": np.dtype(np.float64), "text": np.dtype(object)}
+_DTYPES = {"id": np.int64, "whole": np.int64, "number": np.float64}
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -44,6 +55,10 @@ class Clock:
     frames: Int[np.ndarray, " rows"]
     """Frames, counted from the earliest row."""
     rate_hz: float
+    jittering: Float[np.ndarray, " rows"] | None = None
+    """Time of each row in frames, where times deviate from the frames by more than rounding."""
+    mean_hz: float | None = None
+    """Mean frame rate of jittering times."""
 
     @property
     def step_s(self) -> float:
@@ -52,7 +67,11 @@ class Clock:
 
 
 def read_columns(
-    path: Path, columns: Mapping[str, Kind], *, optional: frozenset[str] = frozenset()
+    path: Path,
+    columns: Mapping[str, Kind],
+    *,
+    optional: frozenset[str] = frozenset(),
+    limits: Mapping[str, Limit] = {},
 ) -> Iterator[dict[str, np.ndarray]]:
     """Reads columns of a CSV file (plain or `.gz`), a chunk of rows at a time.
 
@@ -60,9 +79,11 @@ def read_columns(
         path: the file. Its first line names the columns, in any order.
         columns: kind of the cells of each column to read.
         optional: those of `columns` that may be absent.
+        limits: plausible ranges by column.
 
     Yields:
-        Arrays (rows,) by name: int64, float64 (finite) or str objects.
+        Arrays (rows,) by name: int64, float64 (finite) or str objects. Ids of which one is `EXACT`
+        or more are objects of type int, see `number_ids`.
 
     Raises:
         DataError: the file is missing, damaged or without rows. The message names the line, if a
@@ -72,9 +93,9 @@ def read_columns(
         header = _header(path)
         present = _present(path, header, columns, optional)
         if not _has_even_rows(path, len(header)):
-            _diagnose(path, header, present)
+            _diagnose(path, header, present, limits)
         any_rows = False
-        for chunk in _chunks(path, present):
+        for chunk in _chunks(path, present, limits):
             any_rows = True
             yield chunk
         if not any_rows:
@@ -84,20 +105,63 @@ def read_columns(
     except (pd.errors.ParserError, ValueError) as error:
         if isinstance(error, DataError):
             raise
-        _diagnose(path, _header(path), columns)
+        _diagnose(path, _header(path), columns, limits)
         raise DataError(f"{path}: cannot be read as a table: {_one_line(error)}") from error
     except (OSError, EOFError, zlib.error) as error:
         raise DataError(f"{path}: cannot be read: {_one_line(error)}; copy it again") from error
 
 
-def read_table(path: Path, columns: Mapping[str, Kind]) -> dict[str, np.ndarray]:
+def read_table(
+    path: Path, columns: Mapping[str, Kind], *, limits: Mapping[str, Limit] = {}
+) -> dict[str, np.ndarray]:
     """Reads columns of a small CSV file at once.
 
     Raises:
         DataError: see `read_columns`.
     """
-    chunks = list(read_columns(path, columns))
+    chunks = list(read_columns(path, columns, limits=limits))
     return {name: np.concatenate([chunk[name] for chunk in chunks]) for name in columns}
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class NumberedIds:
+    """Ids of any size as numbers of 64 bits."""
+
+    columns: tuple[Int[np.ndarray, " _"], ...]
+    """The ids of each column."""
+    originals: tuple[int, ...] | None
+    """The id in the files of each number; None where both are equal."""
+
+    def original(self, number: int) -> int:
+        """The id in the files."""
+        return number if self.originals is None else self.originals[number]
+
+    @property
+    def repairs(self) -> list[str]:
+        """A line if the numbers are not those of the files."""
+        if self.originals is None:
+            return []
+        return [
+            f"track ids of {EXACT:,} or more: all {len(self.originals)} tracks are numbered in "
+            f"order of their ids, from {self.originals[0]} as 0 to {self.originals[-1]} as "
+            f"{len(self.originals) - 1}"
+        ]
+
+
+def number_ids(*columns: np.ndarray) -> NumberedIds:
+    """Converts columns of ids from `read_columns` to int64.
+
+    They are unchanged if all are below `EXACT`. Otherwise the ids of all columns together are
+    numbered in their order, from 0.
+    """
+    if all(column.dtype != object for column in columns):
+        return NumberedIds(columns=columns, originals=None)
+    known = sorted(set(itertools.chain.from_iterable(column.tolist() for column in columns)))
+    numbers = {name: number for number, name in enumerate(known)}
+    numbered = tuple(
+        np.array([numbers[name] for name in column.tolist()], dtype=np.int64) for column in columns
+    )
+    return NumberedIds(columns=numbered, originals=tuple(known))
 
 
 def find_line(path: Path, cells: Mapping[str, object], *, occurrence: int = 1) -> int:
@@ -128,7 +192,8 @@ def read_clock(
     """Determines the frame of each row, and the frame rate, from the rows' times.
 
     A frame lasts as long as the median step between rows of a track. The rate is a whole number if
-    one explains all times to the millisecond, since 30 Hz are steps of 33 and 34 ms.
+    one explains all times to the millisecond, since 30 Hz are steps of 33 and 34 ms. Times that no
+    rate explains to the millisecond jitter.
 
     Args:
         tracks: track of each row. Rows are sorted by track, then time.
@@ -180,7 +245,19 @@ def read_clock(
         )
     frames = np.concatenate([[0], np.cumsum(counts)])
     rate_hz = 1000.0 * float(frames[-1] / since_ms[-1])
-    return Clock(frames=frames.astype(np.int64)[inverse], rate_hz=rate_hz)
+    deviations_ms = np.abs(since_ms - frames * 1000.0 / rate_hz)
+    mean_hz, jittering = None, None
+    if deviations_ms.max() > ROUNDING_MS:
+        mean_hz = rate_hz
+        if abs(rate_hz - round(rate_hz)) < WHOLE_WITHIN * rate_hz:
+            rate_hz = float(round(rate_hz))
+        jittering = (since_ms * rate_hz / 1000.0)[inverse]
+    return Clock(
+        frames=frames.astype(np.int64)[inverse],
+        rate_hz=rate_hz,
+        jittering=jittering,
+        mean_hz=mean_hz,
+    )
 
 
 def _open(path: Path) -> io.BufferedIOBase:
@@ -217,7 +294,25 @@ def _has_even_rows(path: Path, num_columns: int) -> bool:
     return commas == (lines + (last != b"\n")) * (num_columns - 1)
 
 
-def _chunks(path: Path, columns: Mapping[str, Kind]) -> Iterator[dict[str, np.ndarray]]:
+def _chunks(
+    path: Path, columns: Mapping[str, Kind], limits: Mapping[str, Limit]
+) -> Iterator[dict[str, np.ndarray]]:
+    for number, frame in enumerate(_frames(path, columns)):
+        if not len(frame):
+            continue
+        if missing := [name for name in columns if name not in frame]:
+            raise ValueError(f"there is a line break before {missing[0]!r} in the header")
+        chunk = {}
+        for name, kind in columns.items():
+            if kind == "id" and EXACT <= frame[name].abs().max(skipna=False) < math.inf:
+                chunk[name] = _exact_ids(path, name, number)
+            else:
+                chunk[name] = _checked(frame[name], kind, limits.get(name))
+        yield chunk
+
+
+def _frames(path: Path, columns: Mapping[str, Kind]) -> Iterator[pd.DataFrame]:
+    """The parsed chunks of a file: texts as they are, all else in double precision."""
     texts = [name for name, kind in columns.items() if kind == "text"]
     reader = pd.read_csv(
         path,
@@ -231,26 +326,42 @@ def _chunks(path: Path, columns: Mapping[str, Kind]) -> Iterator[dict[str, np.nd
     )
     with reader:
         for frame in reader:
-            if not len(frame):
-                continue
             frame.columns = frame.columns.str.strip()
-            if missing := [name for name in columns if name not in frame]:
-                raise ValueError(f"there is a line break before {missing[0]!r} in the header")
-            yield {name: _checked(frame[name], kind) for name, kind in columns.items()}
+            yield frame
 
 
-def _checked(column: pd.Series, kind: Kind) -> np.ndarray:
+def _exact_ids(path: Path, name: str, number: int) -> np.ndarray:
+    """The ids of chunk `number` as objects of type int: parsed again, as texts."""
+    frame = next(itertools.islice(_frames(path, {name: "text"}), number, None))
+    return np.array([_exact_id(cell) for cell in frame[name]], dtype=object)
+
+
+def _exact_id(cell: str) -> int:
+    try:
+        return int(cell)
+    except ValueError:  # such as 5.0 and 1e20
+        value = Decimal(cell)
+        if not math.isfinite(float(value)) or value != value.to_integral_value():
+            raise ValueError("a cell is not a whole number") from None
+        return int(value)
+
+
+def _checked(column: pd.Series, kind: Kind, limit: Limit | None) -> np.ndarray:
     if kind == "text":
         return column.to_numpy(dtype=object)
     cells = column.to_numpy()
     if not np.isfinite(cells).all():
         raise ValueError("a cell is not a number")
-    if kind == "whole" and not (cells == np.floor(cells)).all():
+    if kind != "number" and not ((cells == np.floor(cells)) & (np.abs(cells) < EXACT)).all():
         raise ValueError("a cell is not a whole number")
+    if limit is not None and (np.abs(cells) > limit.largest).any():
+        raise ValueError("a cell is out of range")
     return cells.astype(_DTYPES[kind])
 
 
-def _diagnose(path: Path, header: list[str], columns: Mapping[str, Kind]) -> None:
+def _diagnose(
+    path: Path, header: list[str], columns: Mapping[str, Kind], limits: Mapping[str, Limit]
+) -> None:
     """Raises an error that names the first wrong line, if any. Slow: for damaged files only."""
     kinds: list[tuple[int, str, Kind]] = [
         (header.index(name), name, kind) for name, kind in columns.items() if name in header
@@ -264,14 +375,15 @@ def _diagnose(path: Path, header: list[str], columns: Mapping[str, Kind]) -> Non
                 "header; the line is truncated or damaged: copy the file again"
             )
         for index, name, kind in kinds:
-            if expected := _expected(row[index], kind):
+            if expected := _expected(row[index], kind, limits.get(name)):
+                more = _count_beyond(path, index, limits.get(name))
                 raise DataError(
-                    f"{path}, line {number}: {name} is {row[index]!r}, expected {expected}; "
+                    f"{path}, line {number}: {name} is {row[index]!r}{more}, expected {expected}; "
                     "correct the line or remove it"
                 )
 
 
-def _expected(cell: str, kind: Kind) -> str:
+def _expected(cell: str, kind: Kind, limit: Limit | None) -> str:
     """What a cell should be instead; empty if it is valid."""
     if kind == "text":
         return ""
@@ -281,7 +393,22 @@ def _expected(cell: str, kind: Kind) -> str:
         return "a number"
     if not math.isfinite(value):
         return "a finite number"
-    return "a whole number" if kind == "whole" and value != math.floor(value) else ""
+    if kind != "number" and value != math.floor(value):
+        return "a whole number"
+    if kind == "whole" and abs(value) >= EXACT:
+        return f"a whole number below {EXACT:,}"
+    return str(limit) if limit is not None and abs(value) > limit.largest else ""
+
+
+def _count_beyond(path: Path, index: int, limit: Limit | None) -> str:
+    """How many cells of a column are beyond its limit, if several are."""
+    if limit is None:
+        return ""
+    beyond = rows = 0
+    for _, row in itertools.islice(_lines(path), 1, None):
+        beyond += len(row) > index and bool(_expected(row[index], "number", limit))
+        rows += 1
+    return f", and {beyond - 1:,} of {rows - 1:,} other rows are beyond" if beyond > 1 else ""
 
 
 def _lines(path: Path) -> Iterator[tuple[int, list[str]]]:
@@ -300,6 +427,8 @@ def _lines(path: Path) -> Iterator[tuple[int, list[str]]]:
 def _same(cell: str, value: object) -> bool:
     if isinstance(value, str):
         return cell == value
+    if isinstance(value, int) and abs(value) >= EXACT:
+        return _exact_id(cell) == value
     return float(cell) == value
 
 

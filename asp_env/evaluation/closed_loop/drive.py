@@ -175,7 +175,7 @@ def drive(config: Drive) -> ClosedLoopResult:
         raise AspEnvError(
             f"--controls: the planner {config.planner} uses no forecasts; leave it out"
         )
-    recordings = open_data(config.data)
+    recordings = open_data(config.data, dt_s=config.dt)
     run_unit = partial(methods.drive, recordings)
     with WorkerPool(run_unit, config.jobs) if config.jobs > 1 else nullcontext() as pool:
         chosen, part = _choose_scenarios(config, recordings, methods)
@@ -192,6 +192,7 @@ def drive(config: Drive) -> ClosedLoopResult:
         manifest={
             "data": config.data,
             "data_hash": recordings.data_hash(),
+            "resampled": recordings.resampled(),
             "planner": config.planner,
             "predictors": {name: dict(p.metadata) for name, p in predictors.items()},
             "runs": {name: list(each) for name, each in runs.items() if each != (name,)},

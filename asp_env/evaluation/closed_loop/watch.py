@@ -114,13 +114,14 @@ def make_films(rollouts: Mapping[Path, Rollout], data: str | None) -> list[Film]
     Raises:
         DataError: DATA cannot be opened, or is not what a rollout was driven on.
     """
-    sources: dict[str, Recordings] = {}
+    sources: dict[tuple[str, float], Recordings] = {}
     films = []
     for path, rollout in rollouts.items():
         source = rollout.scenario.source if data is None else data
-        if source not in sources:
-            sources[source] = _open_source(path, source)
-        recording = _find_recording(path, rollout, sources[source])
+        key = (source, rollout.dt_s)
+        if key not in sources:
+            sources[key] = _open_source(path, *key)
+        recording = _find_recording(path, rollout, sources[key])
         try:
             films.append(
                 Film(
@@ -135,9 +136,9 @@ def make_films(rollouts: Mapping[Path, Rollout], data: str | None) -> list[Film]
     return films
 
 
-def _open_source(path: Path, source: str) -> Recordings:
+def _open_source(path: Path, source: str, dt_s: float) -> Recordings:
     try:
-        return open_data(source)
+        return open_data(source, dt_s=dt_s)
     except AspEnvError as error:
         raise DataError(
             f"{path}: was driven on DATA that cannot be opened ({error}); name it with --data"

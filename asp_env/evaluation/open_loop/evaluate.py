@@ -156,7 +156,7 @@ def evaluate(config: Evaluate) -> OpenLoopResult:
     Raises:
         AspEnvError: an option or the data are bad.
     """
-    recordings = open_data(config.data)
+    recordings = open_data(config.data, dt_s=config.dt)
     horizon = ticks(config.horizon, config.dt)
     planner = None if config.planner in NO_PLANNER else load_candidate_planner(config.planner)
     named = with_fallback(config.predictors) if config.fallback else config.predictors
@@ -191,6 +191,7 @@ def evaluate(config: Evaluate) -> OpenLoopResult:
         manifest={
             "data": config.data,
             "data_hash": recordings.data_hash(),
+            "resampled": recordings.resampled(),
             "predictors": {name: dict(p.metadata) for name, p in predictors.items()},
             "runs": {name: list(members) for name, members in runs.items() if members != (name,)},
             "privileged": [name for name, (run, *_) in runs.items() if predictors[run].privileged],

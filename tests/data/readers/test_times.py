@@ -54,7 +54,7 @@ def test_frames_are_recovered_from_times(
         ([[0, 100, 200, 260, 360]], "row 3: timestamp_ms is 260.0, 60 ms after the previous time"),
         ([[0, 100, 101, 200]], "row 2: a second row of track 0 at 101.0 ms, less than a frame"),
         ([[0, 100, 200], [50, 150]], "row 3: timestamp_ms is 50.0, 50 ms after"),
-        ([[0, 100, 200, 301.5 + 20, 400]], "expected multiples of 100 ms"),
+        ([[0, 100, 200, 301.5 + 40, 400]], "expected multiples of 100 ms"),
     ],
 )
 def test_impossible_times_are_refused(tracks: list[list[float]], expected: str) -> None:
