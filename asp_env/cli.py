@@ -4,7 +4,8 @@ import contextlib
 import io
 import re
 import sys
-from collections.abc import Sequence
+import warnings
+from collections.abc import Iterator, Sequence
 from typing import Any
 
 import tyro
@@ -12,12 +13,15 @@ from rich.console import Console
 from rich.table import Table
 
 from asp_env import registry
-from asp_env.errors import AspEnvError
+from asp_env.errors import AspEnvError, LeftOutWarning
 
 BAD_INPUT = 2
 """Exit status for input that a command rejects."""
 
 HELP = ("-h", "--help")
+
+STRICT = "--strict"
+"""Option of every command: a recording that cannot be read is an error."""
 
 RENAMED_OPTIONS = {
     ("drive", "--most"): "--max-scenarios",
@@ -47,9 +51,14 @@ def main(argv: Sequence[str] | None = None) -> int:
     name, options = f"{group} {args[0]}".strip(), args[1:]
     try:
         command = registry.find("commands", name)
-        _parse(name, command, _with_current_names(name, options)).run()
+        strict = STRICT in options
+        options = _with_current_names(name, [option for option in options if option != STRICT])
+        with _one_line_warnings(strict=strict):
+            _parse(name, command, options).run()
     except AspEnvError as error:
         return _report(str(error))
+    except LeftOutWarning as warning:
+        return _report(str(warning).removesuffix("; left out"))
     except OSError as error:
         path = f"{error.filename}: " if error.filename else ""
         return _report(f"{path}{error.strerror or error}")
@@ -57,6 +66,22 @@ def main(argv: Sequence[str] | None = None) -> int:
         sys.stderr.write("asp-env: interrupted\n")
         return 130
     return 0
+
+
+@contextlib.contextmanager
+def _one_line_warnings(*, strict: bool) -> Iterator[None]:
+    """Prints warnings as one line each; with `strict`, recordings that are left out are errors."""
+    before = warnings.formatwarning
+    with warnings.catch_warnings():
+        if strict:
+            warnings.simplefilter("error", LeftOutWarning)
+        warnings.formatwarning = lambda message, *_args, **_options: (
+            f"asp-env: warning: {' '.join(str(message).split())}\n"
+        )
+        try:
+            yield
+        finally:
+            warnings.formatwarning = before
 
 
 def _groups() -> set[str]:
@@ -116,6 +141,10 @@ def _print_commands(group: str = "") -> None:
     prog = f"asp-env {group}".strip()
     console.print(f"usage: {prog} COMMAND …    ({prog} COMMAND --help lists its options)\n")
     console.print(table)
+    console.print(
+        f"\n{STRICT}, with every command: a recording of DATA that cannot be read is an error; "
+        "without it, the recording is left out with a warning."
+    )
 
 
 if __name__ == "__main__":

@@ -174,7 +174,7 @@ def read_osm(path: Path) -> Osm:
     raw_ways: dict[str, Way] = {}
     relations: dict[str, Relation] = {}
     doubles: list[str] = []
-    local = path.suffix == ".osm_xy"
+    local = path.suffix.lower() == ".osm_xy"
     try:
         for _, element in ElementTree.iterparse(path):
             if element.tag not in ("node", "way", "relation"):

@@ -2,9 +2,7 @@
 
 import hashlib
 import struct
-import warnings
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -12,22 +10,24 @@ import numpy as np
 
 from asp_env.data import cache
 from asp_env.data.readers import interaction, levelx
+from asp_env.data.readers.caching import CacheEntry, cached
+from asp_env.data.readers.driven_area import driven_area
+from asp_env.data.readers.found import FoundRecording
 from asp_env.data.readers.interaction import InteractionFiles, InteractionMeta, read_interaction
+from asp_env.data.readers.interaction_cases import CaseFiles, read_case
 from asp_env.data.readers.lanelet2 import Origin, read_lanelet2
 from asp_env.data.readers.layout import TrackTable
 from asp_env.data.readers.levelx import LevelxFiles, RecordingMeta, read_levelx
+from asp_env.data.readers.measurements import derive_tracks
 from asp_env.data.recording import Background, Recording
 from asp_env.data.road_map import Ragged, RoadMap
-from asp_env.errors import DataError
+from asp_env.data.signals import Signals
 
-RecordingFiles = LevelxFiles | InteractionFiles
+RecordingFiles = LevelxFiles | InteractionFiles | CaseFiles | FoundRecording
 """The files of one recording, of any layout."""
 
 Meta = RecordingMeta | InteractionMeta
 """The metadata of one recording, of any layout."""
-
-CacheEntry = tuple[dict[str, Any], dict[str, np.ndarray]]
-"""Facts and arrays, the content of a cache file."""
 
 _TRACK_COLUMNS = ("track_ids", "classes", "sizes", "first_frames", "starts", "states")
 _MAP_PARTS = ("lines", "drivable", "lanes", "areas")
@@ -42,10 +42,13 @@ class ReaderState:
     """
 
     recordings: dict[str, Recording] = field(default_factory=dict)
-    maps: dict[tuple[Path, Origin], RoadMap] = field(default_factory=dict)
+    maps: dict[tuple[Path, Origin] | str, RoadMap] = field(default_factory=dict)
+    """By file and frame, or by a hash of their content."""
     places: dict[str, tuple[Meta, Path]] = field(default_factory=dict)
     """Metadata and path of the map of each recording."""
     hashes: dict[str, str] = field(default_factory=dict)
+    tables: dict[Path, CacheEntry] = field(default_factory=dict)
+    """Tables of several recordings."""
     maps_by_folder: dict[Path, list[Path]] = field(default_factory=dict)
     """Map files by folder. Without it, opening N recordings would list N² files."""
 
@@ -61,10 +64,14 @@ def open_recording(files: RecordingFiles, state: ReaderState) -> Recording:
         DataError: its files are damaged.
     """
     if files.name not in state.recordings:
-        meta, map_path = _place(files, state)
-        place = (map_path, meta.origin)
-        recording = _recording(files, meta, state.maps.get(place) or _road_map(*place))
-        state.maps[place] = recording.road_map
+        if isinstance(files, FoundRecording):
+            recording = _open_found(files, state)
+        else:
+            meta, map_path = _place(files, state)
+            place = (map_path, meta.origin)
+            road_map = state.maps.get(place) or _road_map(*place)
+            recording = _recording(files, meta, road_map, state)
+            state.maps[place] = recording.road_map
         state.recordings[files.name] = recording
     return state.recordings[files.name]
 
@@ -80,20 +87,36 @@ def content_hash(files: RecordingFiles, state: ReaderState) -> str:
         DataError: a file is missing.
     """
     if files.name not in state.hashes:
-        _, map_path = _place(files, state)
-        sources = (*files.tables, map_path)
+        sources = files.tables
+        if not isinstance(files, FoundRecording):
+            sources = (*sources, _place(files, state)[1])
+        content = _files_hash(files.tracks, sources, state)
+        if isinstance(files, CaseFiles):
+            content = hashlib.sha256(f"{content} case {files.case}".encode()).hexdigest()
+        state.hashes[files.name] = content
+    return state.hashes[files.name]
+
+
+def _files_hash(path: Path, sources: tuple[Path, ...], state: ReaderState) -> str:
+    key = " ".join(map(str, sources))
+    if key not in state.hashes:
 
         def make() -> CacheEntry:
             digests = "".join(cache.digest(path) for path in sources)
             return {"hash": hashlib.sha256(digests.encode()).hexdigest()}, {}
 
-        facts, _ = _cached(files.tracks, sources, make, "hash")
-        state.hashes[files.name] = str(facts["hash"])
-    return state.hashes[files.name]
+        facts, _ = cached(path, sources, make, "hash")
+        state.hashes[key] = str(facts["hash"])
+    return state.hashes[key]
 
 
-def _place(files: RecordingFiles, state: ReaderState) -> tuple[Meta, Path]:
+def _place(
+    files: LevelxFiles | InteractionFiles | CaseFiles, state: ReaderState
+) -> tuple[Meta, Path]:
     if files.name not in state.places:
+        if isinstance(files, CaseFiles):
+            state.places[files.name] = files.place(state.maps_by_folder)
+            return state.places[files.name]
         files.check_complete()
         if isinstance(files, LevelxFiles):
             meta = levelx.read_recording_meta(files.recording_meta)
@@ -105,9 +128,17 @@ def _place(files: RecordingFiles, state: ReaderState) -> tuple[Meta, Path]:
     return state.places[files.name]
 
 
-def _recording(files: RecordingFiles, meta: Meta, road_map: RoadMap) -> Recording:
+def _recording(
+    files: LevelxFiles | InteractionFiles | CaseFiles,
+    meta: Meta,
+    road_map: RoadMap,
+    state: ReaderState,
+) -> Recording:
     sources = [*files.tables, *([files.background] if files.background else [])]
-    facts, arrays = _cached(files.tracks, sources, lambda: _track_entry(files, meta), "tracks")
+    if isinstance(files, CaseFiles):
+        facts, arrays = _entry(*read_case(files, state.tables), None)
+    else:
+        facts, arrays = cached(files.tracks, sources, lambda: _track_entry(files, meta), "tracks")
     scale = facts["metres_per_pixel"]
     columns: dict[str, Any] = arrays
     background = None
@@ -128,30 +159,81 @@ def _recording(files: RecordingFiles, meta: Meta, road_map: RoadMap) -> Recordin
     )
 
 
-def _track_entry(files: RecordingFiles, meta: Meta) -> CacheEntry:
-    scale = None
+def _track_entry(files: LevelxFiles | InteractionFiles, meta: Meta) -> CacheEntry:
     if isinstance(files, InteractionFiles):
-        table, rate_hz = read_interaction(files)
-        repairs = list(table.repairs)
-    else:
-        assert isinstance(meta, RecordingMeta)
-        table, rate_hz = read_levelx(files), meta.frame_rate_hz
-        repairs = list(table.repairs)
-        if files.background is not None:
-            scale = _scale(files, files.background, meta, table)
-            if scale is None:
-                repairs.append(f"{files.background.name} left out: its scale is unknown")
+        return _entry(*read_interaction(files), None)
+    assert isinstance(meta, RecordingMeta)
+    table, scale = read_levelx(files), None
+    if files.background is not None:
+        scale = _scale(files, files.background, meta, table)
+        if scale is None:
+            line = f"{files.background.name} left out: its scale is unknown"
+            table = replace(table, repairs=(*table.repairs, line))
+    return _entry(table, meta.frame_rate_hz, scale)
+
+
+def _entry(table: TrackTable, rate_hz: float, metres_per_pixel: float | None) -> CacheEntry:
     last_frames = table.first_frames + np.diff(table.starts) - 1
     facts = {
         "frame_rate_hz": rate_hz,
         "num_frames": int(last_frames.max()) + 1,
-        "metres_per_pixel": scale,
-        "repairs": repairs,
+        "metres_per_pixel": metres_per_pixel,
+        "repairs": list(table.repairs),
     }
     arrays = {name: getattr(table, name) for name in _TRACK_COLUMNS}
     if table.accelerations is not None:
         arrays["accelerations"] = table.accelerations
     return facts, arrays
+
+
+def _open_found(files: FoundRecording, state: ReaderState) -> Recording:
+    sources = list(files.tables)
+    about, parts = cached(files.tracks, sources, lambda: _found_entry(files), ("found", files.name))
+    facts, arrays = about["tracks"], {name: parts[name] for name in _TRACK_COLUMNS}
+    columns: dict[str, Any] = arrays
+    signals = None
+    if "signal_states" in parts:
+        frames = np.arange(facts["num_frames"]) * (about["rate_hz"] / facts["frame_rate_hz"])
+        nearest = np.minimum(np.round(frames).astype(np.int64), parts["signal_states"].shape[1] - 1)
+        states = parts["signal_states"][:, nearest]
+        signals = Signals(stop_lines=parts["stop_lines"], states=states)
+    road_map = state.maps.setdefault(about["map_hash"], _map_of(about["map"], parts))
+    return Recording(
+        name=files.name,
+        frame_rate_hz=facts["frame_rate_hz"],
+        num_frames=facts["num_frames"],
+        repairs=tuple(facts["repairs"]),
+        road_map=road_map,
+        signals=signals,
+        **about["properties"],
+        **columns,
+    )
+
+
+def _found_entry(files: FoundRecording) -> CacheEntry:
+    tables = files.read_tables()
+    table, rate_hz = derive_tracks(tables.measurements, str(files.tracks))
+    table = replace(table, repairs=(*tables.repairs, *table.repairs))
+    road_map = tables.road_map or driven_area(table, files.name)
+    facts, arrays = _entry(table, rate_hz, None)
+    map_facts, map_arrays = _map_arrays(road_map)
+    content = hashlib.sha256(repr((road_map.name, map_facts)).encode())
+    for array in map_arrays.values():
+        content.update(np.ascontiguousarray(array).tobytes())
+    if tables.signals is not None:
+        first_ms = float(tables.measurements.time_ms.min())
+        times_ms = first_ms + 1000.0 / rate_hz * np.arange(facts["num_frames"])
+        arrays["signal_states"] = tables.signals.at(times_ms)
+        arrays["stop_lines"] = tables.signals.stop_lines
+    names = ("location", "speed_limit_mps", "start_hour", "weekday")
+    about = {
+        "tracks": facts,
+        "rate_hz": rate_hz,
+        "map": {"name": road_map.name, **map_facts},
+        "map_hash": content.hexdigest(),
+        "properties": {name: getattr(tables, name) for name in names},
+    }
+    return about, arrays | map_arrays
 
 
 def _scale(
@@ -162,55 +244,25 @@ def _scale(
 
 
 def _road_map(path: Path, origin: Origin) -> RoadMap:
-    facts, arrays = _cached(path, [path], lambda: _map_entry(path, origin), origin)
+    facts, arrays = cached(path, [path], lambda: _map_arrays(read_lanelet2(path, origin)), origin)
+    return _map_of({"name": path.stem, **facts}, arrays)
+
+
+def _map_of(facts: dict[str, Any], arrays: dict[str, np.ndarray]) -> RoadMap:
     parts: dict[str, Any] = {name: arrays[name] for name in _MAP_COLUMNS}
     parts |= {
         name: Ragged(points=arrays[f"{name}_points"], starts=arrays[f"{name}_starts"])
         for name in _MAP_PARTS
     }
-    return RoadMap(
-        name=path.stem,
-        repairs=tuple(facts["repairs"]),
-        **parts,
-    )
+    return RoadMap(name=facts["name"], repairs=tuple(facts["repairs"]), **parts)
 
 
-def _map_entry(path: Path, origin: Origin) -> CacheEntry:
-    road_map = read_lanelet2(path, origin)
+def _map_arrays(road_map: RoadMap) -> CacheEntry:
     arrays = {name: getattr(road_map, name) for name in _MAP_COLUMNS}
     for name in _MAP_PARTS:
         ragged = getattr(road_map, name)
         arrays |= {f"{name}_points": ragged.points, f"{name}_starts": ragged.starts}
     return {"repairs": list(road_map.repairs)}, arrays
-
-
-def _cached(
-    path: Path, sources: Sequence[Path], make: Callable[[], CacheEntry], salt: object
-) -> CacheEntry:
-    """The result of `make`, from the cache if it is stored there and no source has changed since.
-
-    If the cache cannot be written, there is a warning, and `make` is called every time.
-    """
-    current = cache.stamp(sources)
-    try:
-        cached = cache.entry_path(cache.cache_folder(), path, salt)
-    except DataError as error:
-        warnings.warn(f"results are not cached: {error}", stacklevel=2)
-        return _read_only(make())
-    if (found := cache.load(cached, current)) is not None:
-        return found
-    made = make()
-    try:
-        cache.save(cached, current, *made)
-    except OSError as error:
-        warnings.warn(f"results are not cached: {cached}: {error.strerror}", stacklevel=2)
-    return cache.load(cached, current) or _read_only(made)
-
-
-def _read_only(made: CacheEntry) -> CacheEntry:
-    for array in made[1].values():
-        array.flags.writeable = False
-    return made
 
 
 def _png_size(path: Path) -> tuple[int, int] | None:

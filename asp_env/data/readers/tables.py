@@ -5,7 +5,7 @@ import gzip
 import io
 import math
 import zlib
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
@@ -16,8 +16,12 @@ from jaxtyping import Float, Int
 
 from asp_env.errors import DataError
 
-Kind = Literal["whole", "number", "text"]
-"""What the cells of a column must be: whole numbers, finite numbers, or any text."""
+Kind = Literal["whole", "number", "number or empty", "text"]
+"""What the cells of a column must be: whole numbers, finite numbers, finite numbers or nothing
+(which is read as NaN), or any text."""
+
+EMPTY = ("", "NaN", "nan", "NA", "N/A", "null", "None")
+"""Texts of cells that contain nothing."""
 
 ROWS_PER_CHUNK = 250_000
 """Rows that are parsed at a time, which bounds memory. Chosen by hand."""
@@ -34,7 +38,7 @@ JITTER = 0.1
 far below half a frame."""
 
 _BLOCK_BYTES = 1 << 22
-_DTYPES = {"whole": np.dtype(np.int64), "number": np.dtype(np.float64), "text": np.dtype(object)}
+_DTYPES = {"whole": np.dtype(np.int64), "number": np.dtype(np.float64)}
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -52,52 +56,60 @@ class Clock:
 
 
 def read_columns(
-    path: Path, columns: Mapping[str, Kind], *, optional: frozenset[str] = frozenset()
+    path: Path,
+    columns: Mapping[str, Kind],
+    *,
+    optional: frozenset[str] = frozenset(),
+    may_be_empty: bool = False,
 ) -> Iterator[dict[str, np.ndarray]]:
     """Reads columns of a CSV file (plain or `.gz`), a chunk of rows at a time.
 
     Args:
-        path: the file. Its first line names the columns, in any order.
+        path: the file. Its first line names the columns, in any order, in upper or lower case.
         columns: kind of the cells of each column to read.
         optional: those of `columns` that may be absent.
+        may_be_empty: whether a file without rows is valid; it yields nothing.
 
     Yields:
-        Arrays (rows,) by name: int64, float64 (finite) or str objects.
+        Arrays (rows,) by name: int64, float64 or str objects.
 
     Raises:
         DataError: the file is missing, damaged or without rows. The message names the line, if a
             single line is wrong.
     """
     try:
-        header = _header(path)
+        header = header_of(path)
         present = _present(path, header, columns, optional)
         if not _has_even_rows(path, len(header)):
             _diagnose(path, header, present)
         any_rows = False
-        for chunk in _chunks(path, present):
+        for chunk in _chunks(path, header, present):
             any_rows = True
             yield chunk
-        if not any_rows:
+        if not (any_rows or may_be_empty):
             raise DataError(
                 f"{path}: has a header but no rows; copy it again or remove the recording"
             )
     except (pd.errors.ParserError, ValueError) as error:
         if isinstance(error, DataError):
             raise
-        _diagnose(path, _header(path), columns)
+        header = header_of(path)
+        _diagnose(path, header, _present(path, header, columns, frozenset(columns)))
         raise DataError(f"{path}: cannot be read as a table: {_one_line(error)}") from error
     except (OSError, EOFError, zlib.error) as error:
         raise DataError(f"{path}: cannot be read: {_one_line(error)}; copy it again") from error
 
 
-def read_table(path: Path, columns: Mapping[str, Kind]) -> dict[str, np.ndarray]:
-    """Reads columns of a small CSV file at once.
+def read_table(
+    path: Path, columns: Mapping[str, Kind], *, optional: frozenset[str] = frozenset()
+) -> dict[str, np.ndarray]:
+    """Reads columns of a CSV file at once; see `read_columns`.
 
     Raises:
         DataError: see `read_columns`.
     """
-    chunks = list(read_columns(path, columns))
-    return {name: np.concatenate([chunk[name] for chunk in chunks]) for name in columns}
+    chunks = list(read_columns(path, columns, optional=optional))
+    return {name: np.concatenate([chunk[name] for chunk in chunks]) for name in chunks[0]}
 
 
 def find_line(path: Path, cells: Mapping[str, object], *, occurrence: int = 1) -> int:
@@ -111,7 +123,8 @@ def find_line(path: Path, cells: Mapping[str, object], *, occurrence: int = 1) -
     Returns:
         The number of the line, from 1; 0 if there is none.
     """
-    columns = {name: index for index, name in enumerate(_header(path))}
+    header = header_of(path)
+    columns = {name: _places(header, name)[0] for name in cells}
     for number, row in _lines(path):
         if number > 1 and all(_same(row[columns[name]], cells[name]) for name in cells):
             occurrence -= 1
@@ -184,25 +197,52 @@ def read_clock(
 
 
 def _open(path: Path) -> io.BufferedIOBase:
-    return gzip.GzipFile(path) if path.suffix == ".gz" else path.open("rb")
+    return gzip.GzipFile(path) if path.suffix.lower() == ".gz" else path.open("rb")
 
 
-def _header(path: Path) -> list[str]:
+def header_of(path: Path) -> list[str]:
+    """The names of a table's columns, without spaces around them.
+
+    Raises:
+        DataError: the file is empty or damaged.
+    """
     for _, row in _lines(path):
         return [name.strip() for name in row]
     raise DataError(f"{path}: is empty; expected a table with a header; copy it again")
 
 
+def has_columns(path: Path, names: Iterable[str]) -> bool:
+    """Whether a file is a table with all of some columns, in upper or lower case."""
+    try:
+        header = {name.lower() for name in header_of(path)}
+    except (DataError, OSError, EOFError, zlib.error):
+        return False
+    return all(name.lower() in header for name in names)
+
+
+def _places(header: list[str], name: str) -> list[int]:
+    """Indices of the columns with a name, in upper or lower case."""
+    return [index for index, given in enumerate(header) if given.lower() == name.lower()]
+
+
 def _present(
     path: Path, header: list[str], columns: Mapping[str, Kind], optional: frozenset[str]
-) -> dict[str, Kind]:
-    missing = [name for name in columns if name not in header and name not in optional]
+) -> dict[int, tuple[str, Kind]]:
+    """Name and kind of the columns to read, by their index in the file."""
+    places = {name: _places(header, name) for name in columns}
+    missing = [name for name in columns if not places[name] and name not in optional]
     if missing:
         raise DataError(
             f"{path}: lacks the column {', '.join(map(repr, missing))}; "
             f"expected it among those found: {' '.join(', '.join(header).split())[:200]}"
         )
-    return {name: kind for name, kind in columns.items() if name in header}
+    if double := next((name for name in columns if len(places[name]) > 1), None):
+        numbers = " and ".join(str(index + 1) for index in places[double])
+        raise DataError(
+            f"{path}, line 1: columns {numbers} are called {double!r} (spaces around names and "
+            "upper case are ignored), expected one; rename or remove the others"
+        )
+    return {places[name][0]: (name, kind) for name, kind in columns.items() if places[name]}
 
 
 def _has_even_rows(path: Path, num_columns: int) -> bool:
@@ -217,32 +257,38 @@ def _has_even_rows(path: Path, num_columns: int) -> bool:
     return commas == (lines + (last != b"\n")) * (num_columns - 1)
 
 
-def _chunks(path: Path, columns: Mapping[str, Kind]) -> Iterator[dict[str, np.ndarray]]:
-    texts = [name for name, kind in columns.items() if kind == "text"]
+def _chunks(
+    path: Path, header: list[str], columns: Mapping[int, tuple[str, Kind]]
+) -> Iterator[dict[str, np.ndarray]]:
+    kinds = dict(columns.values())
+    names = [columns[i][0] if i in columns else f"column {i + 1}" for i in range(len(header))]
     reader = pd.read_csv(
         path,
-        usecols=lambda name: name.strip() in columns,
-        dtype={name: str if kind == "text" else np.float64 for name, kind in columns.items()},
+        header=0,
+        names=names,
+        usecols=list(columns),
+        dtype={name: str if kind == "text" else np.float64 for name, kind in kinds.items()},
         chunksize=ROWS_PER_CHUNK,
         index_col=False,
         encoding="utf-8-sig",
         encoding_errors="replace",
-        keep_default_na=not texts,
+        keep_default_na="text" not in kinds.values(),
+        na_values={name: list(EMPTY) for name, kind in kinds.items() if kind == "number or empty"},
     )
     with reader:
         for frame in reader:
-            if not len(frame):
-                continue
-            frame.columns = frame.columns.str.strip()
-            if missing := [name for name in columns if name not in frame]:
-                raise ValueError(f"there is a line break before {missing[0]!r} in the header")
-            yield {name: _checked(frame[name], kind) for name, kind in columns.items()}
+            if len(frame):
+                yield {name: _checked(frame[name], kind) for name, kind in kinds.items()}
 
 
 def _checked(column: pd.Series, kind: Kind) -> np.ndarray:
     if kind == "text":
         return column.to_numpy(dtype=object)
     cells = column.to_numpy()
+    if kind == "number or empty":
+        if np.isinf(cells).any():
+            raise ValueError("a cell is not a finite number")
+        return cells
     if not np.isfinite(cells).all():
         raise ValueError("a cell is not a number")
     if kind == "whole" and not (cells == np.floor(cells)).all():
@@ -250,11 +296,8 @@ def _checked(column: pd.Series, kind: Kind) -> np.ndarray:
     return cells.astype(_DTYPES[kind])
 
 
-def _diagnose(path: Path, header: list[str], columns: Mapping[str, Kind]) -> None:
+def _diagnose(path: Path, header: list[str], columns: Mapping[int, tuple[str, Kind]]) -> None:
     """Raises an error that names the first wrong line, if any. Slow: for damaged files only."""
-    kinds: list[tuple[int, str, Kind]] = [
-        (header.index(name), name, kind) for name, kind in columns.items() if name in header
-    ]
     for number, row in _lines(path):
         if number == 1:
             continue
@@ -263,7 +306,7 @@ def _diagnose(path: Path, header: list[str], columns: Mapping[str, Kind]) -> Non
                 f"{path}, line {number}: has {len(row)} fields, expected {len(header)} as in the "
                 "header; the line is truncated or damaged: copy the file again"
             )
-        for index, name, kind in kinds:
+        for index, (name, kind) in columns.items():
             if expected := _expected(row[index], kind):
                 raise DataError(
                     f"{path}, line {number}: {name} is {row[index]!r}, expected {expected}; "
@@ -273,7 +316,7 @@ def _diagnose(path: Path, header: list[str], columns: Mapping[str, Kind]) -> Non
 
 def _expected(cell: str, kind: Kind) -> str:
     """What a cell should be instead; empty if it is valid."""
-    if kind == "text":
+    if kind == "text" or (kind == "number or empty" and cell.strip() in EMPTY):
         return ""
     try:
         value = float(cell)
