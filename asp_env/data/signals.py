@@ -51,7 +51,7 @@ class Signals:
         unknown = np.isnan(self.stop_lines).all(axis=(1, 2), keepdims=True)
         if not (np.isfinite(self.stop_lines) | unknown).all():
             raise DataError(
-                "stop lines of signals: expected finite positions in metres, or NaN for a whole line"
+                "stop lines of signals: expected finite positions in metres, or NaN for all"
             )
         if not np.isin(self.states, list(SignalState)).all():
             raise DataError(

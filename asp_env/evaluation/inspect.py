@@ -20,7 +20,7 @@ from asp_env.data.snippets import HISTORY_S, SNIPPET_INTERVAL_S, find_snippets
 from asp_env.data.source import Recordings, open_data
 from asp_env.dynamics import inverse, rollout
 from asp_env.dynamics.bicycle import Integrator
-from asp_env.errors import DataError
+from asp_env.errors import AspEnvError, DataError
 from asp_env.metrics.drivable import CELL_M, drivable_field
 from asp_env.metrics.forecast.errors import moving
 
@@ -152,12 +152,19 @@ class Inspect:
             disable=not console.is_terminal,
         )
         for number in numbers:
+            name = recordings.names[number]
             try:
                 recording = recordings[number]
             except DataError as error:
-                faults[recordings.names[number]] = str(error)
+                faults[name] = str(error)
                 continue
-            frames_per_tick(recording.frame_rate_hz, self.dt)
+            try:
+                frames_per_tick(recording.frame_rate_hz, self.dt)
+            except AspEnvError as error:
+                if len(recordings) == 1:
+                    raise
+                faults[name] = f"recording {name}: {error}"
+                continue
             summaries.append(
                 RecordingSummary(
                     recording=recording,

@@ -11,7 +11,7 @@ from jaxtyping import Bool, Int, Shaped
 from asp_env.data.histories import histories
 from asp_env.data.recording import Recording
 from asp_env.data.snippets import SnippetIndex, gather_future, gather_present, index_snippets
-from asp_env.data.source import Recordings, join_data, open_data
+from asp_env.data.source import Recordings, join_data, open_readable
 from asp_env.data.split import TrainedOn, snippet_parts
 from asp_env.dynamics import MAX_ACCELERATION_MPS2, MAX_STEERING_RAD, inverse
 from asp_env.errors import AspEnvError
@@ -186,9 +186,9 @@ class TrainingData:
     """Hash of separate validation data, if there are any."""
 
 
-def open_all(data: str | Sequence[str]) -> list[Recordings]:
-    """Opens one or several DATA."""
-    return [open_data(each) for each in ([data] if isinstance(data, str) else data)]
+def open_all(data: str | Sequence[str], dt_s: float) -> list[Recordings]:
+    """Opens the recordings of one or several DATA that can be read."""
+    return [open_readable(each, dt_s=dt_s) for each in ([data] if isinstance(data, str) else data)]
 
 
 def open_training_data(config: TrainingConfig, data: str | Sequence[str]) -> TrainingData:
@@ -201,7 +201,7 @@ def open_training_data(config: TrainingConfig, data: str | Sequence[str]) -> Tra
     Raises:
         AspEnvError: The data are bad, a part is empty, or a recording is in two data sets.
     """
-    opened = open_all(data)
+    opened = open_all(data, config.dt_s)
     recordings = join_data(opened)
     index = snippets_of(recordings, config)
     if not config.validation:
@@ -212,7 +212,7 @@ def open_training_data(config: TrainingConfig, data: str | Sequence[str]) -> Tra
         )
         validation_hash = None
     else:
-        separate = join_data(open_all(config.validation))
+        separate = join_data(open_all(config.validation, config.dt_s))
         training = DatasetSplit(recordings=recordings, snippets=index)
         validation = DatasetSplit(recordings=separate, snippets=snippets_of(separate, config))
         trained_on = _separate_parts(recordings, separate)

@@ -329,7 +329,7 @@ def _with_mix(
     """The training snippets followed by those of other data, if there are any."""
     if not mix:
         return training, None
-    other = join_data(open_all(mix))
+    other = join_data(open_all(mix, config.dt_s))
     chosen = choose_snippets(
         other,
         snippets_of(other, config),

@@ -270,7 +270,7 @@ def _check_first_stage(
     provenance = read_config(stage).get("provenance", {})
     expected = {
         "config": json.loads(json.dumps(dataclasses.asdict(config))),
-        "data_hash": join_data(open_all(data)).data_hash(),
+        "data_hash": join_data(open_all(data, config.dt_s)).data_hash(),
         "start": None if start is None else file_hash(start),
     }
     if other := [name for name, value in expected.items() if provenance.get(name) != value]:

@@ -31,7 +31,7 @@ def cached(
     try:
         stored = cache.entry_path(cache.cache_folder(), path, salt)
     except DataError as error:
-        warnings.warn(f"results are not cached: {error}", stacklevel=2)
+        warnings.warn(f"results are not cached: {error}", stacklevel=1)  # once per process
         return _read_only(make())
     if (found := cache.load(stored, current)) is not None:
         return found
@@ -39,7 +39,7 @@ def cached(
     try:
         cache.save(stored, current, *made)
     except OSError as error:
-        warnings.warn(f"results are not cached: {stored}: {error.strerror}", stacklevel=2)
+        warnings.warn(f"results are not cached: {stored}: {error.strerror}", stacklevel=1)
     return cache.load(stored, current) or _read_only(made)
 
 

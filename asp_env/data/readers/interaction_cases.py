@@ -2,7 +2,8 @@
 
 A table such as `train/DR_CHN_Merging_ZS0_train.csv` has the columns of the INTERACTION layout,
 vehicles and pedestrians together, and `case_id`. Each case is a recording,
-`DR_CHN_Merging_ZS0_train/1`. The map is `maps/DR_CHN_Merging_ZS0.osm` or `.osm_xy`. A table is read once, for all of its cases.
+`DR_CHN_Merging_ZS0_train/1`. The map is `maps/DR_CHN_Merging_ZS0.osm` or `.osm_xy`. A table is read
+once, for all of its cases.
 """
 
 import re

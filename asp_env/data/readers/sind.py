@@ -6,7 +6,7 @@ folder or in one above. Positions and the map are in metres from 0° N 0° E. Th
 in https://github.com/SOTIF-AVLab/SinD/blob/main/Format.md.
 
 No file contains where the lights' stop lines are. `stop_lines.csv` beside the lights gives them,
-with the columns `signal, x1, y1, x2, y2`: the number of the light's column and two points in metres.
+with the columns `signal, x1, y1, x2, y2`: the number of the light's column and two points, m.
 """
 
 import re
