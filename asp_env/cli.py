@@ -13,12 +13,15 @@ from rich.console import Console
 from rich.table import Table
 
 from asp_env import registry
-from asp_env.errors import AspEnvError, RepairWarning
+from asp_env.errors import AspEnvError, LeftOutWarning
 
 BAD_INPUT = 2
 """Exit status for input that a command rejects."""
 
 HELP = ("-h", "--help")
+
+STRICT = "--strict"
+"""Option of every command: a recording that cannot be read is an error."""
 
 RENAMED_OPTIONS = {
     ("drive", "--most"): "--max-scenarios",
@@ -48,10 +51,14 @@ def main(argv: Sequence[str] | None = None) -> int:
     name, options = f"{group} {args[0]}".strip(), args[1:]
     try:
         command = registry.find("commands", name)
-        with _one_line_warnings():
-            _parse(name, command, _with_current_names(name, options)).run()
+        strict = STRICT in options
+        options = _with_current_names(name, [option for option in options if option != STRICT])
+        with _one_line_warnings(strict=strict):
+            _parse(name, command, options).run()
     except AspEnvError as error:
         return _report(str(error))
+    except LeftOutWarning as warning:
+        return _report(str(warning).removesuffix("; left out"))
     except OSError as error:
         path = f"{error.filename}: " if error.filename else ""
         return _report(f"{path}{error.strerror or error}")
@@ -62,20 +69,19 @@ def main(argv: Sequence[str] | None = None) -> int:
 
 
 @contextlib.contextmanager
-def _one_line_warnings() -> Iterator[None]:
-    """Prints warnings about DATA without the line of code that they come from."""
-    usual = warnings.formatwarning
-
-    def one_line(message: Any, category: type[Warning], *rest: Any, **named: Any) -> str:
-        if issubclass(category, RepairWarning):
-            return f"asp-env: warning: {message}\n"
-        return usual(message, category, *rest, **named)
-
-    warnings.formatwarning = one_line
-    try:
-        yield
-    finally:
-        warnings.formatwarning = usual
+def _one_line_warnings(*, strict: bool) -> Iterator[None]:
+    """Prints warnings as one line each; with `strict`, recordings that are left out are errors."""
+    before = warnings.formatwarning
+    with warnings.catch_warnings():
+        if strict:
+            warnings.simplefilter("error", LeftOutWarning)
+        warnings.formatwarning = lambda message, *_args, **_options: (
+            f"asp-env: warning: {' '.join(str(message).split())}\n"
+        )
+        try:
+            yield
+        finally:
+            warnings.formatwarning = before
 
 
 def _groups() -> set[str]:
@@ -135,6 +141,10 @@ def _print_commands(group: str = "") -> None:
     prog = f"asp-env {group}".strip()
     console.print(f"usage: {prog} COMMAND …    ({prog} COMMAND --help lists its options)\n")
     console.print(table)
+    console.print(
+        f"\n{STRICT}, with every command: a recording of DATA that cannot be read is an error; "
+        "without it, the recording is left out with a warning."
+    )
 
 
 if __name__ == "__main__":

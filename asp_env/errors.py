@@ -37,6 +37,10 @@ class MissingExtraError(AspEnvError, ImportError):
         )
 
 
+class LeftOutWarning(UserWarning):
+    """Recordings of DATA that cannot be read are left out. An error with `--strict`."""
+
+
 def unknown_name(kind: str, given: str, known: Iterable[str]) -> AspEnvError:
     """An error that suggests the most similar known name and lists all of them.
 

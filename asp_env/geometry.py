@@ -11,7 +11,8 @@ from typing import Any, no_type_check
 
 import numpy as np
 from jaxtyping import Bool, Float, Shaped
-from numba import njit
+
+from asp_env.compiled import njit
 
 MIN_STEP_M = 0.5
 """`route_along` skips positions nearer than this to the last point of the route, so that standing

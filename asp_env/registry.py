@@ -10,6 +10,7 @@ The groups are:
 - `asp_env.predictors`: forecast the targets of a scene;
 - `asp_env.planners`: plan the ego's actions;
 - `asp_env.drivers`: move the agents other than the ego;
+- `asp_env.readers`: find recordings in a folder, see `asp_env.data.readers.found`;
 - `asp_env.sources`: data by `scheme:argument`, such as `synthetic:intersection`;
 - `asp_env.worlds`: simulate the data of a source that are not replayed, such as `highway:`;
 - `asp_env.views`: render scenes for networks;
@@ -28,7 +29,9 @@ from asp_env.errors import AspEnvError, unknown_name
 _PACKAGE_OF_MODULE = {"pygame": "pygame-ce", "sumolib": "eclipse-sumo", "traci": "eclipse-sumo"}
 """Packages that have other names than their modules."""
 
-Group = Literal["predictors", "planners", "drivers", "sources", "worlds", "views", "commands"]
+Group = Literal[
+    "predictors", "planners", "drivers", "readers", "sources", "worlds", "views", "commands"
+]
 
 
 @cache

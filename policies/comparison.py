@@ -26,7 +26,7 @@ from asp_env.data.recording import ticks
 from asp_env.data.scenarios.scenario import ScenarioSet
 from asp_env.data.scenarios.selection import choose_scenarios
 from asp_env.data.snippets import HISTORY_S
-from asp_env.data.source import Recordings, open_data
+from asp_env.data.source import Recordings, open_readable
 from asp_env.errors import AspEnvError
 from asp_env.evaluation.closed_loop.episodes import EpisodeSettings, drive_episodes
 from asp_env.evaluation.statistics import (
@@ -131,7 +131,7 @@ class HeldOut:
 @cache
 def _recordings(data: str, dt_s: float) -> Recordings:
     """The recordings of held-out data, once per process: what is made of their maps is reused."""
-    return open_data(data, dt_s=dt_s)
+    return open_readable(data, dt_s=dt_s)
 
 
 Values = dict[str, Float[np.ndarray, " n"]]

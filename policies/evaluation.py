@@ -11,7 +11,7 @@ from asp_env.data.recording import ticks
 from asp_env.data.scenarios.scenario import Scenario, ScenarioSet
 from asp_env.data.scenarios.selection import choose_scenarios
 from asp_env.data.snippets import HISTORY_S
-from asp_env.data.source import open_data
+from asp_env.data.source import open_readable
 from asp_env.evaluation.statistics import Estimate, mean
 from policies.environments import PolicyObservations, make_environments
 from policies.observations import Observations
@@ -69,7 +69,7 @@ def evaluate_policy(
     chosen = scenarios
     if isinstance(chosen, str):
         history = ticks(HISTORY_S, settings.dt_s)
-        recordings = open_data(data, dt_s=settings.dt_s)
+        recordings = open_readable(data, dt_s=settings.dt_s)
         chosen = choose_scenarios(recordings, chosen, dt_s=settings.dt_s, history=history)
     if max_scenarios is not None:
         chosen = chosen.evenly_spaced(max_scenarios)

@@ -13,13 +13,14 @@ import pytest
 ROOT = Path(__file__).parents[1]
 PACKAGES = ("asp_env", "predictors", "scenarios", "policies")
 
-ON_ALL = {"errors", "registry", "geometry", "files", "workers"}
+ON_ALL = {"errors", "registry", "geometry", "files", "workers", "compiled"}
 FOR_PREDICTORS = {"views", "metrics", "data", "dynamics"} | ON_ALL
 ARROWS = {
     "__init__": {"envs", "planning", "data", "dynamics", "errors"},
     "errors": set[str](),
     "registry": {"errors"},
-    "geometry": {"errors"},
+    "geometry": {"errors", "compiled"},
+    "compiled": set[str](),
     "files": {"errors"},
     "workers": {"errors"},
     "cli": ON_ALL,

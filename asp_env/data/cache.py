@@ -1,14 +1,15 @@
 """Cache of derived data: arrays in one file per source, mapped into memory, and whole folders.
 
-A cache file is a magic word, the length of a JSON header, the header, and the arrays one after the
-other at multiples of 64 bytes. The header holds the stamp of the files that the arrays were made
-from. Files are written atomically, so that several processes may fill the cache at the same time;
-a file that is damaged or has another stamp counts as absent.
+A cache file is a magic word, the CRC-32 of all that follows, the length of a JSON header, the
+header, and the arrays one after the other at multiples of 64 bytes. The header holds the stamp of
+the files that the arrays were made from. Files are written atomically, so that several processes
+may fill the cache at the same time; a file that is damaged or has another stamp counts as absent.
 """
 
 import hashlib
 import json
 import os
+import zlib
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -18,11 +19,15 @@ import numpy as np
 from asp_env.errors import AspEnvError, DataError
 from asp_env.files import atomic_file, atomic_folder, remove_stale
 
-FORMAT = 7
+FORMAT = 8
 """Version of the readers. Raise it whenever a reader gives other results for the same files."""
 
-_MAGIC = b"asp-env\0"
+_MAGIC = b"asp-env1"
+_CHECKED = len(_MAGIC) + 4
+"""Where the checked content begins: behind the magic word and the checksum."""
+_HEAD = _CHECKED + 4
 _ALIGNMENT = 64
+_BLOCK = 1 << 20
 
 
 def cache_folder() -> Path:
@@ -34,8 +39,8 @@ def cache_folder() -> Path:
         DataError: the folder cannot be created or written to.
     """
     named = os.environ.get("ASP_ENV_CACHE")
-    base = os.environ.get("XDG_CACHE_HOME")
-    folder = Path(named) if named else (Path(base) if base else Path.home() / ".cache") / "asp-env"
+    base = os.environ.get("XDG_CACHE_HOME") or os.path.expanduser("~/.cache")
+    folder = Path(named) if named else Path(base) / "asp-env"
     reason = "no permission to write"
     try:
         folder.mkdir(parents=True, exist_ok=True)
@@ -110,16 +115,13 @@ def load(
         or has another stamp.
     """
     try:
-        with path.open("rb") as file:
-            if file.read(len(_MAGIC)) != _MAGIC:
-                return None
-            length = int.from_bytes(file.read(8), "little")
-            if length > path.stat().st_size:
-                return None
-            header = json.loads(file.read(length))
-        if header["stamp"] != current or path.stat().st_size != header["size"]:
-            return None
         mapped = np.memmap(path, dtype=np.uint8, mode="r").view(np.ndarray)
+        head = mapped[:_HEAD].tobytes()
+        if not head.startswith(_MAGIC) or zlib.crc32(mapped[_CHECKED:]) != _number(head[8:12]):
+            return None
+        header = json.loads(mapped[_HEAD : _HEAD + _number(head[12:])].tobytes())
+        if header["stamp"] != current:
+            return None
         arrays = {
             name: mapped[offset : offset + count].view(dtype).reshape(shape)
             for name, (dtype, shape, offset, count) in header["arrays"].items()
@@ -152,13 +154,19 @@ def save(
     for name, array in plain.items():
         layout[name] = [array.dtype.str, list(array.shape), total, array.nbytes]
         total += _aligned(array.nbytes)
-    header, start = _header(made_from, facts, layout, total)
-    with atomic_file(path) as partial, partial.open("wb") as file:
-        file.write(_MAGIC + len(header).to_bytes(8, "little") + header)
+    header, start = _header(made_from, facts, layout)
+    with atomic_file(path) as partial, partial.open("w+b") as file:
+        file.write(_MAGIC + bytes(4) + len(header).to_bytes(4, "little") + header)
         for name, array in plain.items():
             file.seek(start + layout[name][2])
             file.write(array.data if array.size else b"")
         file.truncate(start + total)
+        file.seek(_CHECKED)
+        checksum = 0
+        while block := file.read(_BLOCK):
+            checksum = zlib.crc32(block, checksum)
+        file.seek(len(_MAGIC))
+        file.write(checksum.to_bytes(4, "little"))
     remove_stale(path)
 
 
@@ -175,12 +183,16 @@ def digest(path: Path) -> str:
         raise DataError(f"{path}: cannot be read: {error.strerror}") from error
 
 
+def _number(content: bytes) -> int:
+    return int.from_bytes(content, "little")
+
+
 def _aligned(count: int) -> int:
     return -(-count // _ALIGNMENT) * _ALIGNMENT
 
 
 def _header(
-    made_from: Sequence[Sequence[Any]], facts: Mapping[str, Any], layout: dict, total: int
+    made_from: Sequence[Sequence[Any]], facts: Mapping[str, Any], layout: dict
 ) -> tuple[bytes, int]:
     """The header, padded to the offset at which the arrays start, and that offset."""
     start = _ALIGNMENT
@@ -191,12 +203,11 @@ def _header(
         }
         content = {
             "stamp": made_from,
-            "size": start + total,
             "facts": dict(facts),
             "arrays": shifted,
         }
         header = json.dumps(content).encode()
-        needed = len(_MAGIC) + 8 + len(header)
+        needed = _HEAD + len(header)
         if needed <= start:
-            return header.ljust(start - len(_MAGIC) - 8), start
+            return header.ljust(start - _HEAD), start
         start = _aligned(needed)

@@ -28,8 +28,8 @@ from typing import Any, NamedTuple, SupportsIndex, no_type_check, overload
 
 import numpy as np
 from jaxtyping import Float
-from numba import njit
 
+from asp_env.compiled import njit
 from asp_env.data import cache
 from asp_env.data.classes import VULNERABLE
 from asp_env.data.recording import Recording

@@ -9,9 +9,9 @@ from typing import Any, Protocol, no_type_check, runtime_checkable
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
-from numba import njit
 
 from asp_env import registry
+from asp_env.compiled import njit
 from asp_env.data.scene import Scene
 from asp_env.data.snippets import Future
 from asp_env.data.split import TrainedOn

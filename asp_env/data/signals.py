@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from enum import IntEnum
 
 import numpy as np
-from jaxtyping import Float, Int, Int8
+from jaxtyping import Bool, Float, Int, Int8
 
 from asp_env.errors import DataError
 
@@ -32,7 +32,8 @@ class Signals:
     """
 
     stop_lines: Float[np.ndarray, "lines 2 2"]
-    """End points of each stop line, [x m, y m] in the recording's frame."""
+    """End points of each stop line, [x m, y m] in the recording's frame; NaN where the files do not
+    contain them. Scenes show signals with known stop lines only."""
     states: Int8[np.ndarray, "signals frames"]
     """`SignalState` of each signal at each frame of the recording."""
 
@@ -47,13 +48,21 @@ class Signals:
                 f"{len(self.stop_lines)} stop lines but the states of {len(self.states)} signals: "
                 "give one line for each signal"
             )
-        if not np.isfinite(self.stop_lines).all():
-            raise DataError("stop lines of signals: expected finite positions in metres")
+        unknown = np.isnan(self.stop_lines).all(axis=(1, 2), keepdims=True)
+        if not (np.isfinite(self.stop_lines) | unknown).all():
+            raise DataError(
+                "stop lines of signals: expected finite positions in metres, or NaN for all"
+            )
         if not np.isin(self.states, list(SignalState)).all():
             raise DataError(
                 "states of signals: expected "
                 + ", ".join(f"{state.value} ({state.name.lower()})" for state in SignalState)
             )
+
+    @property
+    def placed(self) -> Bool[np.ndarray, " signals"]:
+        """Mask of the signals whose stop lines are known."""
+        return np.isfinite(self.stop_lines).all(axis=(1, 2))
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -303,9 +303,12 @@ def gather_signals(
         dt_s: seconds per tick.
 
     Returns:
-        The signals, `UNKNOWN` at ticks outside a recording; None if no recording has signals.
+        The signals whose stop lines are known, `UNKNOWN` at ticks outside a recording; None if no
+        recording has any.
     """
-    count = max((len(r.signals.states) for r in recordings if r.signals is not None), default=0)
+    count = max(
+        (int(r.signals.placed.sum()) for r in recordings if r.signals is not None), default=0
+    )
     if not count:
         return None
     stop_lines = np.zeros((len(recordings), count, 2, 2))
@@ -316,9 +319,10 @@ def gather_signals(
         stride = frames_per_tick(recording.frame_rate_hz, dt_s)
         frames = (now + np.arange(-history, 1)) * stride
         known = (frames >= 0) & (frames < recording.num_frames)
-        signals = len(recording.signals.states)
-        stop_lines[row, :signals] = recording.signals.stop_lines
-        states[row, :signals, known] = recording.signals.states[:, frames[known]].T
+        placed = recording.signals.placed
+        signals = int(placed.sum())
+        stop_lines[row, :signals] = recording.signals.stop_lines[placed]
+        states[row, :signals, known] = recording.signals.states[placed][:, frames[known]].T
     return SceneSignals(stop_lines=stop_lines, states=states)
 
 

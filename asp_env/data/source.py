@@ -3,6 +3,7 @@
 import hashlib
 import re
 import warnings
+from collections import Counter
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import replace
 from functools import partial
@@ -11,10 +12,13 @@ from pathlib import Path
 from typing import Any, SupportsIndex, overload
 
 from asp_env import registry
-from asp_env.data.readers import interaction, levelx
+from asp_env.data.readers.layout import ARCHIVE, archive_hint, shorten
 from asp_env.data.readers.opening import ReaderState, RecordingFiles, content_hash, open_recording
 from asp_env.data.recording import DEFAULT_DT_S, Recording
-from asp_env.errors import DataError, unknown_name
+from asp_env.errors import AspEnvError, DataError, LeftOutWarning, unknown_name
+
+_FIRST = ("levelx", "interaction")
+"""Readers whose recordings stand before those of others."""
 
 _SCHEME = re.compile(r"^([a-z][a-z0-9-]+):(.*)$", re.DOTALL)
 
@@ -130,9 +134,9 @@ def open_data(data: str | Path, *, dt_s: float = DEFAULT_DT_S) -> Recordings:
     resampled to the nearest frame rate for which it is.
 
     Args:
-        data: a folder with recordings in the inD/rounD layout, the INTERACTION layout, or both;
-            `sample:intersection` or `sample:roundabout`; or `scheme:argument` of a registered
-            source.
+        data: a folder with recordings in layouts of the registered readers, such as those of inD,
+            rounD and INTERACTION; `sample:intersection` or `sample:roundabout`; or
+            `scheme:argument` of a registered source.
         dt_s: seconds per tick with which the recordings will be used.
 
     Returns:
@@ -146,21 +150,65 @@ def open_data(data: str | Path, *, dt_s: float = DEFAULT_DT_S) -> Recordings:
     folder = source_folder(source)
     if not folder.is_dir():
         what = "is a file" if folder.exists() else "does not exist"
+        if folder.exists() and ARCHIVE.search(folder.name):
+            what = "is an archive, unpack it first"
         raise DataError(f"data {source!r}: {folder} {what}; expected a folder with recordings")
-    files = (*levelx.find_recordings(folder), *interaction.find_recordings(folder))
+    files = _find(folder)
     if not files:
         raise DataError(
             f"data {source!r}: no recordings found; expected XX_recordingMeta.csv, "
-            "XX_tracksMeta.csv and XX_tracks.csv, or LOCATION/vehicle_tracks_NNN.csv, "
-            "in the folder or below"
+            "XX_tracksMeta.csv and XX_tracks.csv, or LOCATION/vehicle_tracks_NNN.csv, or the "
+            f"files of another reader ({', '.join(registry.names('readers'))}), in the folder or "
+            f"below{archive_hint(folder)}"
         )
-    names = [each.name for each in files]
-    if duplicate := next((name for name in names if names.count(name) > 1), None):
+    counts = Counter(each.name for each in files)
+    if duplicate := next((name for name, count in counts.items() if count > 1), None):
         raise DataError(
             f"data {source!r}: two recordings are called {duplicate}, expected unique names; "
             "put each layout in a folder of its own"
         )
     return Recordings(source, files, dt_s=dt_s)
+
+
+def open_readable(
+    data: str | Path, *, dt_s: float = DEFAULT_DT_S, strict: bool = False
+) -> Recordings:
+    """Finds recordings, reads all, and leaves out those that cannot be read, with one warning.
+
+    Args:
+        data: as `open_data` takes it.
+        dt_s: seconds per tick; recordings whose frames are too far apart for it are left out, too.
+        strict: whether a recording that cannot be read is an error instead.
+
+    Returns:
+        The recordings that can be read, at least one.
+
+    Raises:
+        AspEnvError: the source is unknown, no recording can be read, or one cannot and `strict`.
+        LeftOutWarning: a recording cannot be read and this warning is an error, as by the option
+            `--strict` of commands.
+    """
+    recordings = open_data(data, dt_s=dt_s)
+    faults: dict[int, AspEnvError] = {}
+    for number in range(len(recordings)):
+        try:
+            recordings[number]
+        except AspEnvError as error:
+            faults[number] = error
+    if not faults:
+        return recordings
+    first = next(iter(faults.values()))
+    names = shorten([recordings.names[number] for number in faults])
+    if len(recordings) == 1:
+        raise first
+    message = (
+        f"data {recordings.source!r}: {len(faults)} of {len(recordings)} recordings cannot be used "
+        f"({names}): {first}"
+    )
+    if strict or len(faults) == len(recordings):
+        raise DataError(message)
+    warnings.warn(LeftOutWarning(f"{message}; left out"), stacklevel=2)
+    return recordings.subset(n for n in range(len(recordings)) if n not in faults)
 
 
 def join_data(parts: Sequence[Recordings]) -> Recordings:
@@ -227,6 +275,21 @@ def source_folder(source: str) -> Path:
     if scheme not in known:
         raise unknown_name("source", scheme, ["sample", *known])
     return Path(registry.find("sources", scheme)(argument))
+
+
+def _find(folder: Path) -> tuple[RecordingFiles, ...]:
+    """The recordings that all registered readers find in a folder, this package's layouts first."""
+    names = [*_FIRST, *(name for name in registry.names("readers") if name not in _FIRST)]
+    found: list[RecordingFiles] = []
+    for name in names:
+        try:
+            found += registry.find("readers", name)(folder)
+        except OSError as error:
+            raise DataError(f"{error.filename or folder}: {error.strerror or error}") from error
+        except Exception as error:  # a reader of another package may raise anything
+            reason = " ".join(f"{type(error).__name__}: {error}".split())
+            warnings.warn(f"reader {name!r} is left out: {reason}", stacklevel=3)
+    return tuple(found)
 
 
 def _sample(site: str) -> Path:

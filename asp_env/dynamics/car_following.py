@@ -14,8 +14,8 @@ from typing import no_type_check
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
-from numba import njit
 
+from asp_env.compiled import njit
 from asp_env.dynamics.bicycle import (
     AXLE_SHARE_OF_LENGTH,
     MAX_ACCELERATION_MPS2,

@@ -8,6 +8,7 @@ import dataclasses
 import sys
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -21,7 +22,7 @@ from asp_env.data.scenarios.selection import choose_scenarios, scenario_of
 from asp_env.data.scenarios.tags import TAGS
 from asp_env.data.scene import EGO, Scene, infer_actions
 from asp_env.data.snippets import HISTORY_S, Future
-from asp_env.data.source import Recordings, open_data
+from asp_env.data.source import Recordings, open_readable
 from asp_env.envs.compilation import announce_compilation
 from asp_env.envs.forecasts import Present, extended_space, forecast_observers
 from asp_env.envs.options import ReplayOptions, raster_size
@@ -192,7 +193,7 @@ class ReplayEpisodes:
         """
         announce_compilation()
         history = ticks(HISTORY_S, options.dt_s)
-        self.recordings = open_data(data, dt_s=options.dt_s)
+        self.recordings = open_readable(data, dt_s=options.dt_s)
         self._sampler = ScenarioSampler.choose(
             self.recordings, options.scenarios, dt_s=options.dt_s, history=history
         )
@@ -487,11 +488,32 @@ class ReplayEpisodes:
         """Returns the whole state for `restore`; it holds no recordings and no rasters."""
         forecasts = [each.snapshot() for each in self._forecasts]
         statistics = self._return.copy(), self._num_steps.copy(), dict(self._terms)
-        return self.simulation.snapshot(), self._seeds.copy(), forecasts, statistics
+        state = self.simulation.snapshot(), self._seeds.copy(), forecasts, statistics
+        return self._origin, state
+
+    @cached_property
+    def _origin(self) -> dict[str, Any]:
+        """What a snapshot must agree with to be restored here."""
+        world = self.simulation.world
+        return {
+            "data": f"of content {self.recordings.data_hash()[:12]}",
+            "time step": f"{world.dt_s:g} s",
+            "episodes": len(self._rows),
+        }
 
     def restore(self, snapshot: Any) -> None:
-        """Restores the state of a snapshot, bit for bit."""
-        simulation, seeds, forecasts, (returns, num_steps, terms) = snapshot
+        """Restores the state of a snapshot, bit for bit.
+
+        Raises:
+            AspEnvError: the snapshot is of other data or of another number of episodes.
+        """
+        origin, (simulation, seeds, forecasts, (returns, num_steps, terms)) = snapshot
+        for name, given in origin.items():
+            if given != self._origin[name]:
+                raise AspEnvError(
+                    f"the snapshot is of an environment with {name} {given}, expected "
+                    f"{self._origin[name]}; restore it in an environment with the same arguments"
+                )
         self.simulation.restore(simulation)
         self._return, self._num_steps = returns.copy(), num_steps.copy()
         self._terms = dict(terms)

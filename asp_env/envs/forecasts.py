@@ -14,8 +14,8 @@ from typing import Any, Literal, NamedTuple, Protocol, no_type_check, runtime_ch
 import numpy as np
 from gymnasium import spaces
 from jaxtyping import Bool, Float, Int
-from numba import njit
 
+from asp_env.compiled import njit
 from asp_env.data.predictor import (
     Predictor,
     continued,

@@ -395,6 +395,9 @@ name; several in a mapping with their prefixes |
         """Restores a snapshot of this environment or of one made with the same arguments.
 
         Everything that follows is the same bit for bit.
+
+        Raises:
+            AspEnvError: the snapshot is of an environment with other arguments.
         """
         if snapshot.arrays is None:
             rng = np.random.default_rng()

@@ -307,7 +307,11 @@ class ReplayVectorEnv(SharedInSpec, VectorEnv[Any, Any, np.ndarray]):  # pyright
         )
 
     def restore(self, snapshot: VectorSnapshot) -> None:
-        """Restores a snapshot of this environment or of one made with the same arguments."""
+        """Restores a snapshot of this environment or of one made with the same arguments.
+
+        Raises:
+            AspEnvError: the snapshot is of an environment with other arguments.
+        """
         self._episodes.restore(snapshot.episodes)
         for generator, state in zip(self.np_random, snapshot.generators, strict=True):
             generator.bit_generator.state = state

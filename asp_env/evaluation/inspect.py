@@ -21,7 +21,7 @@ from asp_env.data.snippets import HISTORY_S, SNIPPET_INTERVAL_S, find_snippets
 from asp_env.data.source import Recordings, open_data
 from asp_env.dynamics import inverse, rollout
 from asp_env.dynamics.bicycle import Integrator
-from asp_env.errors import DataError, RepairWarning
+from asp_env.errors import AspEnvError, DataError, RepairWarning
 from asp_env.metrics.drivable import CELL_M, drivable_field
 from asp_env.metrics.forecast.errors import moving
 
@@ -154,12 +154,18 @@ class Inspect:
             disable=not console.is_terminal,
         )
         for number in numbers:
+            name = recordings.names[number]
             try:
                 with warnings.catch_warnings():
                     warnings.simplefilter("ignore", RepairWarning)  # repairs are listed
                     recording = recordings[number]
             except DataError as error:
-                faults[recordings.names[number]] = str(error)
+                faults[name] = str(error)
+                continue
+            except AspEnvError as error:  # its frames are too far apart for the tick
+                if len(recordings) == 1:
+                    raise
+                faults[name] = f"recording {name}: {error}"
                 continue
             summaries.append(
                 RecordingSummary(

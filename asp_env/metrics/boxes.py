@@ -6,8 +6,8 @@ from typing import no_type_check
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
-from numba import njit
 
+from asp_env.compiled import njit
 from asp_env.data.classes import AgentClass
 from asp_env.dynamics.bicycle import AXLE_SHARE_OF_LENGTH
 from asp_env.geometry import overlaps, turned_overlaps

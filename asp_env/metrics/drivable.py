@@ -7,8 +7,8 @@ from typing import no_type_check
 import cv2
 import numpy as np
 from jaxtyping import Bool, Float
-from numba import njit
 
+from asp_env.compiled import njit
 from asp_env.data.road_map import MapCache, RoadMap
 from asp_env.errors import DataError
 from asp_env.geometry import route_coordinates

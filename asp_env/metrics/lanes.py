@@ -12,8 +12,8 @@ from typing import no_type_check
 
 import numpy as np
 from jaxtyping import Bool, Float
-from numba import njit
 
+from asp_env.compiled import njit
 from asp_env.data.road_map import MapCache, RoadMap
 from asp_env.geometry import box_corners, path_length
 from asp_env.metrics.masked import Masked

@@ -15,8 +15,8 @@ from typing import NamedTuple, no_type_check
 
 import numpy as np
 from jaxtyping import Float, Int
-from numba import njit
 
+from asp_env.compiled import njit
 from asp_env.data.predictor import Forecast
 from asp_env.data.scene import EGO, Scene
 from asp_env.dynamics.bicycle import AXLE_SHARE_OF_LENGTH, MAX_ACCELERATION_MPS2

@@ -7,8 +7,8 @@ from typing import no_type_check
 
 import numpy as np
 from jaxtyping import Float
-from numba import njit
 
+from asp_env.compiled import njit
 from asp_env.data.predictor import Forecast
 from asp_env.data.scene import EGO, Scene
 from asp_env.dynamics import MAX_ACCELERATION_MPS2, forward

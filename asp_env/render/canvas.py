@@ -6,7 +6,8 @@ from typing import no_type_check
 import cv2
 import numpy as np
 from jaxtyping import Float, Int, Shaped, UInt8
-from numba import njit
+
+from asp_env.compiled import njit
 
 SHIFT = 4
 """OpenCV takes coordinates in units of 2**-SHIFT pixels."""

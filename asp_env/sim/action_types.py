@@ -16,8 +16,8 @@ from typing import Literal, get_args, no_type_check
 
 import numpy as np
 from jaxtyping import Bool, Float
-from numba import njit
 
+from asp_env.compiled import njit
 from asp_env.dynamics import (
     MAX_ACCELERATION_MPS2,
     clip_actions,

@@ -13,8 +13,8 @@ from typing import no_type_check
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
-from numba import njit
 
+from asp_env.compiled import njit
 from asp_env.data.recording import Recording, frames_per_tick
 from asp_env.data.scenarios.scenario import Scenario
 from asp_env.data.scene import EGO

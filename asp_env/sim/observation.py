@@ -13,8 +13,8 @@ from typing import Protocol, final, no_type_check, runtime_checkable
 import numpy as np
 from gymnasium import spaces
 from jaxtyping import Bool, Float, Int, Shaped
-from numba import njit
 
+from asp_env.compiled import njit
 from asp_env.data.road_map import RoadMap
 from asp_env.data.scene import EGO, infer_actions
 from asp_env.data.signals import SceneSignals

@@ -7,8 +7,8 @@ from typing import no_type_check
 
 import numpy as np
 from jaxtyping import Bool, Float
-from numba import njit
 
+from asp_env.compiled import njit
 from asp_env.dynamics import MAX_ACCELERATION_MPS2
 from asp_env.errors import AspEnvError, unknown_name
 from asp_env.metrics.drivable import OFF_ROAD_M

@@ -17,7 +17,8 @@ import math
 from typing import no_type_check
 
 import numpy as np
-from numba import njit
+
+from asp_env.compiled import njit
 
 SET = 255
 """Value of a covered pixel of a binary raster; all other pixels are 0."""

@@ -13,8 +13,8 @@ from typing import NamedTuple, no_type_check
 
 import numpy as np
 from jaxtyping import Float, Int64
-from numba import njit
 
+from asp_env.compiled import njit
 from asp_env.data.road_map import LineType, RoadMap
 
 BOUNDARIES = (LineType.CURB, LineType.SOLID)

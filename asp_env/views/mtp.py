@@ -36,8 +36,8 @@ from typing import Any, ClassVar, NamedTuple, final, no_type_check
 
 import numpy as np
 from jaxtyping import Int64, UInt8, UInt32
-from numba import njit
 
+from asp_env.compiled import njit
 from asp_env.data.classes import VULNERABLE, AgentClass
 from asp_env.data.road_map import LineType, MapCache, RoadMap
 from asp_env.errors import AspEnvError

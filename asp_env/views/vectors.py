@@ -27,8 +27,8 @@ from typing import Any, NamedTuple, final, no_type_check
 
 import numpy as np
 from jaxtyping import Bool, Float, Float32, Int, Int64
-from numba import njit
 
+from asp_env.compiled import njit
 from asp_env.data.classes import AgentClass
 from asp_env.data.road_map import LineType, MapCache, RoadMap
 from asp_env.errors import AspEnvError

@@ -9,7 +9,7 @@ from dataclasses import dataclass
 from itertools import product
 from typing import Any
 
-from asp_env.data.source import open_data
+from asp_env.data.source import open_readable
 from asp_env.errors import AspEnvError, unknown_name
 
 SEGMENT_S = 3.0
@@ -86,7 +86,9 @@ def open_sites(data: Sequence[str], validation: Sequence[str], test: Sequence[st
 
 
 def _open_site(name: str, data: str, validation: str | None, test: str | None) -> Site:
-    opened = {given: open_data(given) for given in (data, validation, test) if given is not None}
+    opened = {
+        given: open_readable(given) for given in (data, validation, test) if given is not None
+    }
     if test is not None:
         names = dict(zip(opened[test].hashes(), opened[test].names, strict=True))
         for other in (each for each in (data, validation) if each is not None):

@@ -40,7 +40,7 @@ from rich.table import Table
 from asp_env import registry
 from asp_env.data.predictor import Predictor, load_predictor
 from asp_env.data.snippets import SnippetIndex
-from asp_env.data.source import Recordings, join_data, open_data
+from asp_env.data.source import Recordings, join_data, open_readable
 from asp_env.data.split import TrainedOn
 from asp_env.errors import AspEnvError
 from asp_env.evaluation import statistics
@@ -143,7 +143,7 @@ class Study:
         start, _ = folder_and_chaining(name, argument)
         tuning = FineTuning() if options.epochs is None else FineTuning(epochs=options.epochs)
         config = config_from(name, start, tuning)
-        recordings = join_data([open_data(each, dt_s=config.dt_s) for each in options.data])
+        recordings = join_data([open_readable(each, dt_s=config.dt_s) for each in options.data])
         index = snippets_of(recordings, config)
         if options.by == "recordings":
             group = index.recording

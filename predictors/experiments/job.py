@@ -14,7 +14,7 @@ from asp_env.data import cache
 from asp_env.data.histories import History, histories
 from asp_env.data.predictor import load_predictor
 from asp_env.data.recording import DEFAULT_DT_S, ticks
-from asp_env.data.source import open_data
+from asp_env.data.source import open_readable
 from asp_env.errors import AspEnvError
 from predictors.experiments.errors import compute_errors, snippets_to_evaluate, stamp_of
 from predictors.training.command import Train
@@ -87,7 +87,7 @@ class EvaluationJob:
             for chaining in self.chainings:
                 other = load_predictor(f"{name}@{chaining}", horizon=horizon, dt_s=dt_s)
                 predictors[chaining] = other
-        recordings = open_data(self.data)
+        recordings = open_readable(self.data, dt_s=dt_s)
         index = snippets_to_evaluate(
             recordings,
             horizon_s=self.horizon_s,

@@ -21,7 +21,7 @@ from rich.table import Table
 
 from asp_env.data.predictor import load_predictor
 from asp_env.data.recording import DEFAULT_DT_S, ticks
-from asp_env.data.source import open_data
+from asp_env.data.source import open_readable
 from asp_env.evaluation.selection import expand_runs
 from asp_env.evaluation.statistics import (
     Difference,
@@ -69,7 +69,7 @@ class Paired:
         Raises:
             AspEnvError: The data or a predictor are bad.
         """
-        recordings = open_data(self.data)
+        recordings = open_readable(self.data, dt_s=DEFAULT_DT_S)
         index = snippets_to_evaluate(
             recordings,
             horizon_s=self.horizon,

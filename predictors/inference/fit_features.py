@@ -20,7 +20,7 @@ from asp_env import registry
 from asp_env.data.histories import histories
 from asp_env.data.recording import Recording
 from asp_env.data.snippets import SnippetIndex, gather_scene, index_snippets
-from asp_env.data.source import Recordings, join_data, open_data
+from asp_env.data.source import Recordings, join_data, open_readable
 from asp_env.data.split import TrainedOn, num_ticks, part_of_ticks
 from asp_env.errors import AspEnvError, CheckpointError
 from predictors.inference.checkpoint import (
@@ -90,7 +90,7 @@ def add_feature_distance(folder: Path, data: Sequence[str]) -> FeatureDistance:
     predictor = load_trained(spec, str(folder))
     if not data:
         raise AspEnvError("no DATA: expected the validation data of the run")
-    recordings = join_data([open_data(each, dt_s=predictor.dt_s) for each in data])
+    recordings = join_data([open_readable(each, dt_s=predictor.dt_s) for each in data])
     index = index_snippets(
         recordings,
         dt_s=predictor.dt_s,

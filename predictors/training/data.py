@@ -11,7 +11,7 @@ from jaxtyping import Bool, Int, Shaped
 from asp_env.data.histories import histories
 from asp_env.data.recording import Recording
 from asp_env.data.snippets import SnippetIndex, gather_future, gather_present, index_snippets
-from asp_env.data.source import Recordings, join_data, open_data
+from asp_env.data.source import Recordings, join_data, open_readable
 from asp_env.data.split import TrainedOn, snippet_parts
 from asp_env.dynamics import MAX_ACCELERATION_MPS2, MAX_STEERING_RAD, inverse
 from asp_env.errors import AspEnvError
@@ -189,8 +189,8 @@ class TrainingData:
 
 
 def open_all(data: str | Sequence[str], *, dt_s: float) -> list[Recordings]:
-    """Opens one or several DATA for ticks of `dt_s` seconds."""
-    return [open_data(each, dt_s=dt_s) for each in ([data] if isinstance(data, str) else data)]
+    """Opens the recordings of one or several DATA that can be read, for ticks of `dt_s` seconds."""
+    return [open_readable(each, dt_s=dt_s) for each in ([data] if isinstance(data, str) else data)]
 
 
 def open_training_data(config: TrainingConfig, data: str | Sequence[str]) -> TrainingData:

@@ -9,8 +9,7 @@ import numpy as np
 import pandas as pd
 from jaxtyping import Bool, Float, Int
 
-from asp_env.data.classes import parse_class
-from asp_env.data.readers.tables import find_line
+from asp_env.data.classes import AgentClass, parse_class
 from asp_env.errors import DataError
 from asp_env.geometry import wrap_angle
 
@@ -46,10 +45,20 @@ class TrackTable:
     """Frames per second of the files where the rows are interpolated; None where they are not."""
 
 
+ARCHIVE = re.compile(r"\.(zip|7z|rar|tar|tgz|tbz2|txz|tar\.(gz|bz2|xz|zst))$", re.IGNORECASE)
+"""The end of the name of an archive, which has to be unpacked before it can be read."""
+
+
+def is_hidden(name: str) -> bool:
+    """Whether a file or folder is hidden or temporary, such as `._NAME`, `__MACOSX`, `~$NAME`."""
+    return name.startswith((".", "~")) or name.upper() == "__MACOSX"
+
+
 def walk(root: Path) -> list[tuple[Path, list[str]]]:
     """Every folder in and below `root` with the names of its files.
 
-    Hidden folders are skipped; links are followed, but no folder is visited twice.
+    Hidden and temporary files and folders are left out; links are followed, but no folder is
+    visited twice.
     """
     visited: set[str] = set()
     found = []
@@ -59,9 +68,17 @@ def walk(root: Path) -> list[tuple[Path, list[str]]]:
             folders.clear()
             continue
         visited.add(real)
-        folders[:] = sorted(name for name in folders if not name.startswith("."))
-        found.append((Path(folder), sorted(names)))
+        folders[:] = sorted(name for name in folders if not is_hidden(name))
+        found.append((Path(folder), sorted(name for name in names if not is_hidden(name))))
     return found
+
+
+def archive_hint(folder: Path) -> str:
+    """The end of an error message that names the archives in and below a folder; may be empty."""
+    if not folder.is_dir():
+        return ""
+    names = [name for _, names in walk(folder) for name in names if ARCHIVE.search(name)]
+    return f"; unpack {shorten(names)} first" if names else ""
 
 
 def with_parents(folder: Path, top: Path) -> list[Path]:
@@ -82,14 +99,19 @@ def find_maps(folder: Path, maps_by_folder: dict[Path, list[Path]]) -> list[Path
     """
     if folder not in maps_by_folder:
         paths = (place / name for place, names in walk(folder) for name in names)
-        maps_by_folder[folder] = sorted(path for path in paths if path.suffix in MAP_SUFFIXES)
+        maps_by_folder[folder] = sorted(path for path in paths if map_suffix(path) in MAP_SUFFIXES)
     return maps_by_folder[folder]
+
+
+def map_suffix(path: Path) -> str:
+    """The suffix of a file in lower case, such as those in `MAP_SUFFIXES`."""
+    return path.suffix.lower()
 
 
 def natural_key(name: str) -> list[tuple[int, int, str]]:
     """A sort key that orders numbers in names by value: `9` before `10`."""
-    parts = re.split(r"(\d+)", name)
-    return [(1, int(part), "") if part.isdigit() else (0, 0, part) for part in parts]
+    parts = re.split(r"([0-9]+)", name)
+    return [(1, int(part), "") if index % 2 else (0, 0, part) for index, part in enumerate(parts)]
 
 
 def shorten(names: list[str], limit: int = 5) -> str:
@@ -98,26 +120,37 @@ def shorten(names: list[str], limit: int = 5) -> str:
     return ", ".join(names[:limit]) + more
 
 
-def classes_of(path: Path, column: str, names: np.ndarray) -> Int[np.ndarray, " rows"]:
-    """`AgentClass` of each row.
+class ClassNames:
+    """Reads class names; those that are not in the table become `other` and are counted."""
 
-    Args:
-        path: the file that the names are from, for error messages.
-        column: the name of their column.
-        names: (rows,) class names as the file has them.
+    def __init__(self) -> None:
+        self._unknown: dict[str, set[object]] = {}
+        """Tracks of each unknown name."""
 
-    Raises:
-        DataError: a name is unknown.
-    """
-    codes, known = pd.factorize(names)
-    numbers = []
-    for name in known:
-        try:
-            numbers.append(int(parse_class(str(name))))
-        except DataError as error:
-            line = find_line(path, {column: str(name)})
-            raise DataError(f"{path}, line {line}: {error}") from None
-    return np.array(numbers, dtype=np.int8)[codes]
+    def classes(self, names: np.ndarray, tracks: np.ndarray) -> Int[np.ndarray, " rows"]:
+        """`AgentClass` of each row.
+
+        Args:
+            names: (rows,) class names as the file has them.
+            tracks: (rows,) id of the track of each row, a number or a text.
+        """
+        codes, known = pd.factorize(names)
+        numbers = []
+        for code, name in enumerate(known):
+            try:
+                numbers.append(int(parse_class(str(name))))
+            except DataError:
+                found = np.unique(tracks[codes == code]).tolist()
+                self._unknown.setdefault(" ".join(str(name).split())[:40], set()).update(found)
+                numbers.append(int(AgentClass.OTHER))
+        return np.array(numbers, dtype=np.int8)[codes]
+
+    def repairs(self) -> list[str]:
+        """One line for each unknown name, with the number of its tracks."""
+        return [
+            f"{len(tracks)} tracks of the unknown class {name!r} are read as 'other'"
+            for name, tracks in sorted(self._unknown.items())
+        ]
 
 
 def states_of(

@@ -7,6 +7,7 @@ for each recording, not for each location: the origin differs between recordings
 
 import math
 import re
+from collections import Counter
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -17,9 +18,11 @@ from jaxtyping import Float, Int
 from asp_env.data.classes import FOOTPRINTS_M, VULNERABLE
 from asp_env.data.readers.layout import (
     COURSE_ABOVE_MPS,
+    ClassNames,
     TrackTable,
-    classes_of,
+    archive_hint,
     find_maps,
+    map_suffix,
     natural_key,
     shorten,
     states_of,
@@ -69,8 +72,11 @@ MARGIN_PX = 5.0
 """Distance by which positions may lie outside the image, for rounded scales and smoothed positions.
 Chosen by hand."""
 
-_PART = re.compile(r"^(.+)_(recordingMeta\.csv|tracksMeta\.csv|tracks\.csv(?:\.gz)?)$")
-_TIME = re.compile(r"^(\d{1,2}(?:\.\d*)?)(?::([0-5]\d)(?::[0-5]\d)?)?$")
+_PART = re.compile(
+    r"^(.+)_(recordingMeta\.csv|tracksMeta\.csv|tracks\.csv(?:\.gz)?|background\.png)$",
+    re.IGNORECASE,
+)
+_TIME = re.compile(r"^(\d{1,2}(?:\.\d*)?)(?::([0-5]\d)(?::[0-5]\d)?)?$", re.ASCII)
 _META: Mapping[str, Kind] = {
     "trackId": "id",
     "initialFrame": "whole",
@@ -137,6 +143,7 @@ class LevelxFiles:
                 raise DataError(
                     f"{path}: no such file, though {', '.join(present)} exists; "
                     "copy it to the same folder or remove the recording"
+                    f"{archive_hint(path.parent)}"
                 )
 
 
@@ -179,22 +186,22 @@ def find_recordings(root: Path) -> tuple[LevelxFiles, ...]:
     for folder, names in walk(root):
         for name in names:
             if match := _PART.match(name):
-                kind = match[2].split(".")[0]
+                kind = match[2].split(".")[0].lower()
                 parts.setdefault((folder, match[1]), {})[kind] = folder / name
-    ids = [prefix for _, prefix in parts]
+    parts = {key: files for key, files in parts.items() if set(files) != {"background"}}
+    ids = Counter(prefix for _, prefix in parts)
     found = []
     for (folder, prefix), files in parts.items():
-        background = folder / f"{prefix}_background.png"
         place = folder.parent if folder.name == "data" else folder
         inside = place.relative_to(root) if place.is_relative_to(root) else Path()
         found.append(
             LevelxFiles(
-                name=prefix if ids.count(prefix) == 1 else (inside / prefix).as_posix(),
+                name=prefix if ids[prefix] == 1 else (inside / prefix).as_posix(),
                 root=root,
-                recording_meta=files.get("recordingMeta", folder / f"{prefix}_recordingMeta.csv"),
-                tracks_meta=files.get("tracksMeta", folder / f"{prefix}_tracksMeta.csv"),
+                recording_meta=files.get("recordingmeta", folder / f"{prefix}_recordingMeta.csv"),
+                tracks_meta=files.get("tracksmeta", folder / f"{prefix}_tracksMeta.csv"),
                 tracks=files.get("tracks", folder / f"{prefix}_tracks.csv"),
-                background=background if background.is_file() else None,
+                background=files.get("background"),
             )
         )
     return tuple(sorted(found, key=lambda files: natural_key(files.name)))
@@ -216,6 +223,11 @@ def read_recording_meta(path: Path) -> RecordingMeta:
         },
         limits=_LIMITS,
     )
+    if len(table["frameRate"]) > 1:
+        raise DataError(
+            f"{path}, line 3: a second row (recordingId {table['recordingId'][1]}), expected one "
+            "row, of one recording; remove the others"
+        )
     rate = float(table["frameRate"][0])
     if not LOWEST_HZ <= rate <= HIGHEST_HZ:
         raise DataError(
@@ -258,7 +270,7 @@ def find_map(
     """
     top = files.root.parent if files.root.name == "data" else files.root
     for folder in with_parents(files.recording_meta.parent, top):
-        maps = [path for path in find_maps(folder, maps_by_folder) if path.suffix == ".osm"]
+        maps = [path for path in find_maps(folder, maps_by_folder) if map_suffix(path) == ".osm"]
         fitting = [path for path in maps if _names_location(path, meta.location)]
         under_construction = meta.location == 1 and meta.number in CONSTRUCTION_RECORDINGS
         preferred = [path for path in fitting if _is_construction(path) == under_construction]
@@ -268,6 +280,7 @@ def find_map(
     raise DataError(
         f"{files.root}: no map for location {meta.location} of recording {files.name}; "
         f"expected a lanelet2 file location{meta.location}.osm in it or below"
+        f"{archive_hint(files.root)}"
     )
 
 
@@ -331,12 +344,13 @@ def read_levelx(files: LevelxFiles) -> TrackTable:
     _check_unique(files, ids_in_meta, numbered)
     order = np.argsort(ids_in_meta)
     ids = ids_in_meta[order]
-    classes = classes_of(files.tracks_meta, "class", meta["class"])[order]
+    names = ClassNames()
+    classes = names.classes(meta["class"], ids_in_meta)[order]
     _check_same_tracks(files, rows, ids, numbered)
     check_extent(
         rows.measured[:, :2], ("xCenter", "yCenter"), lambda row: _line(files, rows, row, numbered)
     )
-    repairs = numbered.repairs
+    repairs = [*names.repairs(), *numbered.repairs]
     rows, step = _count_frames(files, rows, meta, numbered, repairs)
     begins = np.flatnonzero(np.diff(rows.track, prepend=rows.track[0] - 1))
     _compare_frames(rows, begins, meta, order, repairs)
@@ -386,10 +400,10 @@ def _along_motion(
 
 
 def _names_location(path: Path, location: int) -> bool:
-    own = re.search(r"location[_-]?0*(\d+)$", path.stem, re.IGNORECASE)
+    own = re.search(r"location[_-]?0*(\d+)$", path.stem, re.IGNORECASE | re.ASCII)
     if own:
         return int(own[1]) == location
-    folder = re.match(r"0*(\d+)[_-]", path.parent.name)
+    folder = re.match(r"0*([0-9]+)[_-]", path.parent.name)
     return bool(folder) and int(folder[1]) == location
 
 

@@ -4,7 +4,7 @@ import functools
 import hashlib
 import struct
 import warnings
-from collections.abc import Callable, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
@@ -13,10 +13,15 @@ import numpy as np
 
 from asp_env.data import cache
 from asp_env.data.readers import interaction, levelx
+from asp_env.data.readers.caching import CacheEntry, cached
+from asp_env.data.readers.driven_area import driven_area
+from asp_env.data.readers.found import FoundRecording
 from asp_env.data.readers.interaction import InteractionFiles, InteractionMeta, read_interaction
+from asp_env.data.readers.interaction_cases import CaseFiles, read_case
 from asp_env.data.readers.lanelet2 import Lanelet2File, make_road_map, parse_lanelet2
 from asp_env.data.readers.layout import TrackTable
 from asp_env.data.readers.levelx import LevelxFiles, RecordingMeta, read_levelx
+from asp_env.data.readers.measurements import derive_tracks
 from asp_env.data.readers.placing import (
     Box,
     check_place,
@@ -28,16 +33,14 @@ from asp_env.data.readers.positions import Origin
 from asp_env.data.readers.resampling import resample
 from asp_env.data.recording import DEFAULT_DT_S, Background, Recording, rate_for_ticks
 from asp_env.data.road_map import Ragged, RoadMap
+from asp_env.data.signals import Signals
 from asp_env.errors import DataError, RepairWarning
 
-RecordingFiles = LevelxFiles | InteractionFiles
+RecordingFiles = LevelxFiles | InteractionFiles | CaseFiles | FoundRecording
 """The files of one recording, of any layout."""
 
 Meta = RecordingMeta | InteractionMeta
 """The metadata of one recording, of any layout."""
-
-CacheEntry = tuple[dict[str, Any], dict[str, np.ndarray]]
-"""Facts and arrays, the content of a cache file."""
 
 MapKey = tuple[Path, Origin, Box | None, tuple[str, ...]]
 """File, frame, region (None: all) and the lanelets of unlisted subtypes that are roads."""
@@ -66,10 +69,14 @@ class ReaderState:
     dt_s: float = DEFAULT_DT_S
     """Seconds per tick. Recordings whose rate does not fit are resampled."""
     recordings: dict[str, Recording] = field(default_factory=dict)
-    maps: dict["MapKey", RoadMap] = field(default_factory=dict)
+    maps: dict["MapKey | Path | str", RoadMap] = field(default_factory=dict)
+    """By file, frame and part; by a table of cases, which have one map; or by a hash of their
+    content."""
     places: dict[str, tuple[Meta, Path]] = field(default_factory=dict)
     """Metadata and path of the map of each recording."""
     hashes: dict[str, str] = field(default_factory=dict)
+    tables: dict[Path, CacheEntry] = field(default_factory=dict)
+    """Tables of several recordings."""
     maps_by_folder: dict[Path, list[Path]] = field(default_factory=dict)
     """Map files by folder. Without it, opening N recordings would list N² files."""
 
@@ -86,10 +93,14 @@ def open_recording(files: RecordingFiles, state: ReaderState) -> Recording:
         AspEnvError: its frames are too far apart for the tick.
     """
     if files.name not in state.recordings:
-        meta, map_path = _place(files, state)
-        recording = _recording(files, meta, _NO_MAP, state.dt_s)
-        road_map = _road_map(files, recording, map_path, meta.origin, state)
-        state.recordings[files.name] = replace(recording, road_map=road_map)
+        if isinstance(files, FoundRecording):
+            recording = _open_found(files, state)
+        else:
+            meta, map_path = _place(files, state)
+            recording = _recording(files, meta, state)
+            road_map = _road_map(files, recording, map_path, meta.origin, state)
+            recording = replace(recording, road_map=road_map)
+        state.recordings[files.name] = recording
     return state.recordings[files.name]
 
 
@@ -104,20 +115,36 @@ def content_hash(files: RecordingFiles, state: ReaderState) -> str:
         DataError: a file is missing.
     """
     if files.name not in state.hashes:
-        _, map_path = _place(files, state)
-        sources = (*files.tables, map_path)
+        sources = files.tables
+        if not isinstance(files, FoundRecording):
+            sources = (*sources, _place(files, state)[1])
+        content = _files_hash(files.tracks, sources, state)
+        if isinstance(files, CaseFiles):
+            content = hashlib.sha256(f"{content} case {files.case}".encode()).hexdigest()
+        state.hashes[files.name] = content
+    return state.hashes[files.name]
+
+
+def _files_hash(path: Path, sources: tuple[Path, ...], state: ReaderState) -> str:
+    key = " ".join(map(str, sources))
+    if key not in state.hashes:
 
         def make() -> CacheEntry:
             digests = "".join(cache.digest(path) for path in sources)
             return {"hash": hashlib.sha256(digests.encode()).hexdigest()}, {}
 
-        facts, _ = _cached(files.tracks, sources, make, "hash")
-        state.hashes[files.name] = str(facts["hash"])
-    return state.hashes[files.name]
+        facts, _ = cached(path, sources, make, "hash")
+        state.hashes[key] = str(facts["hash"])
+    return state.hashes[key]
 
 
-def _place(files: RecordingFiles, state: ReaderState) -> tuple[Meta, Path]:
+def _place(
+    files: LevelxFiles | InteractionFiles | CaseFiles, state: ReaderState
+) -> tuple[Meta, Path]:
     if files.name not in state.places:
+        if isinstance(files, CaseFiles):
+            state.places[files.name] = files.place(state.maps_by_folder)
+            return state.places[files.name]
         files.check_complete()
         if isinstance(files, LevelxFiles):
             meta = levelx.read_recording_meta(files.recording_meta)
@@ -129,19 +156,19 @@ def _place(files: RecordingFiles, state: ReaderState) -> tuple[Meta, Path]:
     return state.places[files.name]
 
 
-def _recording(files: RecordingFiles, meta: Meta, road_map: RoadMap, dt_s: float) -> Recording:
+def _recording(
+    files: LevelxFiles | InteractionFiles | CaseFiles,
+    meta: Meta,
+    state: ReaderState,
+) -> Recording:
+    """A recording without its map."""
     sources = [*files.tables, *([files.background] if files.background else [])]
-    facts, arrays = _cached(files.tracks, sources, lambda: _track_entry(files, meta), "tracks")
-    rate_hz = facts["frame_rate_hz"]
-    fitting_hz = rate_for_ticks(rate_hz, dt_s)
-    if fitting_hz != rate_hz:
-        measured = facts, arrays
-        facts, arrays = _cached(
-            files.tracks,
-            sources,
-            lambda: _resampled(files, *measured, fitting_hz),
-            ("tracks", fitting_hz),
-        )
+    if isinstance(files, CaseFiles):
+        entry, salt = _entry(*read_case(files, state.tables), None), ("case", files.case)
+    else:
+        entry = cached(files.tracks, sources, lambda: _track_entry(files, meta), "tracks")
+        salt = ("tracks",)
+    facts, arrays = _fitted(files, entry, sources, salt, state.dt_s)
     scale = facts["metres_per_pixel"]
     columns: dict[str, Any] = arrays
     background = None
@@ -153,7 +180,7 @@ def _recording(files: RecordingFiles, meta: Meta, road_map: RoadMap, dt_s: float
         frame_rate_hz=facts["frame_rate_hz"],
         num_frames=facts["num_frames"],
         speed_limit_mps=meta.speed_limit_mps,
-        road_map=road_map,
+        road_map=_NO_MAP,
         background=background,
         repairs=tuple(facts["repairs"]),
         resampled_from_hz=facts["resampled_from_hz"],
@@ -163,10 +190,9 @@ def _recording(files: RecordingFiles, meta: Meta, road_map: RoadMap, dt_s: float
     )
 
 
-def _track_entry(files: RecordingFiles, meta: Meta) -> CacheEntry:
+def _track_entry(files: LevelxFiles | InteractionFiles, meta: Meta) -> CacheEntry:
     if isinstance(files, InteractionFiles):
-        table, rate_hz = read_interaction(files)
-        return _entry(table, rate_hz, None)
+        return _entry(*read_interaction(files), None)
     assert isinstance(meta, RecordingMeta)
     table, scale = read_levelx(files), None
     if files.background is not None:
@@ -192,6 +218,37 @@ def _entry(table: TrackTable, rate_hz: float, metres_per_pixel: float | None) ->
     return facts, arrays
 
 
+def _fitted(
+    files: RecordingFiles,
+    measured: CacheEntry,
+    sources: Sequence[Path],
+    salt: tuple[object, ...],
+    dt_s: float,
+) -> CacheEntry:
+    """The tracks at a frame rate of which a tick is a whole number.
+
+    Args:
+        files: the recording's files.
+        measured: the tracks at the frames of the files.
+        sources: all files that they follow from.
+        salt: distinguishes them from others of the same files.
+        dt_s: seconds per tick.
+
+    Raises:
+        AspEnvError: the frames are too far apart for the tick.
+    """
+    rate_hz = measured[0]["frame_rate_hz"]
+    fitting_hz = rate_for_ticks(rate_hz, dt_s)
+    if fitting_hz == rate_hz:
+        return measured
+    return cached(
+        files.tracks,
+        sources,
+        lambda: _resampled(files, *measured, fitting_hz),
+        (*salt, fitting_hz),
+    )
+
+
 def _resampled(
     files: RecordingFiles, facts: dict[str, Any], arrays: dict[str, Any], to_hz: float
 ) -> CacheEntry:
@@ -209,6 +266,67 @@ def _resampled(
     return _entry(table, to_hz, facts["metres_per_pixel"])
 
 
+def _open_found(files: FoundRecording, state: ReaderState) -> Recording:
+    sources = list(files.tables)
+    salt = ("found", files.name)
+    about, parts = cached(files.tracks, sources, lambda: _found_entry(files), salt)
+    measured = about["tracks"], {name: parts[name] for name in _TRACK_COLUMNS}
+    facts, arrays = _fitted(files, measured, sources, salt, state.dt_s)
+    columns: dict[str, Any] = arrays
+    signals = None
+    if "signal_states" in parts:
+        frames = np.arange(facts["num_frames"]) * (about["rate_hz"] / facts["frame_rate_hz"])
+        nearest = np.minimum(np.round(frames).astype(np.int64), parts["signal_states"].shape[1] - 1)
+        states = parts["signal_states"][:, nearest]
+        signals = Signals(stop_lines=parts["stop_lines"], states=states)
+    key = about["map_hash"]
+    if key not in state.maps:
+        state.maps[key] = _map_of(about["map"], parts)
+        if about["map_of_file"]:
+            _warn_of_repairs(about["map_of_file"], state.maps[key])
+    return Recording(
+        name=files.name,
+        frame_rate_hz=facts["frame_rate_hz"],
+        num_frames=facts["num_frames"],
+        repairs=tuple(facts["repairs"]),
+        resampled_from_hz=facts["resampled_from_hz"],
+        road_map=state.maps[key],
+        signals=signals,
+        **about["properties"],
+        **columns,
+    )
+
+
+def _found_entry(files: FoundRecording) -> CacheEntry:
+    tables = files.read_tables()
+    table, rate_hz = derive_tracks(tables.measurements, str(files.tracks))
+    table = replace(table, repairs=(*tables.repairs, *table.repairs))
+    of_file, road_map = None, tables.road_map
+    if isinstance(road_map, Lanelet2File):
+        of_file, road_map = road_map.path.name, _used_map(files, table, road_map)
+    road_map = road_map or driven_area(table, files.name)
+    facts, arrays = _entry(table, rate_hz, None)
+    map_facts, map_arrays = _map_arrays(road_map)
+    content = hashlib.sha256(repr((road_map.name, map_facts)).encode())
+    for array in map_arrays.values():
+        content.update(np.ascontiguousarray(array).tobytes())
+    if tables.signals is not None:
+        first_ms = float(tables.measurements.time_ms.min())
+        times_ms = first_ms + 1000.0 / rate_hz * np.arange(facts["num_frames"])
+        arrays["signal_states"] = tables.signals.at(times_ms)
+        arrays["stop_lines"] = tables.signals.stop_lines
+    names = ("location", "speed_limit_mps", "start_hour", "weekday")
+    about = {
+        "tracks": facts,
+        "rate_hz": rate_hz,
+        "map": {"name": road_map.name, **map_facts},
+        "map_of_file": of_file,
+        "map_hash": content.hexdigest(),
+        "properties": {name: getattr(tables, name) for name in names},
+    }
+    return about, arrays | map_arrays
+
+
 def _scale(
     files: LevelxFiles, background: Path, meta: RecordingMeta, table: TrackTable
 ) -> float | None:
@@ -217,45 +335,91 @@ def _scale(
 
 
 def _road_map(
-    files: RecordingFiles, recording: Recording, path: Path, origin: Origin, state: ReaderState
+    files: LevelxFiles | InteractionFiles | CaseFiles,
+    recording: Recording,
+    path: Path,
+    origin: Origin,
+    state: ReaderState,
 ) -> RoadMap:
-    """The map of a recording: what of the file its agents may reach.
+    """The map of a recording: what of the file its agents may reach; cases of a table share it.
 
     Raises:
         DataError: the map is damaged, or of another place.
     """
+    is_case = isinstance(files, CaseFiles)
+    if is_case and files.tracks in state.maps:
+        return state.maps[files.tracks]
     content = functools.cache(lambda: parse_lanelet2(path, origin))
-    facts, survey = _cached(path, [path], lambda: _survey_entry(content()), (origin, "survey"))
-    of_tracks = "place", recording.frame_rate_hz
-    tracks, places = _cached(
-        files.tracks, files.tables, lambda: _places_entry(recording), of_tracks
-    )
-    region_m = used_region(tuple(tracks["extent_m"]), tuple(facts["extent_m"]))
-    rings = Ragged(points=survey["ring_points"], starts=survey["ring_starts"])
-    numbers = driven_lanelets(places["vehicles"], rings, survey["courses_rad"])
-    driven = tuple(facts["ids"][number] for number in numbers)
+    facts, survey = cached(path, [path], lambda: _survey_entry(content()), (origin, "survey"))
+    of_tracks = ("place",) if is_case else ("place", recording.frame_rate_hz)
+    if is_case:
+        table = state.tables[files.tracks][1]
+        tracks = table["classes"], table["starts"], table["states"]
+    else:
+        tracks = recording.classes, recording.starts, recording.states
+    extent, places = cached(files.tracks, files.tables, lambda: _places_entry(*tracks), of_tracks)
+    vehicles = places["vehicles"]
+    region_m, driven = _part(tuple(extent["extent_m"]), vehicles, facts, survey)
     key = (path, origin, region_m, driven)
     if key not in state.maps:
-        state.maps[key] = _make_map(path, origin, region_m, driven, content)
-        if repairs := state.maps[key].repairs:
-            warnings.warn(
-                f"map {path.name}: {'; '.join(repairs)} (asp-env inspect lists all repairs)",
-                RepairWarning,
-                stacklevel=2,
-            )
+        facts, arrays = cached(
+            path,
+            [path],
+            lambda: _map_arrays(make_road_map(content(), region_m=region_m, driven=driven)),
+            (origin, region_m, driven),
+        )
+        state.maps[key] = _map_of({"name": path.stem, **facts}, arrays)
+        _warn_of_repairs(path.name, state.maps[key])
 
     def check() -> CacheEntry:
-        lanes = survey["lane_points"]
-        check_place(path, files.name, places["vehicles"], state.maps[key], lanes)
+        name = files.tracks.name if is_case else files.name
+        check_place(path, name, vehicles, state.maps[key], survey["lane_points"])
         return {}, {}
 
-    _cached(files.tracks, [*files.tables, path], check, (*of_tracks, origin, str(path)))
+    cached(files.tracks, [*files.tables, path], check, (*of_tracks, origin, str(path)))
+    if is_case:
+        state.maps[files.tracks] = state.maps[key]
     return state.maps[key]
 
 
-def _places_entry(recording: Recording) -> CacheEntry:
-    vehicles = moving_vehicles(recording.classes, recording.starts, recording.states)
-    return {"extent_m": list(recording.extent_m)}, {"vehicles": vehicles}
+def _used_map(files: FoundRecording, table: TrackTable, content: Lanelet2File) -> RoadMap:
+    """What of a map file the agents of a recording may reach.
+
+    Raises:
+        DataError: the map is of another place.
+    """
+    extent, places = _places_entry(table.classes, table.starts, table.states)
+    facts, survey = _survey_entry(content)
+    region_m, driven = _part(extent["extent_m"], places["vehicles"], facts, survey)
+    road_map = make_road_map(content, region_m=region_m, driven=driven)
+    check_place(content.path, files.name, places["vehicles"], road_map, survey["lane_points"])
+    return road_map
+
+
+def _part(
+    extent_m: Box,
+    vehicles: np.ndarray,
+    facts: Mapping[str, Any],
+    survey: Mapping[str, np.ndarray],
+) -> tuple[Box | None, tuple[str, ...]]:
+    """The region of a map that tracks use, and the lanelets of unlisted subtypes that are roads.
+
+    Args:
+        extent_m: bounding box of the tracks.
+        vehicles: (n, 4) states of moving vehicles.
+        facts: those of `_survey_entry`.
+        survey: the arrays of `_survey_entry`.
+    """
+    rings = Ragged(points=survey["ring_points"], starts=survey["ring_starts"])
+    numbers = driven_lanelets(vehicles, rings, survey["courses_rad"])
+    driven = tuple(facts["ids"][number] for number in numbers)
+    return used_region(extent_m, tuple(facts["extent_m"])), driven
+
+
+def _places_entry(classes: np.ndarray, starts: np.ndarray, states: np.ndarray) -> CacheEntry:
+    vehicles = moving_vehicles(classes, starts, states)
+    low, high = states[:, :2].min(axis=0), states[:, :2].max(axis=0)
+    return {"extent_m": tuple(map(float, (*low, *high)))}, {"vehicles": vehicles}
 
 
 def _survey_entry(content: Lanelet2File) -> CacheEntry:
@@ -272,57 +436,31 @@ def _survey_entry(content: Lanelet2File) -> CacheEntry:
     }
 
 
-def _make_map(
-    path: Path,
-    origin: Origin,
-    region_m: Box | None,
-    driven: tuple[str, ...],
-    content: Callable[[], Lanelet2File],
-) -> RoadMap:
-    def make() -> CacheEntry:
-        road_map = make_road_map(content(), region_m=region_m, driven=driven)
-        arrays = {name: getattr(road_map, name) for name in _MAP_COLUMNS}
-        for name in _MAP_PARTS:
-            ragged = getattr(road_map, name)
-            arrays |= {f"{name}_points": ragged.points, f"{name}_starts": ragged.starts}
-        return {"repairs": list(road_map.repairs)}, arrays
+def _warn_of_repairs(file_name: str, road_map: RoadMap) -> None:
+    if road_map.repairs:
+        warnings.warn(
+            f"map {file_name}: {'; '.join(road_map.repairs)} (asp-env inspect lists all repairs)",
+            RepairWarning,
+            stacklevel=3,
+        )
 
-    facts, arrays = _cached(path, [path], make, (origin, region_m, driven))
+
+def _map_of(facts: dict[str, Any], arrays: dict[str, np.ndarray]) -> RoadMap:
     parts: dict[str, Any] = {name: arrays[name] for name in _MAP_COLUMNS}
     parts |= {
         name: Ragged(points=arrays[f"{name}_points"], starts=arrays[f"{name}_starts"])
         for name in _MAP_PARTS
     }
-    return RoadMap(name=path.stem, region_m=region_m, repairs=tuple(facts["repairs"]), **parts)
+    region_m = None if facts["region_m"] is None else tuple(facts["region_m"])
+    return RoadMap(name=facts["name"], region_m=region_m, repairs=tuple(facts["repairs"]), **parts)
 
 
-def _cached(
-    path: Path, sources: Sequence[Path], make: Callable[[], CacheEntry], salt: object
-) -> CacheEntry:
-    """The result of `make`, from the cache if it is stored there and no source has changed since.
-
-    If the cache cannot be written, there is a warning, and `make` is called every time.
-    """
-    current = cache.stamp(sources)
-    try:
-        cached = cache.entry_path(cache.cache_folder(), path, salt)
-    except DataError as error:
-        warnings.warn(f"results are not cached: {error}", stacklevel=2)
-        return _read_only(make())
-    if (found := cache.load(cached, current)) is not None:
-        return found
-    made = make()
-    try:
-        cache.save(cached, current, *made)
-    except OSError as error:
-        warnings.warn(f"results are not cached: {cached}: {error.strerror}", stacklevel=2)
-    return cache.load(cached, current) or _read_only(made)
-
-
-def _read_only(made: CacheEntry) -> CacheEntry:
-    for array in made[1].values():
-        array.flags.writeable = False
-    return made
+def _map_arrays(road_map: RoadMap) -> CacheEntry:
+    arrays = {name: getattr(road_map, name) for name in _MAP_COLUMNS}
+    for name in _MAP_PARTS:
+        ragged = getattr(road_map, name)
+        arrays |= {f"{name}_points": ragged.points, f"{name}_starts": ragged.starts}
+    return {"region_m": road_map.region_m, "repairs": list(road_map.repairs)}, arrays
 
 
 def _png_size(path: Path) -> tuple[int, int] | None:

@@ -14,8 +14,8 @@ from typing import no_type_check
 
 import numpy as np
 from jaxtyping import Bool, Float
-from numba import njit
 
+from asp_env.compiled import njit
 from asp_env.geometry import wrap_scalar
 
 ACCELERATION_SIGMA_MPS2 = 1.5

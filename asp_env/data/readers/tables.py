@@ -6,7 +6,7 @@ import io
 import itertools
 import math
 import zlib
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass
 from decimal import Decimal
 from pathlib import Path
@@ -19,9 +19,15 @@ from jaxtyping import Float, Int
 from asp_env.data.readers.ranges import Limit
 from asp_env.errors import DataError
 
-Kind = Literal["id", "whole", "number", "text"]
+Kind = Literal["id", "whole", "number", "number or empty", "text"]
 """What the cells of a column must be: whole numbers of any size, whole numbers below `EXACT`,
-finite numbers, or any text."""
+finite numbers, finite numbers or nothing (which is read as NaN), or any text."""
+
+WHOLE = ("id", "whole")
+"""Kinds of whole numbers."""
+
+EMPTY = ("", "NaN", "nan", "NA", "N/A", "null", "None")
+"""Texts of cells that contain nothing."""
 
 EXACT = 2**53
 """Whole numbers below are exact in double precision, in which cells are parsed."""
@@ -45,7 +51,7 @@ WHOLE_WITHIN = 0.01
 less than this share. Chosen by hand."""
 
 _BLOCK_BYTES = 1 << 22
-_DTYPES = {"id": np.int64, "whole": np.int64, "number": np.float64}
+_DTYPES = {"id": np.int64, "whole": np.int64, "number": np.float64, "number or empty": np.float64}
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -72,55 +78,62 @@ def read_columns(
     *,
     optional: frozenset[str] = frozenset(),
     limits: Mapping[str, Limit] = {},
+    may_be_empty: bool = False,
 ) -> Iterator[dict[str, np.ndarray]]:
     """Reads columns of a CSV file (plain or `.gz`), a chunk of rows at a time.
 
     Args:
-        path: the file. Its first line names the columns, in any order.
+        path: the file. Its first line names the columns, in any order, in upper or lower case.
         columns: kind of the cells of each column to read.
         optional: those of `columns` that may be absent.
         limits: plausible ranges by column.
+        may_be_empty: whether a file without rows is valid; it yields nothing.
 
     Yields:
-        Arrays (rows,) by name: int64, float64 (finite) or str objects. Ids of which one is `EXACT`
-        or more are objects of type int, see `number_ids`.
+        Arrays (rows,) by name: int64, float64 or str objects. Ids of which one is `EXACT` or more
+        are objects of type int, see `number_ids`.
 
     Raises:
         DataError: the file is missing, damaged or without rows. The message names the line, if a
             single line is wrong.
     """
     try:
-        header = _header(path)
+        header = header_of(path)
         present = _present(path, header, columns, optional)
         if not _has_even_rows(path, len(header)):
             _diagnose(path, header, present, limits)
         any_rows = False
-        for chunk in _chunks(path, present, limits):
+        for chunk in _chunks(path, header, present, limits):
             any_rows = True
             yield chunk
-        if not any_rows:
+        if not (any_rows or may_be_empty):
             raise DataError(
                 f"{path}: has a header but no rows; copy it again or remove the recording"
             )
     except (pd.errors.ParserError, ValueError) as error:
         if isinstance(error, DataError):
             raise
-        _diagnose(path, _header(path), columns, limits)
+        header = header_of(path)
+        _diagnose(path, header, _present(path, header, columns, frozenset(columns)), limits)
         raise DataError(f"{path}: cannot be read as a table: {_one_line(error)}") from error
     except (OSError, EOFError, zlib.error) as error:
         raise DataError(f"{path}: cannot be read: {_one_line(error)}; copy it again") from error
 
 
 def read_table(
-    path: Path, columns: Mapping[str, Kind], *, limits: Mapping[str, Limit] = {}
+    path: Path,
+    columns: Mapping[str, Kind],
+    *,
+    optional: frozenset[str] = frozenset(),
+    limits: Mapping[str, Limit] = {},
 ) -> dict[str, np.ndarray]:
-    """Reads columns of a small CSV file at once.
+    """Reads columns of a CSV file at once; see `read_columns`.
 
     Raises:
         DataError: see `read_columns`.
     """
-    chunks = list(read_columns(path, columns, limits=limits))
-    return {name: np.concatenate([chunk[name] for chunk in chunks]) for name in columns}
+    chunks = list(read_columns(path, columns, optional=optional, limits=limits))
+    return {name: np.concatenate([chunk[name] for chunk in chunks]) for name in chunks[0]}
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -175,7 +188,8 @@ def find_line(path: Path, cells: Mapping[str, object], *, occurrence: int = 1) -
     Returns:
         The number of the line, from 1; 0 if there is none.
     """
-    columns = {name: index for index, name in enumerate(_header(path))}
+    header = header_of(path)
+    columns = {name: _places(header, name)[0] for name in cells}
     for number, row in _lines(path):
         if number > 1 and all(_same(row[columns[name]], cells[name]) for name in cells):
             occurrence -= 1
@@ -261,25 +275,52 @@ def read_clock(
 
 
 def _open(path: Path) -> io.BufferedIOBase:
-    return gzip.GzipFile(path) if path.suffix == ".gz" else path.open("rb")
+    return gzip.GzipFile(path) if path.suffix.lower() == ".gz" else path.open("rb")
 
 
-def _header(path: Path) -> list[str]:
+def header_of(path: Path) -> list[str]:
+    """The names of a table's columns, without spaces around them.
+
+    Raises:
+        DataError: the file is empty or damaged.
+    """
     for _, row in _lines(path):
         return [name.strip() for name in row]
     raise DataError(f"{path}: is empty; expected a table with a header; copy it again")
 
 
+def has_columns(path: Path, names: Iterable[str]) -> bool:
+    """Whether a file is a table with all of some columns, in upper or lower case."""
+    try:
+        header = {name.lower() for name in header_of(path)}
+    except (DataError, OSError, EOFError, zlib.error):
+        return False
+    return all(name.lower() in header for name in names)
+
+
+def _places(header: list[str], name: str) -> list[int]:
+    """Indices of the columns with a name, in upper or lower case."""
+    return [index for index, given in enumerate(header) if given.lower() == name.lower()]
+
+
 def _present(
     path: Path, header: list[str], columns: Mapping[str, Kind], optional: frozenset[str]
-) -> dict[str, Kind]:
-    missing = [name for name in columns if name not in header and name not in optional]
+) -> dict[int, tuple[str, Kind]]:
+    """Name and kind of the columns to read, by their index in the file."""
+    places = {name: _places(header, name) for name in columns}
+    missing = [name for name in columns if not places[name] and name not in optional]
     if missing:
         raise DataError(
             f"{path}: lacks the column {', '.join(map(repr, missing))}; "
             f"expected it among those found: {' '.join(', '.join(header).split())[:200]}"
         )
-    return {name: kind for name, kind in columns.items() if name in header}
+    if double := next((name for name in columns if len(places[name]) > 1), None):
+        numbers = " and ".join(str(index + 1) for index in places[double])
+        raise DataError(
+            f"{path}, line 1: columns {numbers} are called {double!r} (spaces around names and "
+            "upper case are ignored), expected one; rename or remove the others"
+        )
+    return {places[name][0]: (name, kind) for name, kind in columns.items() if places[name]}
 
 
 def _has_even_rows(path: Path, num_columns: int) -> bool:
@@ -295,45 +336,53 @@ def _has_even_rows(path: Path, num_columns: int) -> bool:
 
 
 def _chunks(
-    path: Path, columns: Mapping[str, Kind], limits: Mapping[str, Limit]
+    path: Path,
+    header: list[str],
+    columns: Mapping[int, tuple[str, Kind]],
+    limits: Mapping[str, Limit],
 ) -> Iterator[dict[str, np.ndarray]]:
-    for number, frame in enumerate(_frames(path, columns)):
+    kinds = dict(columns.values())
+    index_of = {name: index for index, (name, _) in columns.items()}
+    for number, frame in enumerate(_frames(path, header, columns)):
         if not len(frame):
             continue
-        if missing := [name for name in columns if name not in frame]:
-            raise ValueError(f"there is a line break before {missing[0]!r} in the header")
         chunk = {}
-        for name, kind in columns.items():
+        for name, kind in kinds.items():
             if kind == "id" and EXACT <= frame[name].abs().max(skipna=False) < math.inf:
-                chunk[name] = _exact_ids(path, name, number)
+                chunk[name] = _exact_ids(path, header, index_of[name], number)
             else:
                 chunk[name] = _checked(frame[name], kind, limits.get(name))
         yield chunk
 
 
-def _frames(path: Path, columns: Mapping[str, Kind]) -> Iterator[pd.DataFrame]:
+def _frames(
+    path: Path, header: list[str], columns: Mapping[int, tuple[str, Kind]]
+) -> Iterator[pd.DataFrame]:
     """The parsed chunks of a file: texts as they are, all else in double precision."""
-    texts = [name for name, kind in columns.items() if kind == "text"]
+    kinds = dict(columns.values())
+    names = [columns[i][0] if i in columns else f"column {i + 1}" for i in range(len(header))]
     reader = pd.read_csv(
         path,
-        usecols=lambda name: name.strip() in columns,
-        dtype={name: str if kind == "text" else np.float64 for name, kind in columns.items()},
+        header=0,
+        names=names,
+        usecols=list(columns),
+        dtype={name: str if kind == "text" else np.float64 for name, kind in kinds.items()},
         chunksize=ROWS_PER_CHUNK,
         index_col=False,
         encoding="utf-8-sig",
         encoding_errors="replace",
-        keep_default_na=not texts,
+        keep_default_na="text" not in kinds.values(),
+        na_values={name: list(EMPTY) for name, kind in kinds.items() if kind == "number or empty"},
     )
     with reader:
-        for frame in reader:
-            frame.columns = frame.columns.str.strip()
-            yield frame
+        yield from reader
 
 
-def _exact_ids(path: Path, name: str, number: int) -> np.ndarray:
+def _exact_ids(path: Path, header: list[str], index: int, number: int) -> np.ndarray:
     """The ids of chunk `number` as objects of type int: parsed again, as texts."""
-    frame = next(itertools.islice(_frames(path, {name: "text"}), number, None))
-    return np.array([_exact_id(cell) for cell in frame[name]], dtype=object)
+    frames = _frames(path, header, {index: ("id", "text")})
+    frame = next(itertools.islice(frames, number, None))
+    return np.array([_exact_id(cell) for cell in frame["id"]], dtype=object)
 
 
 def _exact_id(cell: str) -> int:
@@ -350,9 +399,10 @@ def _checked(column: pd.Series, kind: Kind, limit: Limit | None) -> np.ndarray:
     if kind == "text":
         return column.to_numpy(dtype=object)
     cells = column.to_numpy()
-    if not np.isfinite(cells).all():
+    may_be_nan = kind == "number or empty"
+    if not (np.isfinite(cells) | (may_be_nan & np.isnan(cells))).all():
         raise ValueError("a cell is not a number")
-    if kind != "number" and not ((cells == np.floor(cells)) & (np.abs(cells) < EXACT)).all():
+    if kind in WHOLE and not ((cells == np.floor(cells)) & (np.abs(cells) < EXACT)).all():
         raise ValueError("a cell is not a whole number")
     if limit is not None and (np.abs(cells) > limit.largest).any():
         raise ValueError("a cell is out of range")
@@ -360,12 +410,12 @@ def _checked(column: pd.Series, kind: Kind, limit: Limit | None) -> np.ndarray:
 
 
 def _diagnose(
-    path: Path, header: list[str], columns: Mapping[str, Kind], limits: Mapping[str, Limit]
+    path: Path,
+    header: list[str],
+    columns: Mapping[int, tuple[str, Kind]],
+    limits: Mapping[str, Limit],
 ) -> None:
     """Raises an error that names the first wrong line, if any. Slow: for damaged files only."""
-    kinds: list[tuple[int, str, Kind]] = [
-        (header.index(name), name, kind) for name, kind in columns.items() if name in header
-    ]
     for number, row in _lines(path):
         if number == 1:
             continue
@@ -374,7 +424,7 @@ def _diagnose(
                 f"{path}, line {number}: has {len(row)} fields, expected {len(header)} as in the "
                 "header; the line is truncated or damaged: copy the file again"
             )
-        for index, name, kind in kinds:
+        for index, (name, kind) in columns.items():
             if expected := _expected(row[index], kind, limits.get(name)):
                 more = _count_beyond(path, index, limits.get(name))
                 raise DataError(
@@ -385,7 +435,7 @@ def _diagnose(
 
 def _expected(cell: str, kind: Kind, limit: Limit | None) -> str:
     """What a cell should be instead; empty if it is valid."""
-    if kind == "text":
+    if kind == "text" or (kind == "number or empty" and cell.strip() in EMPTY):
         return ""
     try:
         value = float(cell)
@@ -393,7 +443,7 @@ def _expected(cell: str, kind: Kind, limit: Limit | None) -> str:
         return "a number"
     if not math.isfinite(value):
         return "a finite number"
-    if kind != "number" and value != math.floor(value):
+    if kind in WHOLE and value != math.floor(value):
         return "a whole number"
     if kind == "whole" and abs(value) >= EXACT:
         return f"a whole number below {EXACT:,}"
@@ -406,7 +456,7 @@ def _count_beyond(path: Path, index: int, limit: Limit | None) -> str:
         return ""
     beyond = rows = 0
     for _, row in itertools.islice(_lines(path), 1, None):
-        beyond += len(row) > index and bool(_expected(row[index], "number", limit))
+        beyond += len(row) > index and bool(_expected(row[index], "number or empty", limit))
         rows += 1
     return f", and {beyond - 1:,} of {rows - 1:,} other rows are beyond" if beyond > 1 else ""
 

@@ -38,8 +38,8 @@ import math
 from typing import no_type_check
 
 import numpy as np
-from numba import njit
 
+from asp_env.compiled import njit
 from asp_env.geometry import project, wrap_scalar
 
 # Thresholds of the rules above, chosen by hand except those of pred2plan.

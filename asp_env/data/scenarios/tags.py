@@ -50,8 +50,8 @@ from typing import NamedTuple, no_type_check
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
-from numba import njit
 
+from asp_env.compiled import njit
 from asp_env.data.classes import PREDICTED, VULNERABLE, AgentClass
 from asp_env.data.recording import Recording
 from asp_env.data.road_map import RoadMap

@@ -14,7 +14,7 @@ from rich.table import Table
 from asp_env.data.recording import DEFAULT_DT_S
 from asp_env.data.scenarios.scenario import Scenario, find_scenarios
 from asp_env.data.snippets import gather_scene, index_snippets
-from asp_env.data.source import Recordings, open_data
+from asp_env.data.source import Recordings, open_readable
 from asp_env.errors import AspEnvError, unknown_name
 from asp_env.evaluation.bench.environments import environment_rates
 from asp_env.evaluation.bench.stepping import HISTORY, scaling_rates, stepping_rates
@@ -65,7 +65,7 @@ class Bench:
                 raise AspEnvError(f"--{name} {getattr(self, name)}: expected at least 1")
         sections = [_current_section(name) for name in self.sections]
         console = Console(width=max(Console().width, 120))
-        recordings = open_data(self.data)
+        recordings = open_readable(self.data, dt_s=DEFAULT_DT_S)
         latencies: list[Latency] = []
         if self.predictors:
             latencies = measure_latencies(recordings, self.predictors, dt_s=DEFAULT_DT_S)

@@ -17,7 +17,7 @@ from asp_env.data.road_map import RoadMap
 from asp_env.data.rollout import Rollout
 from asp_env.data.scenarios.scenario import ScenarioSet
 from asp_env.data.scenarios.selection import save_scenarios
-from asp_env.data.source import Recordings, open_data
+from asp_env.data.source import Recordings, open_readable
 from asp_env.errors import AspEnvError
 from asp_env.evaluation.closed_loop.comparison import (
     EXPERT,
@@ -175,7 +175,7 @@ def drive(config: Drive) -> ClosedLoopResult:
         raise AspEnvError(
             f"--controls: the planner {config.planner} uses no forecasts; leave it out"
         )
-    recordings = open_data(config.data, dt_s=config.dt)
+    recordings = open_readable(config.data, dt_s=config.dt)
     run_unit = partial(methods.drive, recordings)
     with WorkerPool(run_unit, config.jobs) if config.jobs > 1 else nullcontext() as pool:
         chosen, part = _choose_scenarios(config, recordings, methods)

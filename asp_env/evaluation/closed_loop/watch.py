@@ -14,7 +14,7 @@ from rich.table import Table
 from asp_env.data.recording import Recording, frames_per_tick
 from asp_env.data.rollout import Rollout
 from asp_env.data.snippets import gather_window
-from asp_env.data.source import Recordings, open_data
+from asp_env.data.source import Recordings, open_readable
 from asp_env.errors import AspEnvError, DataError
 from asp_env.render.film import MAX_SIDE_PX, Film, check_video_possible, frames_of, write_video
 from asp_env.render.window import PlayerState, play
@@ -138,7 +138,7 @@ def make_films(rollouts: Mapping[Path, Rollout], data: str | None) -> list[Film]
 
 def _open_source(path: Path, source: str, dt_s: float) -> Recordings:
     try:
-        return open_data(source, dt_s=dt_s)
+        return open_readable(source, dt_s=dt_s)
     except AspEnvError as error:
         raise DataError(
             f"{path}: was driven on DATA that cannot be opened ({error}); name it with --data"

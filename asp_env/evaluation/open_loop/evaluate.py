@@ -21,7 +21,7 @@ from asp_env.data.snippets import (
     gather_scene,
     index_snippets,
 )
-from asp_env.data.source import Recordings, open_data
+from asp_env.data.source import Recordings, open_readable
 from asp_env.evaluation import statistics
 from asp_env.evaluation.open_loop.scoring import (
     ALL_MODES,
@@ -156,7 +156,7 @@ def evaluate(config: Evaluate) -> OpenLoopResult:
     Raises:
         AspEnvError: an option or the data are bad.
     """
-    recordings = open_data(config.data, dt_s=config.dt)
+    recordings = open_readable(config.data, dt_s=config.dt)
     horizon = ticks(config.horizon, config.dt)
     planner = None if config.planner in NO_PLANNER else load_candidate_planner(config.planner)
     named = with_fallback(config.predictors) if config.fallback else config.predictors

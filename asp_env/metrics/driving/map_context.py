@@ -7,8 +7,8 @@ from typing import no_type_check
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
-from numba import njit
 
+from asp_env.compiled import njit
 from asp_env.data.road_map import Ragged, RoadMap
 from asp_env.metrics.drivable import off_road_m
 from asp_env.metrics.lanes import (

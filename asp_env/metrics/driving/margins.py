@@ -11,8 +11,8 @@ from typing import NamedTuple, no_type_check
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
-from numba import njit
 
+from asp_env.compiled import njit
 from asp_env.geometry import overlaps, wrap_angle
 from asp_env.metrics.boxes import AT_FAULT, AT_REST_MPS, is_behind
 from asp_env.metrics.driving.realism import clearance

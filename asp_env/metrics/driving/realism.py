@@ -12,8 +12,8 @@ from typing import no_type_check
 
 import numpy as np
 from jaxtyping import Bool, Float
-from numba import njit
 
+from asp_env.compiled import njit
 from asp_env.data.road_map import RoadMap
 from asp_env.geometry import overlaps, wrap_angle
 from asp_env.metrics.drivable import road_edge_m

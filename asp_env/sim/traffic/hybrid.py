@@ -5,8 +5,8 @@ from typing import no_type_check
 
 import numpy as np
 from jaxtyping import Bool
-from numba import njit
 
+from asp_env.compiled import njit
 from asp_env.data.scene import EGO
 from asp_env.dynamics import MAX_ACCELERATION_MPS2
 from asp_env.geometry import overlaps, point_on_route, wrap_scalar

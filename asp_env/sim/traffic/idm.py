@@ -14,8 +14,8 @@ from typing import NamedTuple, no_type_check
 
 import numpy as np
 from jaxtyping import Bool
-from numba import njit
 
+from asp_env.compiled import njit
 from asp_env.data.recording import frames_per_tick
 from asp_env.data.scene import EGO
 from asp_env.dynamics import MAX_ACCELERATION_MPS2

@@ -8,8 +8,8 @@ from typing import no_type_check
 
 import numpy as np
 from jaxtyping import Bool
-from numba import njit
 
+from asp_env.compiled import njit
 from asp_env.dynamics import inverse
 from asp_env.errors import AspEnvError
 from asp_env.sim.traffic.driver import (

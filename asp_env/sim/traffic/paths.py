@@ -12,8 +12,8 @@ from typing import Any, NamedTuple, no_type_check
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
-from numba import njit
 
+from asp_env.compiled import njit
 from asp_env.data.recording import Recording
 from asp_env.data.scenarios.tags import MANOEUVRE_STANDING_MPS
 from asp_env.dynamics.car_following import IDM, limit_speeds

@@ -145,9 +145,13 @@ FAULTS = {
     "no recording metadata": (remove(RECORDING), [RECORDING, "no such file"]),
     "no track metadata": (remove(META), [META, "no such file"]),
     "no tracks": (remove(TRACKS), [TRACKS, "no such file"]),
-    "unknown class": (
-        set_cell(META, 4, 7, "ufo"),
-        [f"{META}, line 4", "unknown class 'ufo'", "car"],
+    "two columns of one name": (
+        set_cell(TRACKS, 1, 3, " xCenter"),
+        [f"{TRACKS}, line 1", "columns 4 and 5 are called 'xCenter'", "rename or remove"],
+    ),
+    "two recordings in the metadata": (
+        repeat_line(RECORDING, 2),
+        [f"{RECORDING}, line 3", "a second row", "expected one row"],
     ),
     "row twice": (repeat_line(TRACKS, 20), [f"{TRACKS}, line 749", "track 0 at frame 18"]),
     "track listed twice": (repeat_line(META, 3), [f"{META}, line 5", "track 1 is listed twice"]),
@@ -202,7 +206,7 @@ def test_each_fault_is_one_line(folder: Path, name: str) -> None:
     assert all(part in message for part in expected), message
 
 
-@pytest.mark.parametrize("name", ["NaN position", "map without lanelets", "unknown class"])
+@pytest.mark.parametrize("name", ["NaN position", "map without lanelets"])
 def test_a_fault_is_found_despite_a_cached_recording(folder: Path, name: str) -> None:
     assert len(open_data(folder)[0]) == 3
     FAULTS[name][0](folder)
@@ -217,7 +221,7 @@ def test_a_failed_read_caches_nothing(folder: Path, tmp_path: Path) -> None:
     assert not list((tmp_path / "cache").iterdir())
 
 
-@pytest.mark.parametrize("name", ["NaN position", "no recording metadata", "unknown class"])
+@pytest.mark.parametrize("name", ["NaN position", "no recording metadata"])
 def test_a_command_ends_with_status_2_and_one_line(
     folder: Path, capsys: pytest.CaptureFixture[str], name: str
 ) -> None:

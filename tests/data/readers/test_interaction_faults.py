@@ -110,8 +110,8 @@ FAULTS = {
     "no times": (set_cell(VEHICLES, 1, 2, "t"), [VEHICLES, "lacks the column 'timestamp_ms'"]),
     "column of pedestrians missing": (set_cell(PEDESTRIANS, 1, 5, "lat"), [PEDESTRIANS, "'y'"]),
     "NaN position": (set_cell(VEHICLES, 11, 4, "nan"), [f"{VEHICLES}, line 11", "x is 'nan'"]),
-    "NaN heading": (
-        set_cell(VEHICLES, 11, 8, "NaN"),
+    "infinite heading": (
+        set_cell(VEHICLES, 11, 8, "inf"),
         [f"{VEHICLES}, line 11", "psi_rad", "finite"],
     ),
     "empty cell": (set_cell(VEHICLES, 30, 5, ""), [f"{VEHICLES}, line 30", "y is ''", "a number"]),
@@ -124,17 +124,15 @@ FAULTS = {
     "long line": (set_cell(VEHICLES, 9, 3, "car,car"), [f"{VEHICLES}, line 9", "has 12 fields"]),
     "empty file": (change_content(VEHICLES, lambda _: ""), [VEHICLES, "is empty"]),
     "empty pedestrians": (change_content(PEDESTRIANS, lambda _: ""), [PEDESTRIANS, "is empty"]),
-    "header alone": (
-        change_content(VEHICLES, lambda text: text.splitlines()[0] + "\n"),
+    "headers alone": (
+        lambda folder: (
+            [
+                change_content(name, lambda text: text.splitlines()[0] + "\n")(folder)
+                for name in (VEHICLES, PEDESTRIANS)
+            ]
+            and None
+        ),
         [VEHICLES, "has a header but no rows"],
-    ),
-    "unknown agent_type": (
-        set_cell(VEHICLES, 12, 3, "ufo"),
-        [f"{VEHICLES}, line 12", "unknown class 'ufo'", "car"],
-    ),
-    "unknown agent_type of a pedestrian": (
-        set_cell(PEDESTRIANS, 3, 3, ""),
-        [f"{PEDESTRIANS}, line 3", "class ''"],
     ),
     "row twice": (
         repeat_line(VEHICLES, 20),
@@ -174,6 +172,7 @@ FAULTS = {
         [f"{PLACE}.osm", "expected it at its recordings' origin 49.0000, 8.4000", META],
     ),
     "metadata of another recording": (set_metadata("7,0,0"), [META, "no row whose id is 000"]),
+    "metadata twice": (set_metadata("0,0,0\n0,0,0"), [META, "2 rows whose id is 000"]),
     "metadata without origin": (
         set_metadata("0,0", "id,originLat"),
         [META, "lacks", "'originLon'"],
