@@ -145,7 +145,7 @@ def test_damaged_cache_entries_are_replaced(
         path.write_bytes(content[: len(content) // 2])
     del reads[:]
     assert np.array_equal(open_data(folder)[0].states, states)
-    assert reads == ["location1.osm", "00_tracks.csv"]
+    assert reads == ["00_tracks.csv", "location1.osm"]
 
 
 def test_without_a_cache(
@@ -158,7 +158,7 @@ def test_without_a_cache(
     del reads[:]
     with pytest.warns(UserWarning, match="results are not cached: cache folder"):
         after = open_data(folder)[0]
-    assert reads == ["location1.osm", "00_tracks.csv"]
+    assert reads == ["00_tracks.csv", "location1.osm"]
     assert equal(before, after)
     assert not after.states.flags.writeable
 

@@ -107,7 +107,7 @@ def locate_nodes(osm: Osm, origin: Origin, repairs: list[str]) -> dict[str, np.n
         repairs.append(f"{len(names)} nodes are at {_NAMES[system]}, not at {_NAMES[usual]}")
     present = np.isfinite(positions).all(axis=1)
     if not present.all():
-        _leave_out(repairs, names, ~present, "without a position")
+        _leave_out(repairs, names, ~present, "without a valid position")
     if _median_m(positions) >= FAR_M:
         raise _another_place(osm, coordinates, system, origin)
     alone = present & _alone(positions)
