@@ -274,8 +274,13 @@ def test_registered_source(folder: Path, monkeypatch: pytest.MonkeyPatch) -> Non
         arguments.append(argument)
         return folder
 
-    monkeypatch.setattr(registry, "names", lambda _: ("made-up",))
-    monkeypatch.setattr(registry, "find", lambda *_: source)
+    names, find = registry.names, registry.find
+    monkeypatch.setattr(
+        registry, "names", lambda group: ("made-up",) if group == "sources" else names(group)
+    )
+    monkeypatch.setattr(
+        registry, "find", lambda group, name: source if group == "sources" else find(group, name)
+    )
     recordings = open_data("made-up:place:7")
     assert arguments == ["place:7"]
     assert recordings.source == "made-up:place:7"

@@ -309,7 +309,12 @@ def read_measurements(
         chunk["agent_type"] = names.classes(chunk["agent_type"], chunk["track_id"])
         for name, cells in chunks.items():
             cells.append(chunk.get(name, np.full(len(chunk["x"]), np.nan)))
-    return {name: np.concatenate(cells) if cells else np.zeros(0) for name, cells in chunks.items()}
+    return {
+        name: np.concatenate(cells)
+        if cells
+        else np.zeros(0, dtype=np.int64 if columns[name] == "id" else np.float64)
+        for name, cells in chunks.items()
+    }
 
 
 def measurements_of(columns: Mapping[str, np.ndarray]) -> Measurements:
