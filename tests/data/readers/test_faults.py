@@ -50,6 +50,19 @@ def truncate(name: str, share: float) -> Callable[[Path], None]:
     return apply
 
 
+def scale_column(name: str, column: int, factor: float) -> Callable[[Path], None]:
+    """A function that multiplies a column by a factor, as a wrong unit does."""
+
+    def apply(folder: Path) -> None:
+        path = next(folder.rglob(name))
+        head, *lines = [line.split(",") for line in path.read_text().splitlines()]
+        for cells in lines:
+            cells[column] = str(float(cells[column]) * factor)
+        path.write_text("".join(",".join(cells) + "\n" for cells in (head, *lines)))
+
+    return apply
+
+
 def first_lines(name: str, count: int) -> Callable[[Path], None]:
     """A fault: only the first lines of a file exist."""
 
@@ -158,6 +171,60 @@ FAULTS = {
     "track not listed": (first_lines(META, 3), [f"{TRACKS}, line 501", "track 2", META]),
     "rate zero": (set_cell(RECORDING, 2, 2, "0"), [RECORDING, "frameRate is 0", "1 to 250 Hz"]),
     "rate NaN": (set_cell(RECORDING, 2, 2, "NaN"), [f"{RECORDING}, line 2", "frameRate", "finite"]),
+    "rate of 1000 Hz": (set_cell(RECORDING, 2, 2, "1000"), ["frameRate is 1000", "1 to 250 Hz"]),
+    "position beyond single precision": (
+        set_cell(TRACKS, 11, 4, "1e39"),
+        [f"{TRACKS}, line 11: xCenter is '1e39', expected metres from -10,000,000 to 10,000,000"],
+    ),
+    "one position far away": (
+        set_cell(TRACKS, 11, 5, "-30000"),
+        [f"{TRACKS}, line 11: yCenter is -30000", "m from the median of the file; expected metres"],
+    ),
+    "positions in micrometres": (
+        scale_column(TRACKS, 5, 1e6),
+        [f"{TRACKS}, line 2: yCenter is '-2", "and 746 of 746 other rows", "expected metres"],
+    ),
+    "positions in millimetres": (
+        scale_column(TRACKS, 4, 1e3),
+        [TRACKS, "xCenter is", "rows are; expected metres, all within 10,000 m", "convert"],
+    ),
+    "heading that is NaN in single precision": (
+        set_cell(TRACKS, 11, 6, "1e308"),
+        [f"{TRACKS}, line 11: heading is '1e308', expected degrees from -36,000 to 36,000"],
+    ),
+    "velocity": (
+        set_cell(TRACKS, 11, 10, "-101"),
+        [f"{TRACKS}, line 11: yVelocity is '-101', expected m/s from -100 to 100"],
+    ),
+    "acceleration": (set_cell(TRACKS, 11, 11, "1e39"), ["line 11: xAcceleration is '1e39'"]),
+    "size": (set_cell(TRACKS, 11, 8, "1e308"), ["line 11: length is '1e308', expected metres"]),
+    "size in the metadata": (set_cell(META, 3, 5, "450"), [f"{META}, line 3: width is '450'"]),
+    "speed limit": (
+        set_cell(RECORDING, 2, 3, "1e23"),
+        [f"{RECORDING}, line 2: speedLimit is 1e+23, expected at most 100 m/s"],
+    ),
+    "origin": (set_cell(RECORDING, 2, 12, "1e308"), [f"{RECORDING}, line 2: xUtmOrigin"]),
+    "longitude": (set_cell(RECORDING, 2, 11, "200"), ["lonLocation is '200', expected degrees"]),
+    "id that wraps in 32 bits": (
+        set_cell(TRACKS, 11, 1, "4294967296"),
+        [f"{TRACKS}, line 11: track 4294967296 is not in {META}"],
+    ),
+    "id that wraps in 64 bits": (
+        set_cell(TRACKS, 11, 1, "18446744073709551616"),
+        [f"{TRACKS}, line 11: track 18446744073709551616 is not in {META}"],
+    ),
+    "id that is no whole number": (
+        set_cell(TRACKS, 11, 1, "1.5"),
+        [f"{TRACKS}, line 11: trackId is '1.5', expected a whole number"],
+    ),
+    "frame of 20 digits": (
+        set_cell(TRACKS, 11, 2, "18446744073709551616"),
+        [f"{TRACKS}, line 11: frame is '18446744073709551616'", "below 9,007,199,254,740,992"],
+    ),
+    "frame far away": (
+        set_cell(TRACKS, 250, 2, "3000000000"),
+        [f"{TRACKS}, line 250: is 2,999,999,", "less than 10,000,000 frames"],
+    ),
     "cut gzip": (cut_gzip, [f"{TRACKS}.gz", "copy it again"]),
     "another kind of file": (binary_tracks, [TRACKS]),
     "no map": (remove_map, ["no map for location 1", "location1.osm"]),
