@@ -12,6 +12,7 @@ from typing import Any, SupportsIndex, overload
 
 from asp_env import registry
 from asp_env.data.readers.layout import ARCHIVE, archive_hint, shorten
+from asp_env.data.readers.levelx import LevelxFiles
 from asp_env.data.readers.opening import ReaderState, RecordingFiles, content_hash, open_recording
 from asp_env.data.recording import Recording, frames_per_tick
 from asp_env.errors import AspEnvError, DataError, LeftOutWarning, unknown_name
@@ -264,7 +265,15 @@ def _find(folder: Path) -> tuple[RecordingFiles, ...]:
         except Exception as error:  # a reader of another package may raise anything
             reason = " ".join(f"{type(error).__name__}: {error}".split())
             warnings.warn(f"reader {name!r} is left out: {reason}", stacklevel=3)
-    return tuple(found)
+    taken = {path for each in found if not isinstance(each, LevelxFiles) for path in each.tables}
+    return tuple(
+        each
+        for each in found
+        if not (
+            isinstance(each, LevelxFiles)  # whose names others have, too: Veh_smoothed_tracks.csv
+            and {path for path in each.tables if path.is_file()} <= taken
+        )
+    )
 
 
 def _sample(site: str) -> Path:

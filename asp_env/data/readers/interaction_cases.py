@@ -145,7 +145,7 @@ def _read_cases(path: Path) -> CacheEntry:
     columns = read_measurements(path, names, _CASES, optional=OPTIONAL_TRACKS)
     ids = columns["track_id"]
     codes, known = pd.factorize(ids)
-    numbers = pd.to_numeric(pd.Series(known), errors="coerce").to_numpy(dtype=np.float64)
+    numbers = pd.to_numeric(pd.Series(known), errors="coerce").to_numpy(dtype=np.float64, copy=True)
     whole = np.isfinite(numbers) & (numbers == np.floor(numbers)) & (np.abs(numbers) < 2**53)
     start = int(numbers[whole].max(initial=-1)) + 1
     numbers[~whole] = start + np.arange((~whole).sum())  # such as P1, the ids of pedestrians
