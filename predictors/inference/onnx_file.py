@@ -158,7 +158,7 @@ class _Forecaster(nn.Module):
 
     def forward(self, *inputs: Tensor) -> tuple[Tensor, ...]:
         """The outputs, computed with one more target: onnxruntime's GRU aborts without any."""
-        padded = [torch.cat([torch.zeros_like(each[:1]), each]) for each in inputs]
+        padded = [torch.cat([each.new_zeros((1, *each.shape[1:])), each]) for each in inputs]
         return tuple(each[1:] for each in self.outputs(padded).values())
 
     def outputs(self, inputs: Sequence[Tensor]) -> dict[str, Tensor]:

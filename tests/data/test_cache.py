@@ -48,12 +48,23 @@ def test_a_truncated_file_counts_as_absent(tmp_path: Path, cut: int) -> None:
     assert cache.load(path, STAMP) is None
 
 
-@pytest.mark.parametrize(
-    "content", [b"", b"asp-env\0", b"asp-env\0" + b"\xff" * 64, b"PK\3\4" * 99]
-)
+@pytest.mark.parametrize("content", [b"", b"asp-env1", b"asp-env1" + b"\xff" * 64, b"PK\3\4" * 99])
 def test_another_kind_of_file_counts_as_absent(tmp_path: Path, content: bytes) -> None:
     path = tmp_path / "a.bin"
     path.write_bytes(content)
+    assert cache.load(path, STAMP) is None
+
+
+@given(byte=st.integers(0, 10**6), bit=st.integers(0, 7))
+def test_a_flipped_bit_anywhere_counts_as_absent(
+    tmp_path_factory: pytest.TempPathFactory, byte: int, bit: int
+) -> None:
+    """In the magic word, the checksum, the header, or the arrays."""
+    path = tmp_path_factory.mktemp("cache") / "a.bin"
+    cache.save(path, STAMP, {"rate": 25.0}, {"states": np.arange(30.0), "ids": np.arange(7)})
+    content = bytearray(path.read_bytes())
+    content[byte % len(content)] ^= 1 << bit
+    path.write_bytes(bytes(content))
     assert cache.load(path, STAMP) is None
 
 

@@ -113,7 +113,7 @@ def test_a_delayed_predictor_shows_the_signals_of_then() -> None:
     ("lines", "states", "message"),
     [
         (np.zeros((2, 2, 2)), np.zeros((1, 5), dtype=np.int8), "2 stop lines but .* 1 signals"),
-        (np.full((1, 2, 2), np.nan), np.zeros((1, 5), dtype=np.int8), "expected finite"),
+        (np.full((1, 2, 2), np.inf), np.zeros((1, 5), dtype=np.int8), "expected finite"),
         (np.zeros((1, 2, 2)), np.full((1, 5), 4, dtype=np.int8), r"0 \(unknown\), 1 \(red\)"),
     ],
 )

@@ -100,6 +100,14 @@ def test_onnxruntime_agrees_with_the_predictor(exported: Exported) -> None:
         np.testing.assert_allclose(each, expected.actions, atol=1e-4)
 
 
+def test_no_targets_give_empty_outputs(exported: Exported) -> None:
+    """Arrays of no rows, each in the shape that one target has."""
+    batch = make_batch(scene(), exported.predictor.view, exported.predictor.history)
+    one = exported.outputs([tensor[:1] for tensor in inputs_of(batch)])
+    none = exported.outputs([tensor[:0] for tensor in inputs_of(batch)])
+    assert [each.shape for each in none] == [(0, *each.shape[1:]) for each in one]
+
+
 def test_standing_target_has_no_negative_speed(exported: Exported) -> None:
     """One target at 0.1 m/s: speeds are not negative and agree with the network to 1e-4."""
     batch = make_batch(scene(), exported.predictor.view, exported.predictor.history)
