@@ -358,14 +358,12 @@ def _lanelet(
 
 def _use(relation: Relation, subtype: str, unknown: dict[str, list[str]]) -> Use:
     """How vehicles use a lanelet: by its participants, else by its subtype."""
-    of_subtype: Use = "unlisted"
-    for use, subtypes in (
+    known: tuple[tuple[Use, frozenset[str]], ...] = (
         ("along", VEHICLE_SUBTYPES),
         ("over", CROSSED_SUBTYPES),
         ("not", OTHER_SUBTYPES),
-    ):
-        if subtype in subtypes:
-            of_subtype = use
+    )
+    of_subtype = next((use for use, subtypes in known if subtype in subtypes), "unlisted")
     allowed = vehicles_allowed(relation.tags)
     if allowed and of_subtype != "along":
         what = f"of subtype {subtype!r} are roads, since a participant tag allows vehicles"

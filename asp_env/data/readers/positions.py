@@ -105,7 +105,7 @@ def locate_nodes(osm: Osm, origin: Origin, repairs: list[str]) -> dict[str, np.n
     positions = found[system]
     if system != usual:
         repairs.append(f"{len(names)} nodes are at {_NAMES[system]}, not at {_NAMES[usual]}")
-    present = np.isfinite(positions).all(axis=1)
+    present = np.asarray(np.isfinite(positions).all(axis=1))
     if not present.all():
         _leave_out(repairs, names, ~present, "without a valid position")
     if _median_m(positions) >= FAR_M:
@@ -205,9 +205,9 @@ def _another_place(
     osm: Osm, coordinates: Float[np.ndarray, "n 6"], system: str, origin: Origin
 ) -> DataError:
     middle = np.nanmedian(coordinates[:, SYSTEMS[system]], axis=0)
-    unit = "degrees" if system == "degrees" else "metres"
+    unit = "" if system == "degrees" else " (metres)"
     return DataError(
-        f"{osm.path}: lies at about {middle[0]:.4f}, {middle[1]:.4f} ({unit}), expected it at its "
+        f"{osm.path}: lies at about {middle[0]:.4f}, {middle[1]:.4f}{unit}, expected it at its "
         f"recordings' origin {origin.latitude_deg:.4f}, {origin.longitude_deg:.4f} (degrees; from "
         "recordingMeta.csv, or meta_data.csv in the tracks' folder): put the right file in its "
         "place"

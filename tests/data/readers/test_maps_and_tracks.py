@@ -8,7 +8,7 @@ import pytest
 from pyproj import Transformer
 
 from asp_env.cli import main
-from asp_env.data.readers.placing import used_region
+from asp_env.data.readers.placing import Box, used_region
 from asp_env.data.recording import Recording
 from asp_env.data.source import open_data
 from asp_env.errors import DataError, RepairWarning
@@ -105,7 +105,7 @@ def test_small_maps_are_used_as_a_whole(folder: Path) -> None:
         ((0.0, 0.0, 999.0, 999.0), None),
     ],
 )
-def test_regions(tracks: tuple[float, ...], expected: tuple[float, ...] | None) -> None:
+def test_regions(tracks: Box, expected: Box | None) -> None:
     """100 m around the tracks, at multiples of 50 m from the map's corner (0, 0)."""
     assert used_region(tracks, (0.0, 0.0, 1000.0, 1000.0)) == expected
 
