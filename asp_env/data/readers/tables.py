@@ -304,10 +304,11 @@ def _chunks(
             raise ValueError(f"there is a line break before {missing[0]!r} in the header")
         chunk = {}
         for name, kind in columns.items():
-            if kind == "id" and EXACT <= frame[name].abs().max(skipna=False) < math.inf:
+            cells = frame[name].to_numpy()
+            if kind == "id" and EXACT <= float(np.abs(cells).max()) < math.inf:
                 chunk[name] = _exact_ids(path, name, number)
             else:
-                chunk[name] = _checked(frame[name], kind, limits.get(name))
+                chunk[name] = _checked(cells, kind, limits.get(name))
         yield chunk
 
 
@@ -346,10 +347,9 @@ def _exact_id(cell: str) -> int:
         return int(value)
 
 
-def _checked(column: pd.Series, kind: Kind, limit: Limit | None) -> np.ndarray:
+def _checked(cells: np.ndarray, kind: Kind, limit: Limit | None) -> np.ndarray:
     if kind == "text":
-        return column.to_numpy(dtype=object)
-    cells = column.to_numpy()
+        return cells.astype(object)
     if not np.isfinite(cells).all():
         raise ValueError("a cell is not a number")
     if kind != "number" and not ((cells == np.floor(cells)) & (np.abs(cells) < EXACT)).all():
