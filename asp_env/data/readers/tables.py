@@ -348,10 +348,11 @@ def _chunks(
             continue
         chunk = {}
         for name, kind in kinds.items():
-            if kind == "id" and EXACT <= frame[name].abs().max(skipna=False) < math.inf:
+            cells = frame[name].to_numpy()
+            if kind == "id" and EXACT <= float(np.abs(cells).max()) < math.inf:
                 chunk[name] = _exact_ids(path, header, index_of[name], number)
             else:
-                chunk[name] = _checked(frame[name], kind, limits.get(name))
+                chunk[name] = _checked(cells, kind, limits.get(name))
         yield chunk
 
 
@@ -395,10 +396,9 @@ def _exact_id(cell: str) -> int:
         return int(value)
 
 
-def _checked(column: pd.Series, kind: Kind, limit: Limit | None) -> np.ndarray:
+def _checked(cells: np.ndarray, kind: Kind, limit: Limit | None) -> np.ndarray:
     if kind == "text":
-        return column.to_numpy(dtype=object)
-    cells = column.to_numpy()
+        return cells.astype(object)
     may_be_nan = kind == "number or empty"
     if not (np.isfinite(cells) | (may_be_nan & np.isnan(cells))).all():
         raise ValueError("a cell is not a number")

@@ -47,7 +47,7 @@ def test_larger_ids_are_numbered_and_reported(tmp_path: Path, beyond: int) -> No
     """The two ids are equal in double precision; the first rows belong to the larger one."""
     tracks = some_tracks(np.arange(50))
     plain = opened(tmp_path / "a", tracks)
-    tracks["trackId"] = tracks["trackId"].map({0: beyond + 1, 1: beyond})
+    tracks["trackId"] = [beyond + 1 if track == 0 else beyond for track in tracks["trackId"]]
     recording = opened(tmp_path / "b", tracks)
     assert recording.track_ids.tolist() == [0, 1]
     np.testing.assert_array_equal(recording.track(1), plain.track(0))
@@ -59,7 +59,8 @@ def test_larger_ids_are_numbered_and_reported(tmp_path: Path, beyond: int) -> No
 def test_large_ids_of_the_interaction_layout(tmp_path: Path) -> None:
     """Vehicles are numbered, pedestrians get ids above."""
     vehicles = interaction_files.some_cars()
-    vehicles["track_id"] = vehicles["track_id"].map({1: 10**19 + 1, 2: 10**19, 7: 3})
+    names = {1: 10**19 + 1, 2: 10**19, 7: 3}
+    vehicles["track_id"] = [names[track] for track in vehicles["track_id"]]
     walkers = interaction_files.walk("P1", (30.0, -18.0), (1.2, 0.0), 40)
     interaction_files.write_recording(tmp_path, vehicles=vehicles, pedestrians=walkers)
     interaction_files.write_map(tmp_path)

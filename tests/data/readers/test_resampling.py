@@ -10,6 +10,8 @@ from hypothesis import strategies as st
 from asp_env.data.readers.layout import TrackTable
 from asp_env.data.readers.resampling import at_times, resample
 from asp_env.data.source import open_data
+from asp_env.envs.replay import ReplayEnv
+from asp_env.evaluation.open_loop.evaluate import Evaluate, evaluate
 from tests.data import interaction_files, levelx_files
 from tests.real_data import real_data
 
@@ -149,6 +151,25 @@ def test_recordings_of_any_rate_can_be_opened(tmp_path: Path, rate_hz: float) ->
     along = -0.16 * np.sin(0.4 * times) * speed_y / np.hypot(4.0, speed_y)
     assert recording.accelerations is not None
     np.testing.assert_allclose(recording.accelerations, along, atol=2e-4)
+
+
+def test_commands_and_environments_use_any_tick(tmp_path: Path) -> None:
+    """Cars at 29.97 Hz: an environment with ticks of 0.1 s, and the manifest of `evaluate`."""
+    frames = np.arange(int(10 * 29.97))
+    rows = levelx_files.track_rows(0, frames, 29.97)
+    data = tmp_path / "data"
+    levelx_files.write_recording(data, rate_hz=29.97, classes=["car"], tracks=rows)
+    levelx_files.write_map(data)
+    env = ReplayEnv(str(data), dt_s=0.1)
+    env.reset(seed=0)
+    rewards = [env.step(np.zeros(2, dtype=np.float32))[1] for _ in range(3)]
+    assert np.isfinite(rewards).all()
+    result = evaluate(
+        Evaluate(
+            data=str(data), out=tmp_path / "out", predictors=("constant-velocity",), planner="none"
+        )
+    )
+    assert result.manifest["resampled"] == {"00": {"from_hz": 29.97, "to_hz": 30.0}}
 
 
 def test_recordings_that_fit_are_not_resampled(tmp_path: Path) -> None:
