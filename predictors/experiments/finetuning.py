@@ -246,6 +246,7 @@ class Study:
             ),
             data_hash=self.recordings.data_hash(),
             validation_hash=None,
+            resampled=self.recordings.resampled(),
         )
 
     def _errors(

@@ -87,12 +87,15 @@ def test_a_circle(rate_hz: float, within_m: float) -> None:
 def test_polynomials_of_degree_2_are_exact_at_any_spacing(
     steps: list[float], acceleration: float, shares: list[float]
 ) -> None:
-    """Also between the first and the last two rows; a row itself is found to the last bit."""
+    """Also between the first and the last two rows; a row itself is found to the last bit.
+
+    A time that is within a millionth of a row is that of the row.
+    """
     times = np.concatenate([[0.0], np.cumsum(steps)])
     values = (1.0 + 2.0 * times + 0.5 * acceleration * times**2)[:, None]
     wanted = np.sort(np.array(shares)) * times[-1]
     expected = 1.0 + 2.0 * wanted + 0.5 * acceleration * wanted**2
-    np.testing.assert_allclose(at_times(values, times, wanted)[:, 0], expected, atol=1e-9)
+    np.testing.assert_allclose(at_times(values, times, wanted)[:, 0], expected, atol=1e-5)
     np.testing.assert_array_equal(at_times(values, times, times), values)
 
 
