@@ -363,7 +363,10 @@ def _use(relation: Relation, subtype: str, unknown: dict[str, list[str]]) -> Use
         ("over", CROSSED_SUBTYPES),
         ("not", OTHER_SUBTYPES),
     )
-    of_subtype = next((use for use, subtypes in known if subtype in subtypes), "unlisted")
+    of_subtype: Use = "unlisted"
+    for use, subtypes in known:
+        if subtype in subtypes:
+            of_subtype = use
     allowed = vehicles_allowed(relation.tags)
     if allowed and of_subtype != "along":
         what = f"of subtype {subtype!r} are roads, since a participant tag allows vehicles"
