@@ -182,7 +182,7 @@ def test_recordings_that_fit_are_not_resampled(tmp_path: Path) -> None:
     assert recorded.resampled() == {}
     assert (other[0].frame_rate_hz, other[0].resampled_from_hz) == (30.0, 25.0)
     assert other.subset([0])[0] is other[0]
-    with pytest.raises(AspEnvError, match="0.025 s is too short for recordings of 25 Hz: choose"):
+    with pytest.raises(AspEnvError, match=r"0\.025 s is too short for recordings of 25 Hz: choose"):
         open_data(tmp_path, dt_s=0.025)[0]
     assert recorded.data_hash() == other.data_hash()
     coinciding = other[0].track(0)[::6], recorded[0].track(0)[::5]  # every 0.2 s
