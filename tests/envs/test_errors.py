@@ -17,7 +17,7 @@ from asp_env.errors import AspEnvError
         ({"raster_px": (90, 61)}, "square pixels"),
         ({"traffic": "idn"}, r"unknown driver 'idn' \(did you mean 'idm'"),
         ({"dt_s": 0.13}, "0.13 s"),
-        ({"dt_s": 0.025}, "too short for recordings of 25 Hz"),
+        ({"dt_s": 0.07}, "3 s is no whole number of ticks of 0.07 s: choose"),
         ({"reward_weights": {"progres": 2.0}}, "unknown reward weight 'progres'"),
         ({"reward_weights": {"comfort": float("nan")}}, "expected a finite number"),
         ({"render_mode": "ansi"}, "expected human, rgb_array or None"),

@@ -11,6 +11,7 @@ from asp_env.data.readers.layout import TrackTable
 from asp_env.data.readers.resampling import at_times, resample
 from asp_env.data.source import open_data
 from asp_env.envs.replay import ReplayEnv
+from asp_env.errors import AspEnvError
 from asp_env.evaluation.open_loop.evaluate import Evaluate, evaluate
 from tests.data import interaction_files, levelx_files
 from tests.real_data import real_data
@@ -184,6 +185,8 @@ def test_recordings_that_fit_are_not_resampled(tmp_path: Path) -> None:
     assert recorded.resampled() == {}
     assert (other[0].frame_rate_hz, other[0].resampled_from_hz) == (30.0, 25.0)
     assert other.subset([0])[0] is other[0]
+    with pytest.raises(AspEnvError, match=r"0\.025 s is too short for recordings of 25 Hz: choose"):
+        open_data(tmp_path, dt_s=0.025)[0]
     assert recorded.data_hash() == other.data_hash()
     coinciding = other[0].track(0)[::6], recorded[0].track(0)[::5]  # every 0.2 s
     np.testing.assert_array_equal(coinciding[0][:, :2], coinciding[1][:, :2])

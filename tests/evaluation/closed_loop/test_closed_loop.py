@@ -353,7 +353,7 @@ def test_a_run_writes_its_folder(crossings, tmp_path):
         ({"predictors": ()}, "none given"),
         ({"horizon": 0.1}, "no whole number of ticks"),
         ({"rules": "nuplna"}, r"unknown rules 'nuplna' \(did you mean 'nuplan'"),
-        ({"dt": 0.025}, "too short for recordings of 25 Hz"),
+        ({"dt": 0.07}, "no whole number of ticks of 0.07 s: choose"),
         ({"jobs": 0}, "--jobs 0: expected at least 1 process"),
         ({"jobs": -2}, "--jobs -2: expected"),
         ({"reference": "oracle"}, "--reference oracle: expected one of the predictors, constant"),
