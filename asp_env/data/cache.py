@@ -117,7 +117,7 @@ def load(
     try:
         mapped = np.memmap(path, dtype=np.uint8, mode="r").view(np.ndarray)
         head = mapped[:_HEAD].tobytes()
-        if not head.startswith(_MAGIC) or zlib.crc32(mapped[_CHECKED:]) != _number(head[8:12]):
+        if not head.startswith(_MAGIC) or zlib.crc32(mapped[_CHECKED:].data) != _number(head[8:12]):
             return None
         header = json.loads(mapped[_HEAD : _HEAD + _number(head[12:])].tobytes())
         if header["stamp"] != current:

@@ -62,7 +62,7 @@ class Signals:
     @property
     def placed(self) -> Bool[np.ndarray, " signals"]:
         """Mask of the signals whose stop lines are known."""
-        return np.isfinite(self.stop_lines).all(axis=(1, 2))
+        return np.asarray(np.isfinite(self.stop_lines).all(axis=(1, 2)))
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

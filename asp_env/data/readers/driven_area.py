@@ -38,7 +38,8 @@ def _rings(points: Float[np.ndarray, "n 2"]) -> list[np.ndarray]:
     low = points.min(axis=0) - REACH_M - CELL_M
     cells = np.unique(np.floor((points - low) / CELL_M).astype(np.int64), axis=0)
     reach = int(np.ceil(REACH_M / CELL_M))
-    covered = np.zeros(cells.max(axis=0) + reach + 1, dtype=bool)
+    width, height = (cells.max(axis=0) + reach + 1).tolist()
+    covered = np.zeros((width, height), dtype=bool)
     for x in range(-reach, reach + 1):
         for y in range(-reach, reach + 1):
             if np.hypot(x, y) * CELL_M <= REACH_M:

@@ -128,13 +128,17 @@ def read_case(files: CaseFiles, tables: dict[Path, CacheEntry]) -> tuple[TrackTa
     starts = arrays["starts"][first : end + 1]
     rows = slice(starts[0], starts[-1])
     table = TrackTable(
-        **{name: arrays[name][first:end] for name in _COLUMNS},
+        **_columns_of(arrays, int(first), int(end)),
         starts=starts - starts[0],
         states=arrays["states"][rows],
         repairs=tuple(about["repairs"]),
         resampled_from_hz=about["resampled_from_hz"],
     )
     return table, about["rate_hz"]
+
+
+def _columns_of(arrays: Mapping[str, np.ndarray], first: int, end: int) -> dict[str, Any]:
+    return {name: arrays[name][first:end] for name in _COLUMNS}
 
 
 def _list_cases(path: Path) -> CacheEntry:
@@ -146,7 +150,7 @@ def _read_cases(path: Path) -> CacheEntry:
     columns = read_measurements(path, names, _CASES, optional=OPTIONAL_TRACKS)
     ids = columns["track_id"]
     codes, known = pd.factorize(ids)
-    numbers = pd.to_numeric(pd.Series(known), errors="coerce").to_numpy(dtype=np.float64, copy=True)
+    numbers = np.array(pd.to_numeric(pd.Series(known), errors="coerce"), dtype=np.float64)
     whole = np.isfinite(numbers) & (numbers == np.floor(numbers)) & (np.abs(numbers) < 2**53)
     start = int(numbers[whole].max(initial=-1)) + 1
     numbers[~whole] = start + np.arange((~whole).sum())  # such as P1, the ids of pedestrians
@@ -184,7 +188,7 @@ def _read_cases(path: Path) -> CacheEntry:
     counts = np.zeros(len(cases), dtype=np.int64)
     counts[["fault" not in case for case in cases]] = [len(table.track_ids) for table in tables]
     lengths = [np.diff(table.starts) for table in tables] or [np.zeros(0, dtype=np.int64)]
-    arrays = {
+    arrays: dict[str, np.ndarray] = {
         name: np.concatenate([getattr(table, name) for table in tables] or [np.zeros(0)])
         for name in (*_COLUMNS, "states")
     }

@@ -136,7 +136,7 @@ def _tracks(path: Path, names: ClassNames) -> dict[str, np.ndarray]:
 def _numbers(vehicles: np.ndarray, pedestrians: np.ndarray | None = None) -> np.ndarray:
     """Ids as numbers: those of vehicles as in the file if they are whole, then pedestrians'."""
     codes, known = pd.factorize(vehicles)
-    numbers = pd.to_numeric(pd.Series(known), errors="coerce").to_numpy(dtype=np.float64)
+    numbers = np.array(pd.to_numeric(pd.Series(known), errors="coerce"), dtype=np.float64)
     is_plain = np.isfinite(numbers) & (numbers == np.floor(numbers)) & (np.abs(numbers) < 2**53)
     if not is_plain.all():
         numbers = np.arange(len(known), dtype=np.float64)
