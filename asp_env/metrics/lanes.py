@@ -161,7 +161,7 @@ def _build_lane_table(road_map: RoadMap) -> LaneTable:
     return LaneTable(boxes=boxes, chains=_chains(road_map), crossed=_crossed(road_map, boxes))
 
 
-lane_table = MapCache(_build_lane_table, 32)
+lane_table = MapCache(_build_lane_table)
 """The `LaneTable` of a map, cached for the latest maps."""
 
 
