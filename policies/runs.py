@@ -13,6 +13,8 @@ the rewards |
 
 import dataclasses
 import json
+import math
+import zlib
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -32,11 +34,19 @@ from torch import Tensor, nn
 from asp_env.data.predictor import Predictor
 from asp_env.errors import AspEnvError, MissingExtraError
 from asp_env.files import atomic_file, write_text
+from asp_env.stored import brief, parse_json
 from policies.networks import RasterFeatures, TrafficFeatures
 from policies.settings import CONFIG, PolicySettings, read_settings
 
 POLICY = "policy.safetensors"
 CHECKPOINT = "checkpoint.safetensors"
+
+CHECKSUM = "checksum"
+"""Name of the tensor with the checksum of the others in a file."""
+
+MAX_ENTRY = 10_000_000
+"""Largest number of values of an entry of an observation, which bounds the memory. Chosen by
+hand."""
 
 LOG_STD = -1.0
 """Logarithm of the deviation of actions at the start. Chosen by hand: that of stable-baselines3, 0,
@@ -147,7 +157,7 @@ def load_policy(folder: Path) -> TrainedPolicy:
         AspEnvError: there is no finished run, or a file is damaged.
     """
     settings = read_settings(folder)
-    content = json.loads((folder / CONFIG).read_text())
+    content = parse_json((folder / CONFIG).read_bytes())
     space = _read_space(content, folder)
     weights = read_tensors(folder / POLICY)
     policy = algorithm_classes(settings.algorithm).policy(
@@ -226,7 +236,14 @@ def check_predictor(folder: Path, predictor: Predictor | None) -> None:
     Raises:
         AspEnvError: it is another one, or has other weights.
     """
-    trained_with = json.loads((folder / CONFIG).read_text())["predictor"]
+    try:
+        trained_with = parse_json((folder / CONFIG).read_bytes())["predictor"]
+        if trained_with is not None:
+            trained_with = {key: str(trained_with[key]) for key in ("name", "weights")}
+    except (OSError, KeyError, TypeError, ValueError) as error:
+        raise AspEnvError(
+            f"{folder / CONFIG}: damaged ({brief(error)}); train the policy again"
+        ) from None
     given = predictor_identity(predictor)
     if trained_with != given:
         raise AspEnvError(
@@ -244,6 +261,9 @@ def _identity_text(identity: Mapping[str, str] | None) -> str:
 
 def _read_space(content: Any, folder: Path) -> spaces.Dict:
     try:
+        for name, box in content["observation"].items():
+            if not 0 < math.prod(box["shape"]) <= MAX_ENTRY:
+                raise ValueError(f"{name} of shape {box['shape']}")
         return spaces.Dict(
             {
                 name: spaces.Box(
@@ -268,7 +288,11 @@ def read_tensors(path: Path) -> dict[str, Tensor]:
         AspEnvError: there is no such file, or it is damaged.
     """
     try:
-        return load(path.read_bytes())
+        tensors = load(path.read_bytes())
+        checksum = tensors.pop(CHECKSUM, None)  # older runs have none
+        if checksum is not None and not torch.equal(checksum, _checksum(tensors)):
+            raise SafetensorError("its checksum differs")
+        return tensors
     except FileNotFoundError:
         raise AspEnvError(
             f"{path}: missing, the training has not ended; resume it with asp-env rl train --resume"
@@ -278,10 +302,20 @@ def read_tensors(path: Path) -> dict[str, Tensor]:
 
 
 def write_tensors(path: Path, tensors: Mapping[str, Tensor]) -> None:
-    """Writes a safetensors file atomically."""
-    content = save({name: value.detach().contiguous().clone() for name, value in tensors.items()})
+    """Writes a safetensors file with a checksum, atomically."""
+    plain = {name: value.detach().cpu().contiguous().clone() for name, value in tensors.items()}
+    content = save(plain | {CHECKSUM: _checksum(plain)})
     with atomic_file(path) as partial:
         partial.write_bytes(content)
+
+
+def _checksum(tensors: Mapping[str, Tensor]) -> Tensor:
+    """The CRC-32 of the names and the content of some tensors."""
+    value = 0
+    for name in sorted(tensors):
+        value = zlib.crc32(name.encode(), value)
+        value = zlib.crc32(tensors[name].contiguous().reshape(-1).view(torch.uint8).numpy(), value)
+    return torch.tensor([value], dtype=torch.int64)
 
 
 def flatten_state(state: Mapping[Any, Any], prefix: str) -> dict[str, Tensor]:

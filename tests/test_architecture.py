@@ -13,7 +13,7 @@ import pytest
 ROOT = Path(__file__).parents[1]
 PACKAGES = ("asp_env", "predictors", "scenarios", "policies")
 
-ON_ALL = {"errors", "registry", "geometry", "files", "workers", "compiled"}
+ON_ALL = {"errors", "registry", "geometry", "files", "stored", "workers", "compiled"}
 FOR_PREDICTORS = {"views", "metrics", "data", "dynamics"} | ON_ALL
 ARROWS = {
     "__init__": {"envs", "planning", "data", "dynamics", "errors"},
@@ -22,6 +22,7 @@ ARROWS = {
     "geometry": {"errors", "compiled"},
     "compiled": set[str](),
     "files": {"errors"},
+    "stored": {"errors"},
     "workers": {"errors"},
     "cli": ON_ALL,
     "dynamics": ON_ALL,

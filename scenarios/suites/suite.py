@@ -12,6 +12,7 @@ from pathlib import Path
 from asp_env.data.cache import get_or_create
 from asp_env.data.source import open_data
 from asp_env.errors import AspEnvError, MissingExtraError, unknown_name
+from asp_env.stored import parse_json
 from scenarios.sumo.dataset import synthesize
 
 PLACES = 72
@@ -157,7 +158,7 @@ def frozen_facts(suite: Suite) -> Mapping[str, object]:
 def _difference(suite: Suite, folder: Path) -> str:
     """States how the traffic in a folder differs from the frozen one."""
     try:
-        made = json.loads((folder / MADE).read_text())
+        made = parse_json((folder / MADE).read_bytes())
     except (OSError, ValueError) as error:
         raise AspEnvError(f"{folder / MADE}: cannot be read; delete {folder}") from error
     frozen = frozen_facts(suite)

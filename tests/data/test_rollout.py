@@ -176,7 +176,7 @@ def test_other_files_are_rejected(tmp_path: Path, write: Callable[[Path], None])
         ({"forecast_ticks": np.array([0, 1, -1])}, "forecast_ticks: expected numbers from 0 to 2"),
         ({"classes": np.array([0, 99])}, "classes: expected numbers from 0 to 10"),
         ({"events": np.zeros((3, 3), dtype=bool)}, "events: 3 along 'kinds', expected 2"),
-        ({"dt_s": float("nan")}, "time step nan"),
+        ({"dt_s": float("nan")}, "dt_s is nan"),
         ({"dt_s": 0.0}, "time step 0.0"),
     ],
     ids=lambda value: next(iter(value)) if isinstance(value, dict) else None,

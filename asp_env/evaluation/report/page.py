@@ -34,6 +34,7 @@ from asp_env.evaluation.report.tables import (
 from asp_env.evaluation.results import SCORE, difference_of
 from asp_env.evaluation.selection import split_name
 from asp_env.files import atomic_file
+from asp_env.stored import parse_json
 
 BASELINE = "constant-velocity"
 RATIO = "FDE / constant velocity"
@@ -131,7 +132,7 @@ def write_report(
 
 def _read_manifest(path: Path) -> dict[str, Any]:
     try:
-        manifest = json.loads(path.read_text(encoding="utf-8"))
+        manifest = parse_json(path.read_bytes())
     except (OSError, ValueError) as error:
         raise DataError(f"{path}: not a manifest that can be read ({error})") from error
     if not isinstance(manifest, dict):
