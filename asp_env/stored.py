@@ -9,6 +9,7 @@ import json
 import math
 import types
 import typing
+import warnings
 import zipfile
 import zlib
 from collections.abc import Mapping
@@ -35,6 +36,7 @@ _DAMAGE = (
     *(OSError, EOFError, ValueError, KeyError, TypeError, SyntaxError, RecursionError, MemoryError),
     *(zipfile.BadZipFile, zlib.error, TokenError),
     RuntimeError,  # an encrypted archive, or an unknown compression method
+    UserWarning,  # a header of Python 2
 )
 _WORDS = {
     int: "a whole number",
@@ -66,7 +68,8 @@ def read_arrays(path: Path) -> dict[str, np.ndarray]:
             message does not name it.
     """
     try:
-        with zipfile.ZipFile(path) as archive:
+        with warnings.catch_warnings(), zipfile.ZipFile(path) as archive:
+            warnings.simplefilter("error", UserWarning)
             members = archive.infolist()
             size = sum(member.file_size for member in members)
             if size > MAX_ARRAYS_BYTES:
