@@ -147,6 +147,8 @@ class TrainedPolicy:
         actions, self._memory = self._policy.predict(
             shown, state=self._memory, episode_start=starts, deterministic=True
         )
+        if not np.isfinite(actions).all():
+            raise AspEnvError("a policy's action is not finite, so its weights are damaged")
         return np.asarray(actions, dtype=np.float32)
 
 

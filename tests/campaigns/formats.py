@@ -7,6 +7,7 @@ a fault.
 import contextlib
 import functools
 import io
+import json
 import os
 import shutil
 import warnings
@@ -227,6 +228,15 @@ def make_checkpoint(folder: Path) -> None:
     save_distance(folder)
 
 
+def make_old_checkpoint(folder: Path) -> None:
+    """The same without a hash of its weights, as in runs of earlier versions."""
+    make_checkpoint(folder)
+    path = folder / "config.json"
+    config = json.loads(path.read_text())
+    del config["weights_sha256"]
+    path.write_text(json.dumps(config))
+
+
 def use_checkpoint(folder: Path) -> None:
     """Loads the run with its guard and forecasts a scene."""
     import torch
@@ -271,11 +281,13 @@ def use_policy(folder: Path) -> None:
     import torch
 
     torch.set_num_threads(1)
+    from policies.runs import check_predictor
+
     planner: Any = load_planner(f"sb3:{folder}")
     trained = planner._trained
     shown = {name: np.zeros((2, *box.shape), box.dtype) for name, box in trained.space.items()}
     check_finite("actions", trained.act(shown))
-    planner.check_predictor(load_predictor("constant-velocity", horizon=15, dt_s=DT_S))
+    check_predictor(folder, None)
 
 
 @functools.cache
@@ -349,8 +361,6 @@ def use_hidden(folder: Path) -> None:
 
 def make_report(folder: Path) -> None:
     """A table of metrics and a manifest."""
-    import json
-
     from asp_env.evaluation.results import Row, write_metrics
 
     rows = [
@@ -381,8 +391,6 @@ def use_report(folder: Path) -> None:
 
 def make_suite(folder: Path) -> None:
     """The statement of how the traffic of a suite was made."""
-    import json
-
     made = {"data_hash": "0" * 64, "versions": {"numpy": "2.0.0", "asp-env": "0.1.0"}}
     (folder / "suite.json").write_text(json.dumps(made))
 
@@ -468,6 +476,12 @@ FORMATS: Mapping[str, Format] = {
         Format(
             name="checkpoint",
             make=make_checkpoint,
+            use=use_checkpoint,
+            suffixes=(".json", ".safetensors"),
+        ),
+        Format(
+            name="old-checkpoint",
+            make=make_old_checkpoint,
             use=use_checkpoint,
             suffixes=(".json", ".safetensors"),
         ),

@@ -188,7 +188,7 @@ def test_damaged_files_are_rejected(
         load_scenarios(path, recordings, **TICKS)
 
 
-@pytest.mark.parametrize("text", ["", "[1, 2]", "{", "3", '"a"', "\x00"])
+@pytest.mark.parametrize("text", ["", "[1, 2]", "{", "3", '"a"', "\x00", "[" * 100_000])
 def test_other_and_missing_files_are_rejected(
     text: str, recordings: Recordings, tmp_path: Path
 ) -> None:
