@@ -176,7 +176,24 @@ def load_policy(folder: Path) -> TrainedPolicy:
             "train the policy again"
         ) from None
     policy.set_training_mode(False)
+    _check_space(policy, space, folder)
     return TrainedPolicy(settings, space, policy)
+
+
+def _check_space(policy: BasePolicy, space: spaces.Dict, folder: Path) -> None:
+    """Checks that the observation in `config.json` is what the network reads: it acts once.
+
+    Raises:
+        AspEnvError: it is not.
+    """
+    zeros = {name: np.zeros((1, *box.shape), box.dtype) for name, box in space.items()}  # pyright: ignore[reportOptionalIterable, reportCallIssue, reportArgumentType]
+    try:
+        policy.predict(zeros, episode_start=np.ones(1, dtype=bool), deterministic=True)
+    except (KeyError, IndexError, RuntimeError, TypeError, ValueError) as error:
+        raise AspEnvError(
+            f"{folder / CONFIG}: damaged, its observation is not that of the network "
+            f"({brief(error)}); train the policy again"
+        ) from None
 
 
 def _no_learning(left: float | int) -> float:
