@@ -146,9 +146,11 @@ def _fits(value: object, hint: Any) -> bool:
             isinstance(key, str) and _fits(each, parts[1]) for key, each in value.items()
         )
     if hint is int:
-        return type(value) is int and abs(value) < WHOLE_BELOW
+        is_whole = isinstance(value, int) and not isinstance(value, bool)
+        return is_whole and abs(value) < WHOLE_BELOW
     if hint is float:
-        return type(value) in (int, float) and abs(value) < math.inf
+        is_number = isinstance(value, int | float) and not isinstance(value, bool)
+        return is_number and abs(value) < math.inf
     return isinstance(value, hint) if hint in (bool, str, types.NoneType) else True
 
 

@@ -333,8 +333,12 @@ def _checksum(tensors: Mapping[str, Tensor]) -> Tensor:
     value = 0
     for name in sorted(tensors):
         value = zlib.crc32(name.encode(), value)
-        value = zlib.crc32(tensors[name].contiguous().reshape(-1).view(torch.uint8).numpy(), value)
+        value = zlib.crc32(_bytes(tensors[name]), value)
     return torch.tensor([value], dtype=torch.int64)
+
+
+def _bytes(tensor: Tensor) -> bytes:
+    return tensor.contiguous().reshape(-1).view(torch.uint8).numpy().tobytes()
 
 
 def flatten_state(state: Mapping[Any, Any], prefix: str) -> dict[str, Tensor]:

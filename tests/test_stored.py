@@ -43,7 +43,7 @@ def test_arrays_are_read_as_numpy_does(
     """Bit for bit, of any shape and order of memory."""
     path = tmp_path_factory.mktemp("arrays") / "a.npz"
     given = {name: np.asfortranarray(each) if turned else each for name, each in arrays.items()}
-    np.savez_compressed(path, **given)
+    np.savez_compressed(path, **given)  # pyright: ignore[reportArgumentType]
     found = read_arrays(path)
     assert found.keys() == arrays.keys()
     for name, array in arrays.items():

@@ -174,7 +174,7 @@ def make_geo_trax(folder: Path) -> None:
     rows = []
     for track, speed, count in ((1, 8.0, 90), (2, 9.0, 90), (3, 6.0, 270)):
         time = np.arange(count) / 29.97
-        stamps = pd.Timestamp("2022-10-07 17:52:13") + pd.to_timedelta(time, unit="s").round("ms")
+        stamps = pd.to_datetime(1_665_165_133 + time, unit="s").round("ms")
         table = {
             "Vehicle_ID": track,
             "Timestamp": stamps.strftime("%Y-%m-%d %H:%M:%S.%f").str[:-3],
