@@ -6,7 +6,7 @@ from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
-from hypothesis import settings
+from hypothesis import Phase, settings
 from selenium import webdriver
 
 # Several test processes share the cores, and sums by several threads differ in their last bits.
@@ -15,6 +15,11 @@ os.environ.setdefault("OMP_NUM_THREADS", "1")
 os.environ["SDL_VIDEODRIVER"] = "dummy"
 
 settings.register_profile("same-every-time", derandomize=True, deadline=None, max_examples=30)
+settings.register_profile(
+    "without-shrinking",  # for mutants, of which one failure is enough
+    settings.get_profile("same-every-time"),
+    phases=[Phase.explicit, Phase.generate],
+)
 settings.load_profile("same-every-time")
 
 
