@@ -234,6 +234,17 @@ def test_merging_returns_the_requested_number() -> None:
     assert float(probabilities.sum()) == pytest.approx(1, abs=1e-6)
 
 
+def test_targets_are_merged_independently() -> None:
+    """The results for two targets together are those for each alone."""
+    one = ending_at([0.0, 2.0, 4.0], [0.4, 0.35, 0.25])
+    other = ending_at([7.0, 1.0, 1.5], [0.5, 0.3, 0.2])
+    both = merge(Chains(*(torch.cat(pair) for pair in zip(one, other, strict=True))), 2, HALF_M)
+    for number, chains in enumerate((one, other)):
+        alone = merge(chains, 2, HALF_M)
+        for found, expected in zip(both, alone, strict=True):
+            torch.testing.assert_close(found[number], expected[0])
+
+
 @given(st.integers(0, 10_000), st.integers(1, 6), st.integers(1, 7))
 def test_merged_chains_are_among_the_chains(seed: int, count: int, limit: int) -> None:
     """Rows differ, the first has the largest mass, probabilities sum to one, means are between."""
