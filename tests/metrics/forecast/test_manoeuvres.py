@@ -57,7 +57,7 @@ RATE = np.radians(40) / 6.0
             "right",
             "left before now",
         ),
-        *("turns and turns back", "28°", "320° on a roundabout"),
+        *("turns and turns back", "28 degrees", "320 degrees on a roundabout"),
     ],
 )
 def test_manoeuvres_by_hand(states: np.ndarray, expected: Manoeuvre) -> None:
