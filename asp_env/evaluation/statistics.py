@@ -55,6 +55,12 @@ class Estimate:
     n: int
     """Number of samples."""
 
+    def __format__(self, form: str) -> str:
+        """The value and its interval as text, each formatted by `form`."""
+        if self.low is None or self.high is None:
+            return format(self.value, form)
+        return f"{self.value:{form}} [{self.low:{form}}, {self.high:{form}}]"
+
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Difference:
@@ -66,6 +72,14 @@ class Difference:
     p: float | None
     """Two-sided p value of `value / standard error` under the standard normal distribution; None
     without an interval."""
+
+    def __format__(self, form: str) -> str:
+        """The difference and its interval as text, and the MDE if it is not resolved."""
+        estimate, mde = self.estimate, self.mde
+        if is_resolved(estimate.value, estimate.low, estimate.high, mde):
+            return format(estimate, form)
+        seen = "" if mde is None else f" (smallest that could be seen {mde:{form.lstrip('+')}})"
+        return f"{estimate:{form}}, not resolved{seen}"
 
 
 def mean(values: Shaped[np.ndarray, " n"], groups: Shaped[np.ndarray, " n"]) -> Estimate:
@@ -153,6 +167,20 @@ def resampled_sums(
         resamples and the shape is `(1, *sums)`.
     """
     return average_runs(run_sums(parts, groups), stream=stream)
+
+
+def resampled_means(
+    values: Shaped[np.ndarray, "runs n"], groups: Shaped[np.ndarray, " n"], *, stream: int = 0
+) -> Float[np.ndarray, " draws"]:
+    """Means over samples and runs: of the samples as they are, then of every resample.
+
+    Args:
+        values: values of each run for each of n > 0 samples.
+        groups: recording that each sample is from, as numbers or names.
+        stream: number of the sequence of random numbers, as for `resampled_sums`.
+    """
+    sums = resampled_sums(np.stack([values, np.ones_like(values)], axis=-1), groups, stream=stream)
+    return sums[:, 0] / sums[:, 1]
 
 
 def run_sums(
