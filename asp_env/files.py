@@ -114,6 +114,14 @@ def remove_stale(path: Path) -> None:
                 partial.unlink()
 
 
+def remove_partials(folder: Path) -> None:
+    """Removes all temporary files below a folder to which no other process writes."""
+    token = "[0-9a-f]" * (2 * _TOKEN_BYTES)
+    for partial in folder.rglob(f".*.{token}.partial"):
+        with suppress(OSError):
+            partial.unlink()
+
+
 def _partial_path(target: Path) -> Path:
     """A new name in the nearest existing parent folder, thus on the same file system."""
     parent = next(folder for folder in target.parents if folder.exists())

@@ -76,6 +76,12 @@ def find(group: Group, name: str) -> Any:
         ) from error
 
 
+def package(group: Group, name: str) -> str | None:
+    """The top-level package of the object that is registered under a name, None if none is."""
+    point = _plugs(group).get(name)
+    return None if point is None else point.module.partition(".")[0]
+
+
 def _requirement_with(module: str) -> str:
     """What to install for a missing module: the smallest extra with it, or the package itself."""
     package = _PACKAGE_OF_MODULE.get(module, module).replace("_", "-")

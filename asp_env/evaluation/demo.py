@@ -154,7 +154,7 @@ def _show(
             **dict(zip(("open_loop", "closed_loop"), manifests, strict=False)),
         )
         if closed_loop is not None:
-            write_scenario_table(folder, closed_loop.scenarios, closed_loop.methods)
+            write_scenario_table(folder, [closed_loop.driven])
             save_rollouts(folder, closed_loop)
         write_report(
             folder,

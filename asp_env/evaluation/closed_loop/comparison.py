@@ -5,6 +5,7 @@ other or on the number of processes, and networks run on one thread, so results 
 for bit however the units are distributed.
 """
 
+import dataclasses
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
@@ -19,9 +20,10 @@ from asp_env.data.rollout import Rollout
 from asp_env.data.scenarios.scenario import Scenario, ScenarioSet
 from asp_env.data.snippets import HISTORY_S
 from asp_env.data.source import Recordings
+from asp_env.evaluation.closed_loop.containment import Fault
 from asp_env.evaluation.closed_loop.episodes import EpisodeSettings, drive_episodes
-from asp_env.evaluation.results import FALLBACK
-from asp_env.evaluation.selection import load_predictors
+from asp_env.evaluation.results import FALLBACK, FAULTY
+from asp_env.evaluation.selection import load_predictors, short_names
 from asp_env.metrics.driving.rules import Rules, find_rules
 from asp_env.metrics.driving.scores import driving_metrics
 from asp_env.metrics.masked import Masked
@@ -73,6 +75,8 @@ class EpisodeScores:
     """Values (b,) by name."""
     endings: tuple[Ending, ...]
     rollouts: tuple[Rollout, ...]
+    faults: tuple[Fault | None, ...]
+    """The first fault of each episode, where faults are contained."""
 
 
 @final
@@ -99,6 +103,8 @@ class Methods:
         rules: str,
         horizon_s: float,
         dt_s: float,
+        contain_faults: bool = False,
+        budget_ms: float | None = None,
     ) -> None:
         """Loads the planner and the predictors, but opens no data.
 
@@ -111,6 +117,8 @@ class Methods:
             rules: name of the driving rules.
             horizon_s: horizon of forecasts and plans in seconds.
             dt_s: duration of a tick in seconds.
+            contain_faults: as of `EpisodeSettings`.
+            budget_ms: as of `EpisodeSettings`.
 
         Raises:
             AspEnvError: a name is unknown, something cannot be loaded, or the options do not fit.
@@ -123,6 +131,8 @@ class Methods:
             "rules": rules,
             "horizon_s": horizon_s,
             "dt_s": dt_s,
+            "contain_faults": contain_faults,
+            "budget_ms": budget_ms,
         }
         world = world_class(data)
         self.settings = EpisodeSettings(
@@ -132,6 +142,8 @@ class Methods:
             horizon=ticks(horizon_s, dt_s),
             history=ticks(HISTORY_S, dt_s),
             dt_s=dt_s,
+            contain_faults=contain_faults,
+            budget_ms=budget_ms,
         )
         chosen = load_planner(planner)
         runs = [run for names in predictors.values() for run in names]
@@ -157,6 +169,15 @@ class Methods:
             methods.append(alone(planner=chosen))
         self.all: tuple[Method, ...] = tuple(methods)
 
+    @property
+    def labels(self) -> list[str]:
+        """A short name for every run of every method."""
+        short = short_names([*self.predictors])
+        return [
+            " + ".join([method.planner.name, *([short[method.run]] if method.run else [])])
+            for method in self.all
+        ]
+
     def __reduce__(self) -> tuple[Any, ...]:
         return partial(Methods, **self._options), ()
 
@@ -176,10 +197,18 @@ class Methods:
                 recordings, unit.scenarios, method.planner, method.predictor, self.settings
             )
         metrics = driving_metrics(driven.drives, self.settings.rules)
+        faulty = np.array([fault is not None for fault in driven.faults])
+        contained = np.full(len(faulty), self.settings.contain_faults)
         return EpisodeScores(
-            metrics={**metrics, **driven.realism, FALLBACK: driven.fallback},
+            metrics={
+                **metrics,
+                **driven.realism,
+                FALLBACK: driven.fallback,
+                FAULTY: Masked(value=faulty.astype(np.float64), valid=contained),
+            },
             endings=tuple(Ending(kind) for kind in driven.endings.tolist()),
             rollouts=driven.rollouts,
+            faults=driven.faults,
         )
 
 
@@ -252,12 +281,7 @@ class ComparisonScores:
         worst = sorted([*self._worst, *ranked], key=lambda each: each[:2])
         self._worst = worst[:SAVED_ROLLOUTS]
         self._numbers.append(numbers)
-        self._complete.append(
-            [
-                EpisodeScores(metrics=scores.metrics, endings=scores.endings, rollouts=())
-                for scores in by_method
-            ]
-        )
+        self._complete.append([dataclasses.replace(scores, rollouts=()) for scores in by_method])
 
     @property
     def worst(self) -> list[int]:
@@ -269,6 +293,7 @@ class ComparisonScores:
         order = np.argsort(np.concatenate(self._numbers))
         parts = [by_method[method] for by_method in self._complete]
         endings = [ending for part in parts for ending in part.endings]
+        faults = [fault for part in parts for fault in part.faults]
         return EpisodeScores(
             metrics={
                 name: Masked(
@@ -278,5 +303,6 @@ class ComparisonScores:
                 for name in parts[0].metrics
             },
             endings=tuple(endings[i] for i in order.tolist()),
+            faults=tuple(faults[i] for i in order.tolist()),
             rollouts=tuple(rollouts[method] for _, _, rollouts in self._worst),
         )

@@ -27,8 +27,13 @@ from asp_env.evaluation.closed_loop.comparison import (
     WorkUnit,
     work_units,
 )
-from asp_env.evaluation.closed_loop.scenario_table import write_scenario_table
-from asp_env.evaluation.closed_loop.summary import Comparison, MethodScores, comparison_rows
+from asp_env.evaluation.closed_loop.scenario_table import DrivenScenarios, write_scenario_table
+from asp_env.evaluation.closed_loop.summary import (
+    Comparison,
+    MethodScores,
+    comparison_rows,
+    scores_by_method,
+)
 from asp_env.evaluation.hard import HARD_NOTE, is_hard, select_scenarios
 from asp_env.evaluation.ladder import BASELINE, missing_controls
 from asp_env.evaluation.report import check_report_possible, write_report
@@ -44,7 +49,6 @@ from asp_env.evaluation.selection import (
     PartChoice,
     expand_runs,
     no_data_error,
-    short_names,
     ticks_to_evaluate,
     with_fallback,
 )
@@ -118,7 +122,7 @@ class Drive:
             write_metrics(folder, result.rows)
             write_manifest(folder, "drive", **result.manifest)
             save_scenarios(folder / "scenarios.json", result.scenarios, result.recordings)
-            write_scenario_table(folder, result.scenarios, result.methods)
+            write_scenario_table(folder, [result.driven])
             save_rollouts(folder, result)
             title = f"Driving on {Path(self.data).name}"
             write_report(folder, title=title, lead=note, maps=result.maps)
@@ -149,6 +153,17 @@ class ClosedLoopResult:
     scenarios: ScenarioSet
     """All scenarios that were driven."""
     recordings: Recordings
+
+    @property
+    def driven(self) -> DrivenScenarios:
+        """The scenarios with the scores of all methods."""
+        return DrivenScenarios(
+            data=self.manifest["data"],
+            traffic=self.manifest["traffic"],
+            latency_ticks=0,
+            scenarios=self.scenarios,
+            methods=self.methods,
+        )
 
 
 def drive(config: Drive) -> ClosedLoopResult:
@@ -181,8 +196,8 @@ def drive(config: Drive) -> ClosedLoopResult:
         chosen, part = _choose_scenarios(config, recordings, methods)
         scores = _drive_all(pool, run_unit, chosen, methods)
     by_run = [scores.of(number) for number in range(len(methods.all))]
-    by_method = _by_method(methods, by_run)
-    labels = _labels(methods)
+    by_method = scores_by_method(methods, by_run)
+    labels = methods.labels
     rules, predictors = methods.settings.rules, methods.predictors
     worst = [chosen[number] for number in scores.worst]
     rows = comparison_rows(_comparison(config, rules, by_method, chosen))
@@ -242,34 +257,6 @@ def _runs_to_drive(config: Drive) -> dict[str, tuple[str, ...]]:
             f"--reference {config.reference}: expected one of the predictors, {', '.join(runs)}"
         )
     return runs
-
-
-def _by_method(methods: Methods, by_run: Sequence[EpisodeScores]) -> list[MethodScores]:
-    """The scores of all runs, grouped by method."""
-    groups: dict[tuple[str, str], list[int]] = {}
-    for number, method in enumerate(methods.all):
-        groups.setdefault((method.planner.name, method.predictor_name), []).append(number)
-    return [
-        MethodScores(
-            planner=planner,
-            predictor=predictor,
-            runs={
-                methods.all[i].run: methods.all[i].predictor if predictor else None for i in numbers
-            },
-            scores=[by_run[i] for i in numbers],
-            stream=position,
-        )
-        for position, ((planner, predictor), numbers) in enumerate(groups.items())
-    ]
-
-
-def _labels(methods: Methods) -> list[str]:
-    """A short name for every run of every method."""
-    short = short_names([*methods.predictors])
-    return [
-        " + ".join([method.planner.name, *([short[method.run]] if method.run else [])])
-        for method in methods.all
-    ]
 
 
 def _comparison(

@@ -80,6 +80,7 @@ def episodes(*scores: float, **metrics: tuple[float, ...]) -> EpisodeScores:
     return EpisodeScores(
         metrics={name: Masked(value=np.array(each), valid=valid) for name, each in values.items()},
         endings=(Ending.GOAL,) * len(scores),
+        faults=(None,) * len(scores),
         rollouts=tuple(dataclasses.replace(make_rollout(), dt_s=score) for score in scores),
     )
 

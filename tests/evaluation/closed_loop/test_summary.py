@@ -9,7 +9,7 @@ from asp_env.data.predictor import Predictor
 from asp_env.data.scenarios.scenario import ScenarioSet
 from asp_env.data.scenarios.tags import COLUMNS, TAGS
 from asp_env.evaluation.closed_loop.comparison import EpisodeScores
-from asp_env.evaluation.closed_loop.scenario_table import write_scenario_table
+from asp_env.evaluation.closed_loop.scenario_table import DrivenScenarios, write_scenario_table
 from asp_env.evaluation.closed_loop.summary import Comparison, MethodScores, comparison_rows
 from asp_env.evaluation.results import Row
 from asp_env.metrics.masked import Masked
@@ -58,6 +58,7 @@ def _scores(values, **more) -> EpisodeScores:
         },
         endings=(Ending.GOAL,) * len(values),
         rollouts=(),
+        faults=(None,) * len(values),
     )
 
 
@@ -222,18 +223,82 @@ def test_the_scenario_table_has_a_row_for_each_method_run_and_scenario(tmp_path)
         _method("", _scores([1, 1], comfort=[1, np.nan]), planner="expert"),
         _method("m:*", _scores([1 / 3, 1]), _scores([0.5, 1])),
     ]
-    write_scenario_table(tmp_path, _scenarios(0, 1, left=(0,)), methods)
+    scenarios = _scenarios(0, 1, left=(0,))
+    driven = DrivenScenarios(
+        data="d", traffic="log", latency_ticks=2, scenarios=scenarios, methods=methods
+    )
+    write_scenario_table(tmp_path, [driven])
     with (tmp_path / "scenarios.csv").open(newline="") as file:
         header, *rows = csv.reader(file)
     assert header == [
-        "scenario", "recording", "location", "tags", "planner", "predictor", "run", "ending",
-        "score", "comfort",
+        "data", "traffic", "latency_ticks", "scenario", "recording", "location", "tags", "planner",
+        "predictor", "run", "ending", "fault", "score", "comfort",
     ]  # fmt: skip
     assert rows == [
-        ["r0-0-15", "r0", "here", "left", "expert", "", "", "GOAL", "1", "1"],
-        ["r1-1-15", "r1", "here", "", "expert", "", "", "GOAL", "1", ""],
-        ["r0-0-15", "r0", "here", "left", "sampling", "m:*", "m:* 0", "GOAL", "0.333333", ""],
-        ["r1-1-15", "r1", "here", "", "sampling", "m:*", "m:* 0", "GOAL", "1", ""],
-        ["r0-0-15", "r0", "here", "left", "sampling", "m:*", "m:* 1", "GOAL", "0.5", ""],
-        ["r1-1-15", "r1", "here", "", "sampling", "m:*", "m:* 1", "GOAL", "1", ""],
+        ["d", "log", "2", "r0-0-15", "r0", "here", "left", "expert", "", "", "GOAL", "", "1", "1"],
+        ["d", "log", "2", "r1-1-15", "r1", "here", "", "expert", "", "", "GOAL", "", "1", ""],
+        [
+            "d",
+            "log",
+            "2",
+            "r0-0-15",
+            "r0",
+            "here",
+            "left",
+            "sampling",
+            "m:*",
+            "m:* 0",
+            "GOAL",
+            "",
+            "0.333333",
+            "",
+        ],
+        [
+            "d",
+            "log",
+            "2",
+            "r1-1-15",
+            "r1",
+            "here",
+            "",
+            "sampling",
+            "m:*",
+            "m:* 0",
+            "GOAL",
+            "",
+            "1",
+            "",
+        ],
+        [
+            "d",
+            "log",
+            "2",
+            "r0-0-15",
+            "r0",
+            "here",
+            "left",
+            "sampling",
+            "m:*",
+            "m:* 1",
+            "GOAL",
+            "",
+            "0.5",
+            "",
+        ],
+        [
+            "d",
+            "log",
+            "2",
+            "r1-1-15",
+            "r1",
+            "here",
+            "",
+            "sampling",
+            "m:*",
+            "m:* 1",
+            "GOAL",
+            "",
+            "1",
+            "",
+        ],
     ]

@@ -1,0 +1,419 @@
+"""`asp-env study`: methods in several traffics, latencies and data, from one command."""
+
+import fcntl
+import json
+import os
+from collections import Counter
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass, fields, replace
+from pathlib import Path
+from typing import Annotated, Any
+
+import numpy as np
+import tyro
+from rich.console import Console
+from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
+
+from asp_env.data.scenarios.selection import save_scenarios
+from asp_env.errors import AspEnvError
+from asp_env.evaluation.closed_loop.comparison import EXPERT, EpisodeScores, Methods
+from asp_env.evaluation.closed_loop.scenario_table import DrivenScenarios, write_scenario_table
+from asp_env.evaluation.closed_loop.summary import (
+    Comparison,
+    MethodScores,
+    comparison_rows,
+    scores_by_method,
+)
+from asp_env.evaluation.report import check_report_possible, write_report
+from asp_env.evaluation.results import SCORE, Row, write_manifest, write_metrics
+from asp_env.evaluation.selection import PartChoice
+from asp_env.evaluation.study.cells import CellFolder
+from asp_env.evaluation.study.conditions import (
+    Cell,
+    Condition,
+    DataSet,
+    Group,
+    make_cells,
+    make_groups,
+    open_data_sets,
+)
+from asp_env.evaluation.study.driving import CellDriver, Task, drive_tasks
+from asp_env.evaluation.study.settings import StudySettings, read_settings
+from asp_env.evaluation.study.tables import condition_tables, fault_lines
+from asp_env.files import write_text
+from asp_env.metrics.driving.rules import find_rules
+from asp_env.sim.traffic.log import LogDriver
+
+SETTINGS = "study.json"
+"""File with the settings of the last study in a folder."""
+
+SHOWN_SCENARIOS = 6
+"""Number of scenarios of each DATA whose rollouts are stored, for every method: the worst."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Study:
+    """Drive methods in several traffics, latencies and data; finished parts are never repeated.
+
+    A study that was stopped goes on where it was, and one whose options have changed drives only
+    what depends on them.
+    """
+
+    config: tyro.conf.Positional[Path | None] = None
+    """TOML file with the options below as keys; options replace them."""
+    out: Path
+    """Folder of the study: a new one, or that of a study to go on with."""
+    data: Annotated[tuple[str, ...] | None, tyro.conf.arg(metavar="DATA …")] = None
+    """Data, each as for asp-env drive, such as suite:intersection-v1."""
+    methods: Annotated[tuple[str, ...] | None, tyro.conf.arg(metavar="METHOD …")] = None
+    """Methods as for asp-env benchmark: PLANNER+PREDICTOR, a predictor
+    alone, which drives with contingency, or a planner alone."""
+    traffic: Annotated[tuple[str, ...] | None, tyro.conf.arg(metavar="TRAFFIC …")] = None
+    """Drivers of the other agents: log, hybrid, idm, predictor:NAME, …
+    The default is that of the data."""
+    latency_ticks: Annotated[tuple[int, ...] | None, tyro.conf.arg(metavar="TICKS …")] = None
+    """Ticks by which forecasts are late. The default is 0."""
+    scenarios: Annotated[str | None, tyro.conf.arg(metavar="FILTER|FILE")] = None
+    """Scenarios, as for asp-env drive. The default is the frozen list of
+    the data, or all."""
+    max_scenarios: int | None = None
+    """Largest number of scenarios of each DATA, at even spacing."""
+    controls: bool | None = None
+    """Whether the whole ladder of controls drives in replayed traffic
+    without latency. The default is yes."""
+    reference: Annotated[str | None, tyro.conf.arg(metavar="NAME[:RUN]")] = None
+    """Predictor that differences refer to. The default is constant-velocity."""
+    horizon_s: float | None = None
+    """Horizon of forecasts and plans in seconds. The default is 3."""
+    dt_s: float | None = None
+    """Duration of a tick in seconds. The default is 0.2."""
+    part: PartChoice | None = None
+    """Part of the data, as for asp-env drive."""
+    rules: str | None = None
+    """Driving rules: nuplan, pdms, waymax, strict or graded."""
+    budget_ms: float | None = None
+    """Largest wall time of a forecast, and of a plan, in an episode at a
+    tick; what takes longer counts as a fault. Results then depend on
+    the machine."""
+    jobs: int = 1
+    """Number of processes that drive. The results do not depend on it."""
+
+    def run(self) -> None:
+        """Drives what is missing, writes the folder and prints the tables.
+
+        Raises:
+            AspEnvError: an option, the file or the data are bad, or a package is missing.
+        """
+        if self.jobs < 1:
+            raise AspEnvError(f"--jobs {self.jobs}: expected at least 1 process")
+        names = [field.name for field in fields(StudySettings)]
+        settings = read_settings(self.config, {name: getattr(self, name) for name in names})
+        check_report_possible()
+        console = Console()
+        with _locked(self.out):
+            result = run_study(settings, self.out, jobs=self.jobs, console=console)
+            write_study(result, self.out)
+        for table in condition_tables(result.rows, result.privileged):
+            console.print(table)
+        for line in fault_lines(result.driven):
+            console.print(line)
+        console.print(f"wrote {self.out}/report.html")
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class StudyResult:
+    """All results of a study."""
+
+    settings: StudySettings
+    rows: list[Row]
+    """Lines of `metrics.csv`, of all conditions."""
+    driven: list[DrivenScenarios]
+    """Scores of all methods in every scenario, by condition and planner."""
+    data_sets: Mapping[str, DataSet]
+    privileged: list[str]
+    """Names of the planners and predictors that use the recorded future."""
+    predictors: Mapping[str, Mapping[str, str]]
+    """Metadata of the predictors by the name of their run."""
+    rollout_tasks: list[tuple[str, Task]]
+    """Cells with rollouts to show, with the label of their method."""
+    cells: int
+    """Number of different cells."""
+    groups: list[Group]
+
+
+def run_study(
+    settings: StudySettings, out: Path, *, jobs: int = 1, console: Console | None = None
+) -> StudyResult:
+    """Drives all cells that are not stored yet, and summarizes all.
+
+    Args:
+        settings: the settings.
+        out: folder of the study; only its cells are written.
+        jobs: number of processes.
+        console: where progress is shown; nowhere without one.
+
+    Raises:
+        AspEnvError: an option or the data are bad, or a process ended repeatedly.
+    """
+    groups = make_groups(settings)
+    data_sets = open_data_sets(settings, groups)
+    cells = make_cells(groups, data_sets)
+    folder = CellFolder(out)
+    folder.remove_leftovers()
+    missing = {cell.key: Task(cell=cell) for cell in cells if cell.key not in folder}
+    keys = {cell.key for cell in cells}
+    driver = CellDriver(groups, settings.dt_s)
+    columns = (TextColumn("cells"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())
+    with Progress(*columns, console=console, transient=True, disable=console is None) as progress:
+        bar = progress.add_task("cells", total=len(keys), completed=len(keys) - len(missing))
+        for task, scores in drive_tasks(driver, [*missing.values()], jobs):
+            folder.save(task.cell.key, scores)
+            progress.advance(bar)
+    return _summarized(settings, groups, data_sets, cells, folder)
+
+
+def _summarized(
+    settings: StudySettings,
+    groups: list[Group],
+    data_sets: Mapping[str, DataSet],
+    cells: Sequence[Cell],
+    folder: CellFolder,
+) -> StudyResult:
+    rows: list[Row] = []
+    driven: list[DrivenScenarios] = []
+    privileged = [EXPERT]
+    predictors: dict[str, Mapping[str, str]] = {}
+    tasks: list[tuple[str, Task]] = []
+    with_expert: set[Condition] = set()
+    for number, group in enumerate(groups):
+        methods, condition = group.methods(), group.condition
+        data_set = data_sets[condition.data]
+        own = [cell for cell in cells if cell.group == number]
+        by_run = _scores(own, methods, folder)
+        by_method = scores_by_method(methods, by_run)
+        found = comparison_rows(_comparison(settings, condition, data_set, by_method))
+        if condition in with_expert:  # it drives beside every planner
+            by_method = [each for each in by_method if each.planner != EXPERT]
+            found = [row for row in found if row.planner != EXPERT]
+        with_expert.add(condition)
+        rows += found
+        driven.append(
+            DrivenScenarios(
+                data=condition.data,
+                traffic=condition.traffic,
+                latency_ticks=condition.latency_ticks,
+                scenarios=data_set.scenarios,
+                methods=by_method,
+            )
+        )
+        for name, runs in group.runs.items():
+            predictors |= {run: dict(methods.predictors[run].metadata) for run in runs}
+            if methods.predictors[runs[0]].privileged and name not in privileged:
+                privileged.append(name)
+        if condition == _shown_condition(groups, condition.data):
+            tasks += _rollout_tasks(own, methods, by_run, first=number == _first(groups, condition))
+    return StudyResult(
+        settings=settings,
+        rows=rows,
+        driven=driven,
+        data_sets=data_sets,
+        privileged=privileged,
+        predictors=predictors,
+        rollout_tasks=tasks,
+        cells=len({cell.key for cell in cells}),
+        groups=groups,
+    )
+
+
+def _first(groups: Sequence[Group], condition: Condition) -> int:
+    return next(i for i, group in enumerate(groups) if group.condition == condition)
+
+
+def _shown_condition(groups: Sequence[Group], data: str) -> Condition:
+    """The condition of DATA whose drives are shown: that of the first traffic and latency."""
+    return next(group.condition for group in groups if group.condition.data == data)
+
+
+def _scores(cells: Sequence[Cell], methods: Methods, folder: CellFolder) -> list[EpisodeScores]:
+    """The scores of every method of a group in all scenarios, in the order of the scenarios."""
+    parts: list[list[tuple[np.ndarray, EpisodeScores]]] = [[] for _ in methods.all]
+    for cell in cells:
+        parts[cell.unit.method].append((cell.unit.numbers, folder.load(cell.key)))
+    return [_joined(each) for each in parts]
+
+
+def _joined(parts: Sequence[tuple[np.ndarray, EpisodeScores]]) -> EpisodeScores:
+    order = np.argsort(np.concatenate([numbers for numbers, _ in parts]))
+    endings = [ending for _, scores in parts for ending in scores.endings]
+    faults = [fault for _, scores in parts for fault in scores.faults]
+    names = parts[0][1].metrics
+    return EpisodeScores(
+        metrics={
+            name: replace(
+                names[name],
+                value=np.concatenate([scores.metrics[name].value for _, scores in parts])[order],
+                valid=np.concatenate([scores.metrics[name].valid for _, scores in parts])[order],
+            )
+            for name in names
+        },
+        endings=tuple(endings[i] for i in order.tolist()),
+        faults=tuple(faults[i] for i in order.tolist()),
+        rollouts=(),
+    )
+
+
+def _comparison(
+    settings: StudySettings,
+    condition: Condition,
+    data_set: DataSet,
+    methods: Sequence[MethodScores],
+) -> Comparison:
+    rules = find_rules(settings.rules)
+    return Comparison(
+        methods=methods,
+        scenarios=data_set.scenarios,
+        common=Row(
+            data=condition.data,
+            traffic=condition.traffic,
+            latency_ticks=condition.latency_ticks,
+            horizon_s=settings.horizon_s,
+            rules=rules.label,
+            metric="",
+            value=0.0,
+            n=0,
+        ),
+        compared=[*([SCORE] if rules.weights else []), *rules.shown],
+        reference=settings.reference,
+        replayed=condition.traffic == LogDriver.name,
+    )
+
+
+def _rollout_tasks(
+    cells: Sequence[Cell], methods: Methods, by_run: Sequence[EpisodeScores], *, first: bool
+) -> list[tuple[str, Task]]:
+    """Cells of the scenarios with the lowest mean score over all methods but the expert."""
+    name = SCORE if SCORE in by_run[0].metrics else "progress"
+    means = np.mean([each.metrics[name].value for each in by_run[1:] or by_run], axis=0)
+    worst = set(np.argsort(means, kind="stable")[:SHOWN_SCENARIOS].tolist())
+    tasks = []
+    for cell in cells:
+        at = tuple(i for i, number in enumerate(cell.unit.numbers.tolist()) if number in worst)
+        if at and (first or cell.unit.method > 0):
+            tasks.append((methods.labels[cell.unit.method], Task(cell=cell, rollouts=at)))
+    return tasks
+
+
+def write_study(result: StudyResult, out: Path, *, jobs: int = 1) -> None:
+    """Writes all files of a study but its cells.
+
+    Args:
+        result: the result.
+        out: folder of the study.
+        jobs: number of processes that drive the rollouts that are shown once more.
+
+    Raises:
+        AspEnvError: a process ended repeatedly, or a package is missing.
+    """
+    settings = result.settings
+    _write_rollouts(result, out, jobs)
+    write_metrics(out, result.rows)
+    write_scenario_table(out, result.driven)
+    write_manifest(
+        out,
+        "study",
+        settings=settings.as_json(),
+        privileged=result.privileged,
+        predictors=result.predictors,
+        data={
+            name: {
+                "data_hash": each.recordings.data_hash(),
+                "resampled": each.recordings.resampled(),
+                "part": each.part,
+                "scenarios": {
+                    scenario.name: {"seed": scenario.seed} for scenario in each.scenarios
+                },
+            }
+            for name, each in result.data_sets.items()
+        },
+        faults=_fault_counts(result.driven),
+        cells=result.cells,
+        intervals="95 %, bootstrap over recordings and, with several, over training runs",
+    )
+    for number, each in enumerate(result.data_sets.values()):
+        name = "scenarios.json" if len(result.data_sets) == 1 else f"scenarios-{number + 1}.json"
+        save_scenarios(out / name, each.scenarios, each.recordings)
+    shown = {
+        scenario.recording_name: (data, scenario.recording)
+        for data, each in result.data_sets.items()
+        for scenario in each.scenarios
+    }
+    maps = {
+        name: result.data_sets[data].recordings[recording].road_map
+        for name, (data, recording) in shown.items()
+    }
+    write_report(out, title=f"Study on {', '.join(settings.data)}", maps=maps)
+    write_text(out / SETTINGS, json.dumps(settings.as_json(), indent=1) + "\n")
+
+
+def _write_rollouts(result: StudyResult, out: Path, jobs: int) -> None:
+    """Drives the scenarios that are shown once more, unless their rollouts are stored."""
+    wanted: dict[str, list[tuple[Path, int]]] = {}
+    tasks: dict[str, Task] = {}
+    for label, task in result.rollout_tasks:
+        for position in task.rollouts:
+            name = task.cell.unit.scenarios[position].name
+            path = out / "rollouts" / label / f"{name}.npz"
+            stamp = path.with_suffix(".key")
+            if not path.exists() or not stamp.exists() or stamp.read_text() != task.cell.key:
+                wanted.setdefault(task.cell.key, []).append((path, position))
+                tasks[task.cell.key] = task
+    driver = CellDriver(result.groups, result.settings.dt_s)
+    for task, scores in drive_tasks(driver, [*tasks.values()], jobs):
+        for path, position in wanted[task.cell.key]:
+            path.parent.mkdir(parents=True, exist_ok=True)
+            scores.rollouts[task.rollouts.index(position)].save(path)
+            write_text(path.with_suffix(".key"), task.cell.key)
+
+
+def _fault_counts(driven: Sequence[DrivenScenarios]) -> dict[str, dict[str, int]]:
+    """Number of drives with each cause, by method and condition."""
+    counts: dict[str, dict[str, int]] = {}
+    for each in driven:
+        for method in each.methods:
+            causes = Counter(
+                f"{fault.socket} {fault.cause}"
+                for scores in method.scores
+                for fault in scores.faults
+                if fault is not None
+            )
+            if causes:
+                place = f"{each.data}, {each.traffic}, {each.latency_ticks} ticks"
+                counts[f"{method.planner}+{method.predictor} ({place})"] = dict(causes)
+    return counts
+
+
+@contextmanager
+def _locked(out: Path) -> Iterator[None]:
+    """Reserves the folder of a study for this process.
+
+    Raises:
+        AspEnvError: it is not a folder of a study, or another process writes to it.
+    """
+    if out.exists() and not out.is_dir():
+        raise AspEnvError(f"{out} is a file; choose another --out")
+    names: list[Any] = [each.name for each in out.iterdir()] if out.exists() else []
+    if names and not {SETTINGS, "cells"} & set(names):
+        raise AspEnvError(f"{out} exists and is not the folder of a study; choose another --out")
+    (out / "cells").mkdir(parents=True, exist_ok=True)
+    descriptor = os.open(out, os.O_RDONLY)
+    try:
+        try:
+            fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except OSError as error:
+            raise AspEnvError(
+                f"{out}: another process drives this study; wait for it, or choose another --out"
+            ) from error
+        yield
+    finally:
+        os.close(descriptor)
