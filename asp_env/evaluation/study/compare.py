@@ -99,9 +99,10 @@ class Compare:
             if self.a.resolve() == self.b.resolve():
                 raise AspEnvError("the folders are the same: name two of its methods by --methods")
             return {name: (name, name) for name in first if name in second}
-        if len(self.methods) > 2:
+        one, *more = self.methods
+        if len(more) > 1:
             raise AspEnvError(f"--methods: {len(self.methods)} names given, expected one or two")
-        names = (self.methods[0], self.methods[-1])
+        names = (one, more[0] if more else one)
         for name, known in zip(names, (first, second), strict=True):
             if name not in known:
                 raise unknown_name("method", name, known)

@@ -131,7 +131,7 @@ def _group(
         wanted += [each for each in (settings.reference, *more) if each not in wanted]
     wanted = list(dict.fromkeys(wanted))
     runs = {
-        name: tuple(_late(run, condition.latency_ticks) for run in each)
+        name: tuple(f"{late_prefix(condition.latency_ticks)}{run}" for run in each)
         for name, each in expand_runs(wanted).items()
     }
     return Group(
@@ -153,8 +153,9 @@ def _group(
     )
 
 
-def _late(run: str, ticks_late: int) -> str:
-    return f"{DELAYED}:{ticks_late}:{run}" if ticks_late else run
+def late_prefix(latency_ticks: int) -> str:
+    """What the name of a predictor starts with that is late by some ticks."""
+    return f"{DELAYED}:{latency_ticks}:" if latency_ticks else ""
 
 
 def open_data_sets(settings: StudySettings, groups: Sequence[Group]) -> dict[str, DataSet]:

@@ -34,6 +34,7 @@ from asp_env.evaluation.study.conditions import (
     Condition,
     DataSet,
     Group,
+    late_prefix,
     make_cells,
     make_groups,
     open_data_sets,
@@ -191,7 +192,11 @@ def _summarized(
         data_set = data_sets[condition.data]
         own = [cell for cell in cells if cell.group == number]
         by_run = _scores(own, methods, folder)
-        by_method = scores_by_method(methods, by_run)
+        late = late_prefix(condition.latency_ticks)
+        by_method = [
+            replace(each, runs={run.removeprefix(late): p for run, p in each.runs.items()})
+            for each in scores_by_method(methods, by_run)
+        ]
         found = comparison_rows(_comparison(settings, condition, data_set, by_method))
         if condition in with_expert:  # it drives beside every planner
             by_method = [each for each in by_method if each.planner != EXPERT]
@@ -208,7 +213,9 @@ def _summarized(
             )
         )
         for name, runs in group.runs.items():
-            predictors |= {run: dict(methods.predictors[run].metadata) for run in runs}
+            predictors |= {
+                run.removeprefix(late): dict(methods.predictors[run].metadata) for run in runs
+            }
             if methods.predictors[runs[0]].privileged and name not in privileged:
                 privileged.append(name)
         if condition == _shown_condition(groups, condition.data):
