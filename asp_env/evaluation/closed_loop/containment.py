@@ -319,7 +319,8 @@ def _checked_plan(plan: object, num_episodes: int) -> Plan:
 
 def _finite(*arrays: np.ndarray) -> Bool[np.ndarray, " n"]:
     """Which rows of all arrays are finite."""
-    return np.all([np.isfinite(each).reshape(len(each), -1).all(axis=1) for each in arrays], axis=0)
+    finite = [np.isfinite(each).all(axis=tuple(range(1, each.ndim))) for each in arrays]
+    return np.all(finite, axis=0)
 
 
 def _no_forecast(scene: Scene, steps: int) -> Forecast:

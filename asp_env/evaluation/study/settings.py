@@ -71,7 +71,7 @@ class StudySettings:
         for name in ("max_scenarios", "horizon_s", "dt_s", "budget_ms"):
             value = getattr(self, name)
             if value is not None and not value > 0:
-                raise AspEnvError(f"study: {name} {value}, expected a number above 0")
+                raise AspEnvError(f"study: {name} {value:g}, expected a number above 0")
 
     def as_json(self) -> dict[str, Any]:
         """The settings as plain values."""
@@ -113,6 +113,7 @@ def _read_toml(path: Path) -> dict[str, Any]:
 
 _LISTS = {"data": str, "methods": str, "traffic": str, "latency_ticks": int}
 _TEXTS = ("scenarios", "reference", "part", "rules")
+_NUMBERS = ("horizon_s", "dt_s", "budget_ms")
 
 
 def _checked(name: str, value: Any) -> Any:
@@ -127,10 +128,10 @@ def _checked(name: str, value: Any) -> Any:
         good = isinstance(value, str)
     elif name == "controls":
         good = isinstance(value, bool)
-    elif name == "max_scenarios":
-        good = value is None or type(value) is int
-    else:
+    elif name in _NUMBERS:
         good = value is None or type(value) in (int, float)
+    else:
+        good = value is None or type(value) is int
     if not good:
         raise AspEnvError(f"study: {name} {value!r} has a wrong type, see asp-env study --help")
-    return value
+    return float(value) if name in _NUMBERS and value is not None else value
