@@ -105,6 +105,7 @@ class Methods:
         dt_s: float,
         contain_faults: bool = False,
         budget_ms: float | None = None,
+        measure_forecasts: bool = False,
     ) -> None:
         """Loads the planner and the predictors, but opens no data.
 
@@ -119,6 +120,8 @@ class Methods:
             dt_s: duration of a tick in seconds.
             contain_faults: as of `EpisodeSettings`.
             budget_ms: as of `EpisodeSettings`.
+            measure_forecasts: as of `EpisodeSettings`. If the planner is the expert, the methods
+                are then the forecasts of each predictor while it is replayed.
 
         Raises:
             AspEnvError: a name is unknown, something cannot be loaded, or the options do not fit.
@@ -133,6 +136,7 @@ class Methods:
             "dt_s": dt_s,
             "contain_faults": contain_faults,
             "budget_ms": budget_ms,
+            "measure_forecasts": measure_forecasts,
         }
         world = world_class(data)
         self.settings = EpisodeSettings(
@@ -144,6 +148,7 @@ class Methods:
             dt_s=dt_s,
             contain_faults=contain_faults,
             budget_ms=budget_ms,
+            measure_forecasts=measure_forecasts,
         )
         chosen = load_planner(planner)
         runs = [run for names in predictors.values() for run in names]
@@ -153,8 +158,9 @@ class Methods:
             for each in loaded if chosen.uses_forecasts else []:
                 chosen.check_predictor(each)
         alone = partial(Method, predictor=loaded[0], predictor_name="", run="")
-        methods = [alone(planner=load_planner(EXPERT))]
-        if chosen.uses_forecasts:
+        at_log = chosen.privileged and measure_forecasts
+        methods = [] if at_log else [alone(planner=load_planner(EXPERT))]
+        if chosen.uses_forecasts or at_log:
             methods += [
                 Method(
                     planner=chosen,
@@ -192,9 +198,11 @@ class Methods:
             AspEnvError: the data do not suit a predictor or a driver.
         """
         method = self.all[unit.method]
+        measured = self.settings.measure_forecasts and bool(method.run)
+        settings = dataclasses.replace(self.settings, measure_forecasts=measured)
         with one_thread():
             driven = drive_episodes(
-                recordings, unit.scenarios, method.planner, method.predictor, self.settings
+                recordings, unit.scenarios, method.planner, method.predictor, settings
             )
         metrics = driving_metrics(driven.drives, self.settings.rules)
         faulty = np.array([fault is not None for fault in driven.faults])
@@ -205,6 +213,7 @@ class Methods:
                 **driven.realism,
                 FALLBACK: driven.fallback,
                 FAULTY: Masked(value=faulty.astype(np.float64), valid=contained),
+                **driven.forecasts,
             },
             endings=tuple(Ending(kind) for kind in driven.endings.tolist()),
             rollouts=driven.rollouts,

@@ -137,12 +137,12 @@ class Containment:
         if usable is None and running.sum() > 1 and not faulty:
             usable = self._plan_apart(planner, scene, forecast, running)
         if usable is None:
-            return _no_plan(scene, steps)
+            return coasting_plan(scene, steps)
         bad = ~_finite(usable.actions, usable.states) & running
         self._mark(bad, "planner", planner.name, "not finite", "an action or a state is not finite")
         if not bad.any():
             return usable
-        filled = _no_plan(scene, usable.actions.shape[1])
+        filled = coasting_plan(scene, usable.actions.shape[1])
         return Plan(
             actions=np.where(bad[:, None, None], filled.actions, usable.actions),
             states=np.where(bad[:, None, None], filled.states, usable.states),
@@ -208,7 +208,7 @@ class Containment:
     ) -> Plan:
         """The plans of one episode after another."""
         steps = forecast.states.shape[2]
-        plan = _no_plan(scene, steps)
+        plan = coasting_plan(scene, steps)
         for episode in np.flatnonzero(running).tolist():
             only = np.zeros_like(running)
             only[episode] = True
@@ -335,8 +335,13 @@ def _no_forecast(scene: Scene, steps: int) -> Forecast:
     )
 
 
-def _no_plan(scene: Scene, steps: int) -> Plan:
-    """Plans of zero actions."""
+def coasting_plan(scene: Scene, steps: int) -> Plan:
+    """Plans of zero actions for all situations of a scene.
+
+    Args:
+        scene: the scene.
+        steps: number of ticks.
+    """
     egos = scene.states[:, EGO, -1]
     actions = np.zeros((len(egos), steps, 2), dtype=np.float32)
     lengths_m = np.maximum(scene.sizes[:, EGO, 0], 1.0)  # episodes that have ended may have none

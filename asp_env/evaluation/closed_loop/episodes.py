@@ -13,7 +13,8 @@ from asp_env.data.rollout import Rollout
 from asp_env.data.scenarios.scenario import Scenario
 from asp_env.data.scene import EGO, Scene
 from asp_env.data.snippets import Future
-from asp_env.evaluation.closed_loop.containment import Containment, Fault
+from asp_env.evaluation.closed_loop.containment import Containment, Fault, coasting_plan
+from asp_env.evaluation.closed_loop.forecast_quality import forecast_quality
 from asp_env.metrics.drivable import OFF_ROAD_M
 from asp_env.metrics.driving.cost import log_route_m
 from asp_env.metrics.driving.map_context import map_context
@@ -67,6 +68,9 @@ class EpisodeSettings:
     are marked, instead of raising; see `asp_env.evaluation.closed_loop.containment`."""
     budget_ms: float | None = None
     """Largest wall time of a forecast and of a plan, with `contain_faults`; None for no limit."""
+    measure_forecasts: bool = False
+    """Whether the forecasts are measured, see `asp_env.evaluation.closed_loop.forecast_quality`;
+    they are then made while an expert is replayed, too."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -94,6 +98,8 @@ class DrivenEpisodes:
     rollouts: tuple[Rollout, ...]
     faults: tuple[Fault | None, ...]
     """The first fault of each episode; None for one without."""
+    forecasts: Mapping[str, Masked]
+    """Measures of the forecasts (b,), if they are measured."""
 
 
 def drive_episodes(
@@ -137,7 +143,7 @@ def drive_episodes(
     while (endings == Ending.RUNNING).any():
         running = endings == Ending.RUNNING
         actions = np.zeros((len(scenarios), 2), dtype=np.float32)
-        if not planner.privileged:
+        if not planner.privileged or settings.measure_forecasts:
             last_plan = decisions[-1].plan if decisions else None
             decisions.append(
                 _decide(
@@ -149,6 +155,7 @@ def drive_episodes(
                     containment,
                 )
             )
+        if not planner.privileged:
             actions = decisions[-1].plan.actions[:, 0].astype(np.float32)
         simulation.step(actions, running & (not planner.privileged))
         events.append(world.events())
@@ -156,10 +163,12 @@ def drive_episodes(
         endings = np.where(running, ending(events[-1]), endings)
     drives = _measure(world, events, np.stack(active, axis=1), settings.rules)
     flags = _event_flags(drives, settings.rules)
+    made = [decision.forecast for decision in decisions]
     return DrivenEpisodes(
         drives=drives,
         realism=traffic_realism(world, drives.active),
-        fallback=fallback_share([each.forecast for each in decisions], len(scenarios)),
+        fallback=fallback_share(made, len(scenarios)),
+        forecasts=_measured(world, made, drives.active) if settings.measure_forecasts else {},
         endings=endings,
         faults=(None,) * len(scenarios) if containment is None else tuple(containment.faults),
         rollouts=tuple(
@@ -167,6 +176,15 @@ def drive_episodes(
             for b, scenario in enumerate(scenarios)
         ),
     )
+
+
+def _measured(
+    world: World, forecasts: Sequence[Forecast], active: Bool[np.ndarray, "b t"]
+) -> dict[str, Masked]:
+    """Measures of the forecasts, by what happens in the episodes."""
+    ticks = slice(world.history, world.history + active.shape[1])
+    valid = world.episodes.valid[:, ticks] & active[..., None]
+    return forecast_quality(forecasts, world.episodes.states[:, ticks], valid)
 
 
 def _decide(
@@ -188,11 +206,18 @@ def _decide(
         future = recorded_future(simulation.world, scene, horizon)
     if containment is None:
         forecast = forecast_for_planner(predictor, scene, future, horizon)
-        return Decision(running=running, forecast=forecast, plan=planner.plan(scene, forecast))
-    made = containment.predict(predictor, scene, future if predictor.privileged else None, running)
-    forecast = fill_missing(_cut(made, horizon), scene)
-    plan = containment.plan(planner, scene, forecast, running)
-    containment.next_tick()
+    else:
+        given = future if predictor.privileged else None
+        made = containment.predict(predictor, scene, given, running)
+        forecast = fill_missing(_cut(made, horizon), scene)
+    if planner.privileged:
+        plan = coasting_plan(scene, horizon)
+    elif containment is None:
+        plan = planner.plan(scene, forecast)
+    else:
+        plan = containment.plan(planner, scene, forecast, running)
+    if containment is not None:
+        containment.next_tick()
     return Decision(running=running, forecast=forecast, plan=plan)
 
 

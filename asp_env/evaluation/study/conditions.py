@@ -11,7 +11,7 @@ from asp_env.data.snippets import HISTORY_S
 from asp_env.data.source import Recordings, open_readable, source_folder
 from asp_env.errors import AspEnvError
 from asp_env.evaluation.closed_loop.benchmark import FROZEN, parse_method
-from asp_env.evaluation.closed_loop.comparison import Methods, WorkUnit, work_units
+from asp_env.evaluation.closed_loop.comparison import EXPERT, Methods, WorkUnit, work_units
 from asp_env.evaluation.hard import select_scenarios
 from asp_env.evaluation.ladder import ORACLE, missing_controls
 from asp_env.evaluation.selection import (
@@ -46,7 +46,10 @@ class Condition:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Group:
-    """A planner with its predictors in one condition."""
+    """A planner with its predictors in one condition.
+
+    If the planner is the expert, it is replayed while each predictor forecasts.
+    """
 
     condition: Condition
     planner: str
@@ -55,6 +58,11 @@ class Group:
     uses_forecasts: bool
     options: Mapping[str, Any]
     """Arguments of `Methods`."""
+
+    @property
+    def is_static(self) -> bool:
+        """Whether the expert is replayed, so that forecasts are of logged states."""
+        return self.planner == EXPERT
 
     def methods(self) -> Methods:
         """Loads the planner and the predictors.
@@ -111,7 +119,26 @@ def make_groups(settings: StudySettings) -> list[Group]:
                     for planner, predictors in named.items()
                     if (group := _group(settings, condition, planner, predictors)) is not None
                 ]
+        groups += _static_groups(settings, data, groups)
     return groups
+
+
+def _static_groups(settings: StudySettings, data: str, groups: Sequence[Group]) -> list[Group]:
+    """Groups in which the expert is replayed and all predictors of DATA forecast, by latency."""
+    found = []
+    for latency in settings.latency_ticks:
+        condition = Condition(data=data, traffic=world_class(data).traffic, latency_ticks=latency)
+        runs = {
+            name: each
+            for group in groups
+            if group.condition.data == data
+            and group.condition.latency_ticks == latency
+            and group.uses_forecasts
+            for name, each in group.runs.items()
+        }
+        if runs:
+            found.append(_make_group(settings, condition, EXPERT, runs))
+    return found
 
 
 def _group(
@@ -134,6 +161,17 @@ def _group(
         name: tuple(f"{late_prefix(condition.latency_ticks)}{run}" for run in each)
         for name, each in expand_runs(wanted).items()
     }
+    return _make_group(settings, condition, planner, runs, uses_forecasts=uses_forecasts)
+
+
+def _make_group(
+    settings: StudySettings,
+    condition: Condition,
+    planner: str,
+    runs: Mapping[str, tuple[str, ...]],
+    *,
+    uses_forecasts: bool = False,
+) -> Group:
     return Group(
         condition=condition,
         planner=planner,
@@ -149,6 +187,7 @@ def _group(
             "dt_s": settings.dt_s,
             "contain_faults": True,
             "budget_ms": settings.budget_ms,
+            "measure_forecasts": True,
         },
     )
 

@@ -18,6 +18,7 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, T
 from asp_env.data.scenarios.selection import save_scenarios
 from asp_env.errors import AspEnvError
 from asp_env.evaluation.closed_loop.comparison import EXPERT, EpisodeScores, Methods
+from asp_env.evaluation.closed_loop.forecast_quality import FORECAST_METRICS
 from asp_env.evaluation.closed_loop.scenario_table import DrivenScenarios, write_scenario_table
 from asp_env.evaluation.closed_loop.summary import (
     Comparison,
@@ -40,8 +41,9 @@ from asp_env.evaluation.study.conditions import (
     open_data_sets,
 )
 from asp_env.evaluation.study.driving import CellDriver, Task, drive_tasks
+from asp_env.evaluation.study.questions import Answer, answers
 from asp_env.evaluation.study.settings import StudySettings, read_settings
-from asp_env.evaluation.study.tables import condition_tables, fault_lines
+from asp_env.evaluation.study.tables import answer_lines, condition_tables, fault_lines
 from asp_env.files import write_text
 from asp_env.metrics.driving.rules import find_rules
 from asp_env.sim.traffic.log import LogDriver
@@ -117,7 +119,7 @@ class Study:
             write_study(result, self.out)
         for table in condition_tables(result.rows, result.privileged):
             console.print(table)
-        for line in fault_lines(result.driven):
+        for line in (*answer_lines(result.answers), *fault_lines(result.driven)):
             console.print(line)
         console.print(f"wrote {self.out}/report.html")
 
@@ -129,6 +131,8 @@ class StudyResult:
     settings: StudySettings
     rows: list[Row]
     """Lines of `metrics.csv`, of all conditions."""
+    answers: list[Answer]
+    """Answers to the questions of a study, whose rows are among `rows`."""
     driven: list[DrivenScenarios]
     """Scores of all methods in every scenario, by condition and planner."""
     data_sets: Mapping[str, DataSet]
@@ -197,11 +201,16 @@ def _summarized(
             replace(each, runs={run.removeprefix(late): p for run, p in each.runs.items()})
             for each in scores_by_method(methods, by_run)
         ]
-        found = comparison_rows(_comparison(settings, condition, data_set, by_method))
-        if condition in with_expert:  # it drives beside every planner
+        comparison = _comparison(settings, condition, data_set, by_method)
+        if group.is_static:
+            comparison = replace(comparison, compared=[], reference=None, replayed=False)
+        found = comparison_rows(comparison)
+        if group.is_static:
+            found = [row for row in found if row.metric in FORECAST_METRICS]
+        elif condition in with_expert:  # it drives beside every planner
             by_method = [each for each in by_method if each.planner != EXPERT]
             found = [row for row in found if row.planner != EXPERT]
-        with_expert.add(condition)
+        with_expert |= set() if group.is_static else {condition}
         rows += found
         driven.append(
             DrivenScenarios(
@@ -218,11 +227,18 @@ def _summarized(
             }
             if methods.predictors[runs[0]].privileged and name not in privileged:
                 privileged.append(name)
-        if condition == _shown_condition(groups, condition.data):
+        if condition == _shown_condition(groups, condition.data) and not group.is_static:
             tasks += _rollout_tasks(own, methods, by_run, first=number == _first(groups, condition))
+    found_answers = answers(driven, privileged)
+    rows += [
+        replace(row, horizon_s=settings.horizon_s, rules=find_rules(settings.rules).label)
+        for answer in found_answers
+        for row in answer.rows
+    ]
     return StudyResult(
         settings=settings,
         rows=rows,
+        answers=found_answers,
         driven=driven,
         data_sets=data_sets,
         privileged=privileged,
@@ -344,6 +360,7 @@ def write_study(result: StudyResult, out: Path, *, jobs: int = 1) -> None:
             for name, each in result.data_sets.items()
         },
         faults=_fault_counts(result.driven),
+        answers={each.question: each.sentences for each in result.answers if each.sentences},
         cells=result.cells,
         intervals="95 %, bootstrap over recordings and, with several, over training runs",
     )

@@ -10,9 +10,13 @@ from asp_env.evaluation.closed_loop.scenario_table import DrivenScenarios
 from asp_env.evaluation.results import SCORE, Row, difference_of
 from asp_env.evaluation.selection import short_names
 from asp_env.evaluation.statistics import is_resolved
+from asp_env.evaluation.study.questions import Answer
 
 SUBSETS = ("all", "interactive")
 """Subsets of the scenarios that are shown, the last that occurs."""
+
+MOST_SENTENCES = 8
+"""Number of sentences of an answer that are printed."""
 
 NOT_RESOLVED = "~"
 """Mark of differences that are not resolved."""
@@ -75,6 +79,16 @@ def _cell(rows: Sequence[Row], condition: tuple[str, int]) -> str:
             mark = "" if is_resolved(row.value, row.low, row.high, row.mde) else NOT_RESOLVED
             text += f" ({row.value:+.3f}{mark})"
     return text
+
+
+def answer_lines(answers: Sequence[Answer]) -> Iterator[str]:
+    """Each question, with the first sentences of its answer."""
+    for answer in answers:
+        if answer.sentences:
+            yield f"\n[bold]{answer.question}[/bold]"
+            yield from (f"  {sentence}" for sentence in answer.sentences[:MOST_SENTENCES])
+            if (more := len(answer.sentences) - MOST_SENTENCES) > 0:
+                yield f"  {more} more in manifest.json and metrics.csv"
 
 
 def fault_lines(driven: Sequence[DrivenScenarios]) -> Iterator[str]:

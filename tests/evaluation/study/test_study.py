@@ -74,13 +74,14 @@ def driven(monkeypatch: pytest.MonkeyPatch) -> list[int]:
 
 
 def test_a_study_of_one_condition_is_a_drive(data: str, tmp_path: Path) -> None:
-    """The same rows as `asp-env drive` prints, but for the share of faulty drives."""
+    """The same rows as `asp-env drive` prints, besides what only a study measures."""
     result = run_study(settings(data, methods=("constant-turn-rate",), traffic=("log",)), tmp_path)
     predictors = ("constant-turn-rate", "constant-velocity", "oracle")
     expected = drive(
         Drive(data=data, out=tmp_path, predictors=predictors, traffic="log", max_scenarios=3)
     )
-    rows = [row for row in result.rows if row.metric != "faulty"]
+    metrics = {row.metric for row in expected.rows}
+    rows = [row for row in result.rows if row.metric in metrics]
     assert rows == expected.rows
     assert {row.value for row in result.rows if row.metric == "faulty"} == {0.0}
 
@@ -88,16 +89,19 @@ def test_a_study_of_one_condition_is_a_drive(data: str, tmp_path: Path) -> None:
 def test_only_what_depends_on_a_changed_option_is_driven(
     data: str, tmp_path: Path, driven: list[int]
 ) -> None:
-    """In two traffics: 4 methods with the expert, and `idm` alone; the expert is shared."""
+    """In two traffics: 4 methods with the expert, and `idm` alone; the expert is shared.
+
+    Three predictors forecast while the expert is replayed, once for both traffics.
+    """
     run_study(settings(data), tmp_path)
     run_study(settings(data), tmp_path)
     run_study(settings(data, methods=("constant-turn-rate", "idm", "blind")), tmp_path)
     run_study(settings(data, traffic=("idm",)), tmp_path)
     run_study(settings(data, latency_ticks=(0, 1)), tmp_path)
     run_study(settings(data, rules="nuplan"), tmp_path)
-    # 2 traffics of (expert, turn rate, constant velocity, oracle, idm); blind in both; 3 predictors
-    # that are late in both; everything by other rules.
-    assert driven == [10, 0, 2, 0, 6, 10]
+    # 2 traffics of (expert, turn rate, constant velocity, oracle, idm), and at logged states; blind;
+    # 3 predictors that are late; everything by other rules.
+    assert driven == [2 * 5 + 3, 0, 2 + 1, 0, 2 * 3 + 3, 2 * 5 + 3]
 
 
 def test_the_same_bytes_by_any_number_of_processes_and_after_a_kill(
@@ -201,11 +205,16 @@ def test_faults_are_counted_and_the_others_are_unchanged(
     assert of["blind", "score"] == of["constant-velocity", "score"]
     write_study(faulty, tmp_path / "faulty")
     manifest = json.loads((tmp_path / "faulty" / "manifest.json").read_text())
-    (counts,) = manifest["faults"].values()
+    counts = manifest["faults"][f"contingency+blind ({data}, log, 0 ticks)"]
     drives = len(faulty.driven[0].scenarios)
     assert counts == {"predictor raised": round(of["blind", "faulty"] * drives)}
+    # The others are the forecasts of the same predictor at logged states.
+    assert set(manifest["faults"]) <= {
+        f"{planner}+blind ({data}, log, 0 ticks)" for planner in ("contingency", "expert")
+    }
     with (tmp_path / "faulty" / "scenarios.csv").open(newline="") as file:
-        marked = [line for line in csv.DictReader(file) if line["fault"]]
+        lines = [line for line in csv.DictReader(file) if line["planner"] == "contingency"]
+    marked = [line for line in lines if line["fault"]]
     assert len(marked) == counts["predictor raised"]
     assert "raised at tick" in marked[0]["fault"]
 
