@@ -99,8 +99,8 @@ def test_only_what_depends_on_a_changed_option_is_driven(
     run_study(settings(data, traffic=("idm",)), tmp_path)
     run_study(settings(data, latency_ticks=(0, 1)), tmp_path)
     run_study(settings(data, rules="nuplan"), tmp_path)
-    # 2 traffics of (expert, turn rate, constant velocity, oracle, idm), and at logged states; blind;
-    # 3 predictors that are late; everything by other rules.
+    # 2 traffics of (expert, turn rate, constant velocity, oracle, idm), and 3 at logged states;
+    # blind; 3 predictors that are late; everything by other rules.
     assert driven == [2 * 5 + 3, 0, 2 + 1, 0, 2 * 3 + 3, 2 * 5 + 3]
 
 
