@@ -16,6 +16,12 @@ ATTEMPTS = 3
 """How often a cell is driven whose process ends before it is done."""
 
 
+DriveTasks = Callable[
+    [Sequence[Group], float, Sequence["Task"]], Iterator[tuple["Task", EpisodeScores]]
+]
+"""Drives tasks: groups, duration of a tick and tasks to tasks with their scores, in any order."""
+
+
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Task:
     """A cell to drive."""
@@ -40,6 +46,10 @@ class CellDriver:
         self._dt_s = dt_s
         self._recordings: dict[str, Recordings] = {}
         self._methods: tuple[int, Methods] | None = None
+
+    def add_recordings(self, data: str, recordings: Recordings) -> None:
+        """States where DATA are, instead of opening them by their name."""
+        self._recordings[data] = recordings
 
     def __reduce__(self) -> tuple[Any, ...]:
         return CellDriver, (self._groups, self._dt_s)
@@ -70,14 +80,15 @@ def _chosen(rollouts: Sequence[Rollout], positions: Sequence[int]) -> tuple[Roll
 
 
 def drive_tasks(
-    driver: Callable[[Task], EpisodeScores], tasks: Sequence[Task], jobs: int
+    groups: Sequence[Group], dt_s: float, tasks: Sequence[Task], jobs: int
 ) -> Iterator[tuple[Task, EpisodeScores]]:
     """Drives tasks, and yields each as soon as it is done.
 
     If a process ends, all others are started anew, and what it drove is driven again.
 
     Args:
-        driver: a `CellDriver`.
+        groups: the groups that cells refer to.
+        dt_s: duration of a tick.
         tasks: the tasks.
         jobs: number of processes; with 1, this process drives.
 
@@ -85,6 +96,7 @@ def drive_tasks(
         AspEnvError: the data do not suit a predictor or a driver, or a process has ended
             `ATTEMPTS` times in the same cell.
     """
+    driver = CellDriver(groups, dt_s)
     if jobs == 1:
         for task in tasks:
             yield task, driver(task)

@@ -7,6 +7,7 @@ from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, fields, replace
+from functools import partial
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -40,13 +41,16 @@ from asp_env.evaluation.study.conditions import (
     make_groups,
     open_data_sets,
 )
-from asp_env.evaluation.study.driving import CellDriver, Task, drive_tasks
+from asp_env.evaluation.study.driving import DriveTasks, Task, drive_tasks
 from asp_env.evaluation.study.questions import Answer, answers
+from asp_env.evaluation.study.ray_cluster import drive_on_ray
 from asp_env.evaluation.study.settings import StudySettings, read_settings
 from asp_env.evaluation.study.tables import answer_lines, condition_tables, fault_lines
 from asp_env.files import write_text
 from asp_env.metrics.driving.rules import find_rules
 from asp_env.sim.traffic.log import LogDriver
+
+IN_THIS_PROCESS: DriveTasks = partial(drive_tasks, jobs=1)
 
 SETTINGS = "study.json"
 """File with the settings of the last study in a folder."""
@@ -101,6 +105,12 @@ class Study:
     the machine."""
     jobs: int = 1
     """Number of processes that drive. The results do not depend on it."""
+    ray: Annotated[str | None, tyro.conf.arg(metavar="ADDRESS|auto")] = None
+    """Address of a Ray cluster that drives instead, or auto for the one that
+    was started on this machine. The results do not depend on it."""
+    ray_send_data: bool = False
+    """Send the files of data that are folders through Ray's object store,
+    instead of reading them on all nodes from the same path."""
 
     def run(self) -> None:
         """Drives what is missing, writes the folder and prints the tables.
@@ -110,13 +120,18 @@ class Study:
         """
         if self.jobs < 1:
             raise AspEnvError(f"--jobs {self.jobs}: expected at least 1 process")
+        if self.ray is not None and self.jobs > 1:
+            raise AspEnvError("--ray and --jobs: give one of them; a cluster uses all its cores")
         names = [field.name for field in fields(StudySettings)]
         settings = read_settings(self.config, {name: getattr(self, name) for name in names})
         check_report_possible()
         console = Console()
+        drive = partial(drive_tasks, jobs=self.jobs)
+        if self.ray is not None:
+            drive = partial(drive_on_ray, address=self.ray, send_data=self.ray_send_data)
         with _locked(self.out):
-            result = run_study(settings, self.out, jobs=self.jobs, console=console)
-            write_study(result, self.out)
+            result = run_study(settings, self.out, drive=drive, console=console)
+            write_study(result, self.out, drive=drive)
         for table in condition_tables(result.rows, result.privileged):
             console.print(table)
         for line in (*answer_lines(result.answers), *fault_lines(result.driven)):
@@ -148,14 +163,18 @@ class StudyResult:
 
 
 def run_study(
-    settings: StudySettings, out: Path, *, jobs: int = 1, console: Console | None = None
+    settings: StudySettings,
+    out: Path,
+    *,
+    drive: DriveTasks = IN_THIS_PROCESS,
+    console: Console | None = None,
 ) -> StudyResult:
     """Drives all cells that are not stored yet, and summarizes all.
 
     Args:
         settings: the settings.
         out: folder of the study; only its cells are written.
-        jobs: number of processes.
+        drive: drives the cells.
         console: where progress is shown; nowhere without one.
 
     Raises:
@@ -168,11 +187,11 @@ def run_study(
     folder.remove_leftovers()
     missing = {cell.key: Task(cell=cell) for cell in cells if cell.key not in folder}
     keys = {cell.key for cell in cells}
-    driver = CellDriver(groups, settings.dt_s)
     columns = (TextColumn("cells"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())
     with Progress(*columns, console=console, transient=True, disable=console is None) as progress:
         bar = progress.add_task("cells", total=len(keys), completed=len(keys) - len(missing))
-        for task, scores in drive_tasks(driver, [*missing.values()], jobs):
+        tasks = [*missing.values()]
+        for task, scores in drive(groups, settings.dt_s, tasks) if tasks else ():
             folder.save(task.cell.key, scores)
             progress.advance(bar)
     return _summarized(settings, groups, data_sets, cells, folder)
@@ -327,19 +346,19 @@ def _rollout_tasks(
     return tasks
 
 
-def write_study(result: StudyResult, out: Path, *, jobs: int = 1) -> None:
+def write_study(result: StudyResult, out: Path, *, drive: DriveTasks = IN_THIS_PROCESS) -> None:
     """Writes all files of a study but its cells.
 
     Args:
         result: the result.
         out: folder of the study.
-        jobs: number of processes that drive the rollouts that are shown once more.
+        drive: drives the scenarios that are shown once more.
 
     Raises:
         AspEnvError: a process ended repeatedly, or a package is missing.
     """
     settings = result.settings
-    _write_rollouts(result, out, jobs)
+    _write_rollouts(result, out, drive)
     write_metrics(out, result.rows)
     write_scenario_table(out, result.driven)
     write_manifest(
@@ -380,7 +399,7 @@ def write_study(result: StudyResult, out: Path, *, jobs: int = 1) -> None:
     write_text(out / SETTINGS, json.dumps(settings.as_json(), indent=1) + "\n")
 
 
-def _write_rollouts(result: StudyResult, out: Path, jobs: int) -> None:
+def _write_rollouts(result: StudyResult, out: Path, drive: DriveTasks) -> None:
     """Drives the scenarios that are shown once more, unless their rollouts are stored."""
     wanted: dict[str, list[tuple[Path, int]]] = {}
     tasks: dict[str, Task] = {}
@@ -392,8 +411,9 @@ def _write_rollouts(result: StudyResult, out: Path, jobs: int) -> None:
             if not path.exists() or not stamp.exists() or stamp.read_text() != task.cell.key:
                 wanted.setdefault(task.cell.key, []).append((path, position))
                 tasks[task.cell.key] = task
-    driver = CellDriver(result.groups, result.settings.dt_s)
-    for task, scores in drive_tasks(driver, [*tasks.values()], jobs):
+    if not tasks:
+        return
+    for task, scores in drive(result.groups, result.settings.dt_s, [*tasks.values()]):
         for path, position in wanted[task.cell.key]:
             path.parent.mkdir(parents=True, exist_ok=True)
             scores.rollouts[task.rollouts.index(position)].save(path)

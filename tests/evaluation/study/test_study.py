@@ -9,6 +9,7 @@ import signal
 import subprocess
 import sys
 import time
+from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
@@ -23,7 +24,8 @@ from asp_env.evaluation.results import Row
 from asp_env.evaluation.study import study
 from asp_env.evaluation.study.cells import CellFolder
 from asp_env.evaluation.study.compare import Compare, compare_methods, read_scenario_table
-from asp_env.evaluation.study.conditions import make_cells, make_groups, open_data_sets
+from asp_env.evaluation.study.conditions import Group, make_cells, make_groups, open_data_sets
+from asp_env.evaluation.study.driving import Task, drive_tasks
 from asp_env.evaluation.study.settings import StudySettings
 from asp_env.evaluation.study.study import Study, StudyResult, run_study, write_study
 from predictors.physical import ConstantVelocity
@@ -59,18 +61,20 @@ def bytes_of(folder: Path) -> dict[str, str]:
     }
 
 
-@pytest.fixture
-def driven(monkeypatch: pytest.MonkeyPatch) -> list[int]:
-    """Number of cells that each study of this test has driven."""
-    counts: list[int] = []
-    original = study.drive_tasks
+class Counted:
+    """Drives in this process, and counts the cells of each study."""
 
-    def counted(driver, tasks, jobs):
-        counts.append(len(tasks))
-        return original(driver, tasks, jobs)
+    def __init__(self) -> None:
+        self.counts: list[int] = []
 
-    monkeypatch.setattr(study, "drive_tasks", counted)
-    return counts
+    def study(self, given: StudySettings, out: Path) -> None:
+        """Runs a study."""
+        self.counts.append(0)
+        run_study(given, out, drive=self._drive)
+
+    def _drive(self, groups: Sequence[Group], dt_s: float, tasks: Sequence[Task]):
+        self.counts[-1] = len(tasks)
+        return drive_tasks(groups, dt_s, tasks, jobs=1)
 
 
 def test_a_study_of_one_condition_is_a_drive(data: str, tmp_path: Path) -> None:
@@ -86,22 +90,24 @@ def test_a_study_of_one_condition_is_a_drive(data: str, tmp_path: Path) -> None:
     assert {row.value for row in result.rows if row.metric == "faulty"} == {0.0}
 
 
-def test_only_what_depends_on_a_changed_option_is_driven(
-    data: str, tmp_path: Path, driven: list[int]
-) -> None:
+def test_only_what_depends_on_a_changed_option_is_driven(data: str, tmp_path: Path) -> None:
     """In two traffics: 4 methods with the expert, and `idm` alone; the expert is shared.
 
     Three predictors forecast while the expert is replayed, once for both traffics.
     """
-    run_study(settings(data), tmp_path)
-    run_study(settings(data), tmp_path)
-    run_study(settings(data, methods=("constant-turn-rate", "idm", "blind")), tmp_path)
-    run_study(settings(data, traffic=("idm",)), tmp_path)
-    run_study(settings(data, latency_ticks=(0, 1)), tmp_path)
-    run_study(settings(data, rules="nuplan"), tmp_path)
+    counted = Counted()
+    for changes in (
+        {},
+        {},
+        {"methods": ("constant-turn-rate", "idm", "blind")},
+        {"traffic": ("idm",)},
+        {"latency_ticks": (0, 1)},
+        {"rules": "nuplan"},
+    ):
+        counted.study(settings(data, **changes), tmp_path)
     # 2 traffics of (expert, turn rate, constant velocity, oracle, idm), and 3 at logged states;
     # blind; 3 predictors that are late; everything by other rules.
-    assert driven == [2 * 5 + 3, 0, 2 + 1, 0, 2 * 3 + 3, 2 * 5 + 3]
+    assert counted.counts == [2 * 5 + 3, 0, 2 + 1, 0, 2 * 3 + 3, 2 * 5 + 3]
 
 
 def test_the_same_bytes_by_any_number_of_processes_and_after_a_kill(
