@@ -1,10 +1,8 @@
 """Road maps: boundaries, drivable area and lanes, in the metric frame of a recording."""
 
-from collections import OrderedDict
-from collections.abc import Callable
 from dataclasses import dataclass, field
 from enum import IntEnum
-from typing import Any, Generic, TypeVar, final
+from typing import Any
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
@@ -51,7 +49,7 @@ class Ragged:
         )
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
+@dataclass(frozen=True, slots=True, kw_only=True, weakref_slot=True)
 class RoadMap:
     """Boundaries and lane markings, drivable area, and lanes with their successors."""
 
@@ -118,33 +116,3 @@ class RoadMap:
         if self.region_m is not None:
             low, high = np.maximum(low, self.region_m[:2]), np.minimum(high, self.region_m[2:])
         return (float(low[0]), float(low[1]), float(high[0]), float(high[1]))
-
-
-Value = TypeVar("Value")
-
-
-@final
-class MapCache(Generic[Value]):
-    """Caches the latest results of a function of a road map, by the identity of the map."""
-
-    def __init__(self, make: Callable[[RoadMap], Value], size: int = 512) -> None:
-        """Creates an empty cache.
-
-        Args:
-            make: the function.
-            size: number of maps; the least recently used one is removed first.
-        """
-        self._make = make
-        self._size = size
-        self._entries: OrderedDict[int, tuple[RoadMap, Value]] = OrderedDict()
-
-    def __call__(self, road_map: RoadMap) -> Value:
-        """The value of `make(road_map)`."""
-        key = id(road_map)
-        # The entry refers to its map, so that no other map can get its id.
-        if key not in self._entries:
-            self._entries[key] = (road_map, self._make(road_map))
-            while len(self._entries) > self._size:
-                self._entries.popitem(last=False)
-        self._entries.move_to_end(key)
-        return self._entries[key][1]
