@@ -1,11 +1,9 @@
 """Values computed once per road map, within a stated amount of memory."""
 
 import dataclasses
-import weakref
 from collections import OrderedDict
 from collections.abc import Callable
-from functools import partial
-from typing import Any, Generic, NamedTuple, TypeVar, final
+from typing import Generic, TypeVar, final
 
 import numpy as np
 
@@ -18,17 +16,12 @@ than 0.2 MB, so that this covers about 700 maps."""
 Value = TypeVar("Value")
 
 
-class _Entry(NamedTuple, Generic[Value]):
-    road_map: "weakref.ref[RoadMap]"
-    value: Value
-    size_bytes: int
-
-
 @final
 class MapCache(Generic[Value]):
-    """Caches the latest results of a function of a road map, by the identity of the map.
+    """Caches the latest results of a function of a road map.
 
-    A result is removed as soon as nothing else refers to its map.
+    Maps of equal geometry share a result: those of several environments with the same data, and of
+    data that are opened again.
     """
 
     def __init__(
@@ -37,13 +30,13 @@ class MapCache(Generic[Value]):
         """Creates an empty cache.
 
         Args:
-            make: the function. Its results must not refer to the map.
+            make: the function. Its results must not depend on the name of the map.
             limit_bytes: memory of the arrays in all results; above it the least recently used
                 result is removed first. The latest result is always kept.
         """
         self._make = make
         self._limit_bytes = limit_bytes
-        self._entries: OrderedDict[int, _Entry[Value]] = OrderedDict()
+        self._entries: OrderedDict[bytes, tuple[Value, int]] = OrderedDict()
         self.size_bytes = 0
         """Memory of the arrays in all results."""
 
@@ -52,31 +45,16 @@ class MapCache(Generic[Value]):
 
     def __call__(self, road_map: RoadMap) -> Value:
         """The value of `make(road_map)`."""
-        key = id(road_map)
-        entry = self._entries.get(key)
-        if entry is None:
+        key = road_map.geometry_hash
+        if key not in self._entries:
             value = self._make(road_map)
-            # A result is removed before another map can get the id. The callback must not refer to
-            # the cache itself, which would become part of a cycle.
-            removed = weakref.ref(road_map, partial(_remove, weakref.ref(self), key))
-            entry = _Entry(removed, value, _size_bytes(value))
-            self._entries[key] = entry
-            self.size_bytes += entry.size_bytes
+            self._entries[key] = value, _size_bytes(value)
+            self.size_bytes += self._entries[key][1]
             while len(self._entries) > 1 and self.size_bytes > self._limit_bytes:
-                self._remove(next(iter(self._entries)))
+                _, (_, removed_bytes) = self._entries.popitem(last=False)
+                self.size_bytes -= removed_bytes
         self._entries.move_to_end(key)
-        return entry.value
-
-    def _remove(self, key: int) -> None:
-        entry = self._entries.pop(key, None)
-        if entry is not None:
-            self.size_bytes -= entry.size_bytes
-
-
-def _remove(cache: "weakref.ref[MapCache[Any]]", key: int, _: object) -> None:
-    alive = cache()
-    if alive is not None:
-        alive._remove(key)
+        return self._entries[key][0]
 
 
 def _size_bytes(value: object) -> int:

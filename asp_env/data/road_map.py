@@ -1,6 +1,7 @@
 """Road maps: boundaries, drivable area and lanes, in the metric frame of a recording."""
 
-from dataclasses import dataclass, field
+import hashlib
+from dataclasses import dataclass, field, fields
 from enum import IntEnum
 from typing import Any
 
@@ -49,7 +50,7 @@ class Ragged:
         )
 
 
-@dataclass(frozen=True, slots=True, kw_only=True, weakref_slot=True)
+@dataclass(frozen=True, slots=True, kw_only=True)
 class RoadMap:
     """Boundaries and lane markings, drivable area, and lanes with their successors."""
 
@@ -77,6 +78,7 @@ class RoadMap:
     it is the whole map. Lanes and lines that reach out of the region are complete."""
     repairs: tuple[str, ...] = ()
     """Repairs made by the reader, one line for each kind."""
+    _geometry_hash: bytes = field(default=b"", init=False, repr=False, compare=False)
 
     def __post_init__(self) -> None:
         """Checks that the numbers of lines, lanes and their properties agree.
@@ -105,6 +107,22 @@ class RoadMap:
         """The same object: maps are immutable."""
         del memo
         return self
+
+    @property
+    def geometry_hash(self) -> bytes:
+        """Hash of everything except name and repairs, computed once."""
+        if not self._geometry_hash:
+            seen = hashlib.blake2b(repr(self.region_m).encode(), digest_size=16)
+            for each in fields(self):
+                value = getattr(self, each.name)
+                for array in (
+                    (value.points, value.starts) if isinstance(value, Ragged) else (value,)
+                ):
+                    if isinstance(array, np.ndarray):
+                        seen.update(f"{each.name}{array.dtype}{array.shape}".encode())
+                        seen.update(np.ascontiguousarray(array))
+            object.__setattr__(self, "_geometry_hash", seen.digest())
+        return self._geometry_hash
 
     @property
     def extent_m(self) -> tuple[float, float, float, float]:

@@ -1,7 +1,6 @@
 """Memory and cache of distance fields."""
 
 import dataclasses
-import gc
 
 import numpy as np
 import pytest
@@ -19,7 +18,11 @@ PLACES = 100
 
 def test_the_places_of_a_suite_have_their_fields_made_once(monkeypatch: pytest.MonkeyPatch) -> None:
     road_map = open_data("sample:roundabout")[0].road_map
-    maps = [dataclasses.replace(road_map, name=str(i)) for i in range(PLACES)]
+    left, low, right, high = road_map.extent_m
+    maps = [
+        dataclasses.replace(road_map, region_m=(left, low, right, high + place))
+        for place in range(PLACES)
+    ]
     field, made = drivable_field(road_map), []
     monkeypatch.setattr(drivable._fields, "_make", lambda each: made.append(each) or field)
     for _ in range(2):
@@ -28,15 +31,10 @@ def test_the_places_of_a_suite_have_their_fields_made_once(monkeypatch: pytest.M
     assert len(made) == PLACES
 
 
-def test_fields_of_maps_that_are_no_longer_used_are_removed() -> None:
-    road_map = make_map()
-    gc.collect()
-    before = drivable._fields.size_bytes
-    drivable_field(road_map)
-    assert drivable._fields.size_bytes > before
-    del road_map
-    gc.collect()
-    assert drivable._fields.size_bytes == before
+def test_environments_with_the_same_data_share_a_field() -> None:
+    first, second = (open_data("sample:intersection")[0].road_map for _ in range(2))
+    assert first is not second
+    assert drivable_field(first) is drivable_field(second)
 
 
 def test_tiles_hold_a_fraction_of_the_grid() -> None:
