@@ -15,7 +15,6 @@ import contextlib
 import csv
 import io
 import os
-import shutil
 import sys
 import tempfile
 import threading
@@ -221,13 +220,12 @@ def soak(out: Path, minutes: float) -> list[Sample]:
         writer = csv.DictWriter(file, [each.name for each in fields(Sample)])
         writer.writeheader()
         while time.monotonic() - begin < 60 * minutes:
-            folder = Path(tempfile.mkdtemp(prefix="soak-"))
-            for part in PARTS:
-                part(number, folder)
-                samples.append(take(time.monotonic() - begin, number, part.__name__))
-                writer.writerow(asdict(samples[-1]))
-                file.flush()
-            shutil.rmtree(folder)
+            with tempfile.TemporaryDirectory(prefix="soak-") as folder:
+                for part in PARTS:
+                    part(number, Path(folder))
+                    samples.append(take(time.monotonic() - begin, number, part.__name__))
+                    writer.writerow(asdict(samples[-1]))
+                    file.flush()
             number += 1
     return samples
 
