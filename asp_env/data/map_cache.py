@@ -1,17 +1,14 @@
-"""Values computed once per road map, within a stated amount of memory."""
+"""Values computed once per road map."""
 
-import dataclasses
-from collections import OrderedDict
 from collections.abc import Callable
 from typing import Generic, TypeVar, final
 
-import numpy as np
-
+from asp_env.data.bounded_cache import BoundedCache
 from asp_env.data.road_map import RoadMap
 
 DEFAULT_LIMIT_BYTES = 128 * 2**20
-"""Memory of the arrays of one cache. Chosen by hand: what views and rules need of a map has less
-than 0.2 MB, so that this covers about 700 maps."""
+"""Memory of one cache. Chosen by hand: what views and rules need of a map has less than 0.2 MB, so
+that this covers about 700 maps."""
 
 Value = TypeVar("Value")
 
@@ -31,38 +28,11 @@ class MapCache(Generic[Value]):
 
         Args:
             make: the function. Its results must not depend on the name of the map.
-            limit_bytes: memory of the arrays in all results; above it the least recently used
-                result is removed first. The latest result is always kept.
+            limit_bytes: memory of all results.
         """
         self._make = make
-        self._limit_bytes = limit_bytes
-        self._entries: OrderedDict[bytes, tuple[Value, int]] = OrderedDict()
-        self.size_bytes = 0
-        """Memory of the arrays in all results."""
-
-    def __len__(self) -> int:
-        return len(self._entries)
+        self.results = BoundedCache[Value](limit_bytes)
 
     def __call__(self, road_map: RoadMap) -> Value:
         """The value of `make(road_map)`."""
-        key = road_map.geometry_hash
-        if key not in self._entries:
-            value = self._make(road_map)
-            self._entries[key] = value, _size_bytes(value)
-            self.size_bytes += self._entries[key][1]
-            while len(self._entries) > 1 and self.size_bytes > self._limit_bytes:
-                _, (_, removed_bytes) = self._entries.popitem(last=False)
-                self.size_bytes -= removed_bytes
-        self._entries.move_to_end(key)
-        return self._entries[key][0]
-
-
-def _size_bytes(value: object) -> int:
-    """Memory of all arrays in a value, which may be nested in tuples and dataclasses."""
-    if isinstance(value, np.ndarray):
-        return value.nbytes
-    if isinstance(value, tuple | list):
-        return sum(_size_bytes(each) for each in value)
-    if dataclasses.is_dataclass(value):
-        return sum(_size_bytes(getattr(value, each.name)) for each in dataclasses.fields(value))
-    return 0
+        return self.results.get(road_map.geometry_hash, lambda: self._make(road_map))

@@ -68,7 +68,7 @@ def test_the_least_recently_used_value_is_removed_above_the_limit() -> None:
     values = [cache(_map(number)) for number in range(2)]
     assert cache(_map(0)) is values[0]
     cache(_map(2))
-    assert (len(cache), cache.size_bytes) == (2, 2000)
+    assert (len(cache.results), cache.results.size_bytes) == (2, 2000)
     assert cache(_map(0)) is values[0]
     assert cache(_map(1)) is not values[1]
 
@@ -77,7 +77,7 @@ def test_a_value_above_the_limit_is_kept_until_the_next() -> None:
     cache = MapCache(lambda _: KILOBYTE.copy(), 100)
     assert cache(_map(0)) is cache(_map(0))
     cache(_map(1))
-    assert (len(cache), cache.size_bytes) == (1, 1000)
+    assert (len(cache.results), cache.results.size_bytes) == (1, 1000)
 
 
 def test_arrays_in_tuples_and_dataclasses_count() -> None:
@@ -85,4 +85,4 @@ def test_arrays_in_tuples_and_dataclasses_count() -> None:
     table = Table(name="a", columns=(KILOBYTE[:400], KILOBYTE[:600]))
     cache = MapCache(lambda _: Nested(table=table, extra=np.zeros(100)))
     cache(make_map())
-    assert cache.size_bytes == 1800
+    assert cache.results.size_bytes == 1800
