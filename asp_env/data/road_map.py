@@ -120,7 +120,7 @@ class RoadMap:
                 ):
                     if isinstance(array, np.ndarray):
                         seen.update(f"{each.name}{array.dtype}{array.shape}".encode())
-                        seen.update(np.ascontiguousarray(array))
+                        seen.update(np.ascontiguousarray(array).data)
             object.__setattr__(self, "_geometry_hash", seen.digest())
         return self._geometry_hash
 

@@ -254,13 +254,15 @@ def draw(samples: list[Sample], path: Path) -> None:
     labels = {"rss_mib": "resident memory, MiB", "open_files": "open files"}
     labels |= {"threads": "threads", "children": "child processes"}
     figure = Figure(figsize=(8, 6), layout="constrained")
-    for axis, (name, label) in zip(figure.subplots(4, 1, sharex=True), labels.items(), strict=True):
+    axes = figure.subplots(4, 1, sharex=True)
+    for axis, (name, label) in zip(axes, labels.items(), strict=True):
         minutes = [sample.seconds / 60 for sample in samples]
         axis.plot(minutes, [getattr(sample, name) for sample in samples], linewidth=0.8)
-        axis.set_ylim(bottom=0)
+        most = max(getattr(sample, name) for sample in samples)
+        axis.set_ylim(0, 1.2 * most + 1)
         axis.set_ylabel(label, fontsize=8)
         axis.grid(alpha=0.3)
-    axis.set_xlabel("minutes")
+    axes[-1].set_xlabel("minutes")
     figure.savefig(path, dpi=100)
 
 
