@@ -22,7 +22,7 @@ from asp_env.data.source import Recordings, open_data
 from asp_env.dynamics import inverse, rollout
 from asp_env.dynamics.bicycle import Integrator
 from asp_env.errors import AspEnvError, DataError, RepairWarning
-from asp_env.metrics.drivable import CELL_M, drivable_field
+from asp_env.metrics.drivable import drivable_field
 from asp_env.metrics.forecast.errors import moving
 
 HORIZONS_S = (3.0, 6.0)
@@ -293,7 +293,7 @@ def _map_table(maps: list[RoadMap]) -> Table:
     for name in ("lanes", "successors", "lines", "drivable m²", "repairs"):
         table.add_column(name, justify="right")
     for road_map in maps:
-        area_m2 = float((drivable_field(road_map).outside_m <= 0).sum()) * CELL_M**2
+        area_m2 = drivable_field(road_map).drivable_m2()
         table.add_row(
             road_map.name,
             str(len(road_map.lanes)),
