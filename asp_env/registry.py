@@ -56,7 +56,7 @@ def find(group: Group, name: str) -> Any:
             the object cannot be imported.
     """
     plugs, kind = _plugs(group), group.rstrip("s")
-    if name not in plugs:
+    if not isinstance(name, str) or name not in plugs:
         raise unknown_name(kind, name, plugs)
     try:
         return plugs[name].load()

@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
+from asp_env.arguments import positive_number
 from asp_env.data.classes import is_predicted
 from asp_env.data.road_map import RoadMap
 from asp_env.data.signals import Signals
@@ -42,10 +43,8 @@ def fits_ticks(frame_rate_hz: float, dt_s: float) -> bool:
     Raises:
         AspEnvError: a value is not a positive number.
     """
-    if not (math.isfinite(frame_rate_hz) and frame_rate_hz > 0):
-        raise AspEnvError(f"frame rate {frame_rate_hz} Hz: expected a positive number")
-    if not (math.isfinite(dt_s) and dt_s > 0):
-        raise AspEnvError(f"time step {dt_s} s: expected a positive number")
+    positive_number("frame rate", frame_rate_hz, "Hz")
+    positive_number("time step", dt_s, "s")
     frames = dt_s * frame_rate_hz
     return frames > 0.5 and abs(frames - round(frames)) <= 1e-4 * frames
 
@@ -110,8 +109,7 @@ def ticks(duration_s: float, dt_s: float) -> int:
             time steps, or near durations if no usual time step divides the duration.
     """
     for what, value_s in (("time step", dt_s), ("duration", duration_s)):
-        if not (math.isfinite(value_s) and value_s > 0):
-            raise AspEnvError(f"{what} {value_s} s: expected a positive number")
+        positive_number(what, value_s, "s")
     count = round(duration_s / dt_s)
     if count < 1 or abs(count * dt_s - duration_s) > 1e-6:
         if any(math.isclose(dt_s, step) for step in _TIME_STEPS_S):

@@ -12,6 +12,7 @@ from pathlib import Path
 from typing import Any, SupportsIndex, overload
 
 from asp_env import registry
+from asp_env.arguments import positive_number, shown
 from asp_env.data.readers.layout import ARCHIVE, archive_hint, shorten
 from asp_env.data.readers.levelx import LevelxFiles
 from asp_env.data.readers.opening import ReaderState, RecordingFiles, content_hash, open_recording
@@ -80,10 +81,22 @@ class Recordings(Sequence[Any]):  # not of Recording: run-time checks of its ite
         Raises:
             DataError: the recording's files are damaged.
             AspEnvError: its frames are too far apart for the tick.
+            IndexError: there is no such recording.
+            TypeError: the index is neither a number nor a slice.
         """
         if isinstance(index, slice):
             return self.subset(range(len(self))[index])
-        return open_recording(self.files[index], self._opened)
+        try:
+            files = self.files[index]
+        except IndexError:
+            raise IndexError(
+                f"recording {shown(index)}: expected 0 to {len(self) - 1}, or -{len(self)} to -1"
+            ) from None
+        except TypeError:
+            raise TypeError(
+                f"recording {shown(index)}: expected a whole number or a slice"
+            ) from None
+        return open_recording(files, self._opened)
 
     def __iter__(self) -> Iterator[Recording]:
         """Opens one recording after the other."""
@@ -147,7 +160,12 @@ def open_data(data: str | Path, *, dt_s: float = DEFAULT_DT_S) -> Recordings:
         AspEnvError: the source is unknown.
         DataError: the folder does not exist, or has no recordings.
     """
+    if not isinstance(data, str | Path) or not str(data):
+        raise AspEnvError(
+            f"data {shown(data)}: expected a folder with recordings, or a text scheme:argument"
+        )
     source = str(data)
+    positive_number("time step", dt_s, "s")
     folder = source_folder(source)
     if not folder.is_dir():
         what = "is a file" if folder.exists() else "does not exist"

@@ -15,6 +15,7 @@ import numpy as np
 from gymnasium import spaces
 from jaxtyping import Bool, Float, Int
 
+from asp_env.arguments import shown, table, whole_number
 from asp_env.data.predictor import Predictor
 from asp_env.data.recording import ticks
 from asp_env.data.scenarios.scenario import Scenario, ScenarioFilter, ScenarioSet
@@ -126,8 +127,8 @@ class ScenarioSampler:
             self.recordings,
             source=self.scenarios.source,
             recording=scenario.recording,
-            ego_id=scenario.ego_id if ego is None else _whole_number("ego", ego),
-            start_tick=None if start_tick is None else _whole_number("start_tick", start_tick),
+            ego_id=scenario.ego_id if ego is None else whole_number("ego", ego),
+            start_tick=None if start_tick is None else whole_number("start_tick", start_tick),
             dt_s=self.scenarios.dt_s,
             history=self.scenarios.history,
         )
@@ -138,10 +139,36 @@ class ScenarioSampler:
         is_whole = isinstance(key, int | np.integer) and not isinstance(key, bool)
         if not (is_whole and 0 <= key < len(self.scenarios)):
             raise AspEnvError(
-                f"scenario {key}: expected 0 to {len(self.scenarios) - 1} for this data, or a "
-                "scenario's name"
+                f"scenario {shown(key)}: expected 0 to {len(self.scenarios) - 1} for this data, or "
+                "a scenario's name"
             )
         return self.scenarios[int(key)]
+
+
+def reset_options(options: Any) -> dict[str, Any]:
+    """Checks the options of a reset.
+
+    Args:
+        options: a mapping, or None for none.
+
+    Returns:
+        The options, in a dictionary of their own.
+
+    Raises:
+        AspEnvError: the options are no mapping.
+    """
+    if options is None:
+        return {}
+    return dict(table("options", options, f"some of {', '.join(RESET_OPTIONS)}"))
+
+
+def checked_seed(seed: Any) -> int | None:
+    """Checks the seed of a reset, which Gymnasium expects to be a number of Python.
+
+    Raises:
+        AspEnvError: the seed is neither None nor a whole number of at least 0.
+    """
+    return None if seed is None else whole_number("seed", seed, least=0)
 
 
 def _check_set(
@@ -160,12 +187,6 @@ def _check_set(
             f"scenarios for {scenarios.history} past ticks of {scenarios.dt_s:g} s: expected "
             f"{history} of {dt_s:g} s"
         )
-
-
-def _whole_number(name: str, value: Any) -> int:
-    if not isinstance(value, int | np.integer) or isinstance(value, bool):
-        raise AspEnvError(f"{name} {value!r}: expected a whole number")
-    return int(value)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -211,8 +232,6 @@ class ReplayEpisodes:
         )
         check_action_type(options.action_type)
         self._action_type = options.action_type
-        if options.action_repeat < 1:
-            raise AspEnvError(f"action_repeat {options.action_repeat}: expected at least 1")
         self._action_repeat = options.action_repeat
         self._weights = weights_from(options.reward_weights or {})
         self._forecasts = forecast_observers(options.predictor, options.forecast, options.dt_s)
@@ -253,7 +272,15 @@ class ReplayEpisodes:
         self._allocate(num_episodes)
 
     def draw_from(self, scenarios: ScenarioSet) -> None:
-        """Replaces the scenarios to draw from; episodes under way go on."""
+        """Replaces the scenarios to draw from; episodes under way go on.
+
+        Raises:
+            AspEnvError: the argument is no set of scenarios, or the set is of other data.
+        """
+        if not isinstance(scenarios, ScenarioSet):
+            raise AspEnvError(f"scenarios {shown(scenarios)}: expected a ScenarioSet")
+        world = self.simulation.world
+        _check_set(scenarios, self.recordings, dt_s=world.dt_s, history=world.history)
         self.scenarios = scenarios
         self._sampler = dataclasses.replace(self._sampler, scenarios=scenarios)
 
@@ -439,7 +466,13 @@ class ReplayEpisodes:
             scene: a present scene.
             horizon: number of ticks.
             rows: numbers of the episodes that are its situations; all by default.
+
+        Raises:
+            AspEnvError: an argument is no scene or no number of ticks.
         """
+        if not isinstance(scene, Scene):
+            raise AspEnvError(f"scene {shown(scene)}: expected a Scene, such as that of scene()")
+        whole_number("horizon", horizon, least=1)
         return recorded_future(self.simulation.world, scene, horizon, rows)
 
     @property
@@ -591,7 +624,7 @@ def valid_actions(
         expected += f" for each environment, {shape}"
     try:
         values = np.asarray(actions, dtype=np.float64)
-    except (TypeError, ValueError):
+    except (TypeError, ValueError, OverflowError):
         raise AspEnvError(f"action {type(actions).__name__}: expected {expected}") from None
     if values.shape != shape:
         raise AspEnvError(f"action of shape {values.shape}: expected {expected}")
