@@ -37,6 +37,10 @@ class MissingExtraError(AspEnvError, ImportError):
         )
 
 
+class StaleInstallError(AspEnvError):
+    """The metadata of the installed package are older than its code, and lack names of it."""
+
+
 class LeftOutWarning(UserWarning):
     """Recordings of DATA that cannot be read are left out. An error with `--strict`."""
 

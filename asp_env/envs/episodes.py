@@ -18,7 +18,15 @@ from jaxtyping import Bool, Float, Int
 from asp_env.arguments import shown, table, whole_number
 from asp_env.data.predictor import Predictor
 from asp_env.data.recording import ticks
-from asp_env.data.scenarios.scenario import Scenario, ScenarioFilter, ScenarioSet
+from asp_env.data.scenarios.scenario import (
+    MIN_DISTANCE_M,
+    MIN_LENGTH_S,
+    SHORT_LENGTH_S,
+    Scenario,
+    ScenarioFilter,
+    ScenarioSet,
+    short_history,
+)
 from asp_env.data.scenarios.selection import choose_scenarios, scenario_of
 from asp_env.data.scenarios.tags import TAGS
 from asp_env.data.scene import EGO, Scene, infer_actions
@@ -84,8 +92,9 @@ class ScenarioSampler:
         chosen = choose_scenarios(recordings, str(scenarios), dt_s=dt_s, history=history)
         if not len(chosen):
             raise AspEnvError(
-                f"{recordings.source}: no vehicle covers 10 m in 4 s after 3 s of history; "
-                "use other recordings"
+                f"{recordings.source}: no vehicle covers {MIN_DISTANCE_M:g} m in "
+                f"{MIN_LENGTH_S:g} s after {history * dt_s:g} s of history, or in "
+                f"{SHORT_LENGTH_S:g} s of short recordings; use other recordings"
             )
         return cls(recordings=recordings, scenarios=chosen)
 
@@ -182,7 +191,8 @@ def _check_set(
             f"scenarios of {scenarios.source}: expected some of {recordings.source}, whose "
             f"recordings are {', '.join(names)}"
         )
-    if abs(scenarios.dt_s - dt_s) > 1e-9 or scenarios.history != history:
+    histories = (history, short_history(history, dt_s))
+    if abs(scenarios.dt_s - dt_s) > 1e-9 or scenarios.history not in histories:
         raise AspEnvError(
             f"scenarios for {scenarios.history} past ticks of {scenarios.dt_s:g} s: expected "
             f"{history} of {dt_s:g} s"

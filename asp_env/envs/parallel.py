@@ -381,7 +381,7 @@ entry is a vector, images stay images |
             self._selected[scenario.recording],
             scenario,
             dt_s=world.dt_s,
-            history=world.history,
+            history=self.scenarios.history,
             max_agents=self._max_agents,
         )
         reset_mask = np.arange(self._max_agents) < len(views)
@@ -528,7 +528,7 @@ entry is a vector, images stay images |
             selected = self._selected[scenario.recording]
             if selected[recording.track_ids == scenario.ego_id].any():
                 present = present_tracks(
-                    recording, scenario, dt_s=world.dt_s, history=world.history
+                    recording, scenario, dt_s=world.dt_s, history=scenarios.history
                 )
                 num_agents = max(num_agents, int((present & selected).sum()))
                 drivable[row] = True
