@@ -240,6 +240,7 @@ class ReplayEpisodes:
             history=history,
             world_class=kind,
         )
+        self._traffic = _name_of_traffic(options.traffic, kind.traffic)
         check_action_type(options.action_type)
         self._action_type = options.action_type
         self._action_repeat = options.action_repeat
@@ -532,31 +533,38 @@ class ReplayEpisodes:
         forecasts = [each.snapshot() for each in self._forecasts]
         statistics = self._return.copy(), self._num_steps.copy(), dict(self._terms)
         state = self.simulation.snapshot(), self._seeds.copy(), forecasts, statistics
-        return self._origin, state
+        return state
 
     @cached_property
-    def _origin(self) -> dict[str, Any]:
-        """What a snapshot must agree with to be restored here."""
+    def origin(self) -> dict[str, Any]:
+        """What a snapshot must have in common with these episodes to be restored here."""
         world = self.simulation.world
         return {
             "data": f"of content {self.recordings.data_hash()[:12]}",
             "time step": f"{world.dt_s:g} s",
-            "episodes": len(self._rows),
+            "number of episodes": len(self._rows),
+            "traffic": self._traffic,
+            "action_type": self._action_type,
+            "action_repeat": self._action_repeat,
+            "predictors": ", ".join(each.name for each in self.predictors) or "none",
         }
 
-    def restore(self, snapshot: Any) -> None:
-        """Restores the state of a snapshot, bit for bit.
+    def check_origin(self, origin: Mapping[str, Any]) -> None:
+        """Checks what a snapshot comes from.
 
         Raises:
-            AspEnvError: the snapshot is of other data or of another number of episodes.
+            AspEnvError: it is of other data, of another time step, number of episodes or action.
         """
-        origin, (simulation, seeds, forecasts, (returns, num_steps, terms)) = snapshot
-        for name, given in origin.items():
-            if given != self._origin[name]:
+        for name, expected in self.origin.items():
+            if origin.get(name) != expected:
                 raise AspEnvError(
-                    f"the snapshot is of an environment with {name} {given}, expected "
-                    f"{self._origin[name]}; restore it in an environment with the same arguments"
+                    f"the snapshot is of an environment with {name} {origin.get(name)}, expected "
+                    f"{expected}; restore it in an environment with the same arguments"
                 )
+
+    def restore(self, snapshot: Any) -> None:
+        """Restores the state of a snapshot of these episodes, see `check_origin`, bit for bit."""
+        simulation, seeds, forecasts, (returns, num_steps, terms) = snapshot
         self.simulation.restore(simulation)
         self._return, self._num_steps = returns.copy(), num_steps.copy()
         self._terms = dict(terms)
@@ -573,6 +581,14 @@ class ReplayEpisodes:
         """Gives episodes serial numbers, so that forecasts of earlier ones are not shown."""
         self._serials[rows] = self._num_begun + np.arange(len(rows))
         self._num_begun += len(rows)
+
+
+def _name_of_traffic(spec: Any, default: str) -> str:
+    """The traffic in words, to compare environments: drivers by name, or by class."""
+    if isinstance(spec, Mapping):
+        names = (f"{key}={_name_of_traffic(each, default)}" for key, each in spec.items())
+        return ",".join(sorted(names))
+    return spec if isinstance(spec, str) else default if spec is None else type(spec).__name__
 
 
 def _seed_from(rng: np.random.Generator) -> int:

@@ -47,6 +47,8 @@ class EnvSnapshot:
     arguments restores it by stepping through the actions again.
     """
 
+    origin: Mapping[str, Any]
+    """What an environment must have in common with this one to restore the snapshot."""
     scenario: Scenario
     rng: Mapping[str, Any]
     """State of the episode's generator at its start."""
@@ -392,6 +394,7 @@ name; several in a mapping with their prefixes |
         if self._start is None:
             raise gymnasium.error.ResetNeeded(NOT_BEGUN)
         return EnvSnapshot(
+            origin=self._episodes.origin,
             scenario=self._start[0],
             rng=self._start[1],
             actions=np.array(self._actions, dtype=np.float32).reshape(-1, 2),
@@ -413,6 +416,7 @@ name; several in a mapping with their prefixes |
             raise AspEnvError(
                 f"snapshot {shown(snapshot)}: expected what snapshot() of a ReplayEnv returns"
             )
+        self._episodes.check_origin(snapshot.origin)
         if snapshot.arrays is None:
             rng = np.random.default_rng()
             rng.bit_generator.state = snapshot.rng

@@ -48,6 +48,8 @@ MAX_ENVS = 2**20
 class VectorSnapshot:
     """The whole state of a vector environment; a pickle holds no recordings and no rasters."""
 
+    origin: Mapping[str, Any]
+    """What an environment must have in common with this one to restore the snapshot."""
     episodes: Any
     generators: tuple[Mapping[str, Any], ...]
     """States of `np_random`."""
@@ -311,6 +313,7 @@ class ReplayVectorEnv(SharedInSpec, VectorEnv[Any, Any, np.ndarray]):  # pyright
         """
         self._check_begun()
         return VectorSnapshot(
+            origin=self._episodes.origin,
             episodes=self._episodes.snapshot(),
             generators=tuple(each.bit_generator.state for each in self.np_random),
             seeds=tuple(self._seeds),
@@ -327,6 +330,7 @@ class ReplayVectorEnv(SharedInSpec, VectorEnv[Any, Any, np.ndarray]):  # pyright
             raise AspEnvError(
                 f"snapshot {shown(snapshot)}: expected what snapshot() of a ReplayVectorEnv returns"
             )
+        self._episodes.check_origin(snapshot.origin)
         self._episodes.restore(snapshot.episodes)
         for generator, state in zip(self.np_random, snapshot.generators, strict=True):
             generator.bit_generator.state = state
