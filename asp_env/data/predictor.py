@@ -18,6 +18,9 @@ from asp_env.data.snippets import Future
 from asp_env.data.split import TrainedOn
 from asp_env.geometry import wrap_angle
 
+MAX_HORIZON = 2**20
+"""Longest horizon in ticks. Chosen by hand: beyond all recordings."""
+
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Forecast:
@@ -215,7 +218,7 @@ def load_predictor(name: str, *, horizon: int, dt_s: float) -> Predictor:
         AspEnvError: the name is unknown, or the predictor cannot be made for these values.
     """
     text("predictor", name)
-    whole_number("horizon", horizon, least=1)
+    whole_number("horizon", horizon, least=1, most=MAX_HORIZON)
     positive_number("time step", dt_s, "s")
     kind, _, argument = name.partition(":")
     plug: PredictorPlug = registry.find("predictors", kind)

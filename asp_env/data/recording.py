@@ -23,6 +23,9 @@ LEAST_FRAMES_PER_TICK = 0.75
 """Recordings with fewer frames per tick are refused: most of their ticks would be interpolated.
 Chosen by hand."""
 
+MAX_DURATION_S = 3600.0
+"""Longest history, horizon and tick. Chosen by hand: beyond all recordings."""
+
 SUGGESTIONS = 5
 """Number of time steps that an error message lists."""
 
@@ -109,7 +112,8 @@ def ticks(duration_s: float, dt_s: float) -> int:
             time steps, or near durations if no usual time step divides the duration.
     """
     for what, value_s in (("time step", dt_s), ("duration", duration_s)):
-        positive_number(what, value_s, "s")
+        if positive_number(what, value_s, "s") > MAX_DURATION_S:
+            raise AspEnvError(f"{what} {value_s:g} s: expected at most {MAX_DURATION_S:g} s")
     count = round(duration_s / dt_s)
     if count < 1 or abs(count * dt_s - duration_s) > 1e-6:
         if any(math.isclose(dt_s, step) for step in _TIME_STEPS_S):
