@@ -104,6 +104,16 @@ def _near(steps_s: Sequence[float], dt_s: float) -> str:
     return ", ".join(f"{step:g}" for step in sorted(nearest))
 
 
+def check_duration(what: str, value_s: Any) -> None:
+    """Checks a time step, a history or a horizon.
+
+    Raises:
+        AspEnvError: the duration is no positive number of seconds, or longer than an hour.
+    """
+    if positive_number(what, value_s, "s") > MAX_DURATION_S:
+        raise AspEnvError(f"{what} {value_s:g} s: expected at most {MAX_DURATION_S:g} s")
+
+
 def ticks(duration_s: float, dt_s: float) -> int:
     """Number of ticks of a duration.
 
@@ -112,8 +122,7 @@ def ticks(duration_s: float, dt_s: float) -> int:
             time steps, or near durations if no usual time step divides the duration.
     """
     for what, value_s in (("time step", dt_s), ("duration", duration_s)):
-        if positive_number(what, value_s, "s") > MAX_DURATION_S:
-            raise AspEnvError(f"{what} {value_s:g} s: expected at most {MAX_DURATION_S:g} s")
+        check_duration(what, value_s)
     count = round(duration_s / dt_s)
     if count < 1 or abs(count * dt_s - duration_s) > 1e-6:
         if any(math.isclose(dt_s, step) for step in _TIME_STEPS_S):

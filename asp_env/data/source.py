@@ -12,11 +12,11 @@ from pathlib import Path
 from typing import Any, SupportsIndex, overload
 
 from asp_env import registry
-from asp_env.arguments import positive_number, shown
+from asp_env.arguments import shown
 from asp_env.data.readers.layout import ARCHIVE, archive_hint, shorten
 from asp_env.data.readers.levelx import LevelxFiles
 from asp_env.data.readers.opening import ReaderState, RecordingFiles, content_hash, open_recording
-from asp_env.data.recording import DEFAULT_DT_S, Recording
+from asp_env.data.recording import DEFAULT_DT_S, Recording, check_duration
 from asp_env.errors import (
     AspEnvError,
     DataError,
@@ -184,7 +184,7 @@ def open_data(data: str | Path, *, dt_s: float = DEFAULT_DT_S) -> Recordings:
             f"data {shown(data)}: expected a folder with recordings, or a text scheme:argument"
         )
     source = str(data)
-    positive_number("time step", dt_s, "s")
+    check_duration("time step", dt_s)
     folder = source_folder(source)
     if not folder.is_dir():
         what = "is a file" if folder.exists() else "does not exist"
