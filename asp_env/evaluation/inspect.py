@@ -144,7 +144,7 @@ class Inspect:
     def _examine(
         self, recordings: Recordings, console: Console
     ) -> tuple[list[RecordingSummary], dict[str, str]]:
-        summaries: list[RecordingSummary] = []
+        opened: list[Recording] = []
         faults: dict[str, str] = {}
         numbers = track(
             range(len(recordings)),
@@ -167,19 +167,19 @@ class Inspect:
                     raise
                 faults[name] = f"recording {name}: {error}"
                 continue
-            summaries.append(
-                RecordingSummary(
-                    recording=recording,
-                    on_road=_on_road(recording),
-                    drifts=_drifts(recording, self.dt),
-                    scenarios=find_scenarios(
-                        [recording],
-                        source=self.data,
-                        dt_s=self.dt,
-                        history=ticks(HISTORY_S, self.dt),
-                    ),
-                )
+            opened.append(recording)
+        scenarios = find_scenarios(
+            opened, source=self.data, dt_s=self.dt, history=ticks(HISTORY_S, self.dt)
+        )
+        summaries = [
+            RecordingSummary(
+                recording=recording,
+                on_road=_on_road(recording),
+                drifts=_drifts(recording, self.dt),
+                scenarios=scenarios.select(scenarios.recording == number),
             )
+            for number, recording in enumerate(opened)
+        ]
         return summaries, faults
 
 
