@@ -155,9 +155,7 @@ def _show(
             **dict(zip(("open_loop", "closed_loop"), manifests, strict=False)),
         )
         if closed_loop is not None:
-            save_scenarios(
-                folder / "scenarios.json", closed_loop.scenarios, closed_loop.recordings
-            )
+            save_scenarios(folder / "scenarios.json", closed_loop.scenarios, closed_loop.recordings)
             write_scenario_table(folder, closed_loop.scenarios, closed_loop.methods)
             save_rollouts(folder, closed_loop)
         write_report(

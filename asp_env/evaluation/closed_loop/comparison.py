@@ -38,8 +38,8 @@ SAVED_ROLLOUTS = 6
 """Number of the worst scenarios, whose rollouts are saved for every method."""
 
 TELLING_ROLLOUTS = 3
-"""Number of scenarios with the largest gain over the reference whose rollouts are saved as well, and
-of those with the largest loss."""
+"""Number of scenarios with the largest gains over the reference whose rollouts are saved as well,
+and of those with the largest losses."""
 
 EXPERT = "expert"
 """Name of the planner that replays the logged ego; the reference of every comparison."""

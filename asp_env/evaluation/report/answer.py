@@ -109,24 +109,26 @@ def forecast_answer(results: Sequence[Result]) -> Answer | None:
             details=(),
         )
     best = min(tested, key=lambda r: r.value or 0.0)
-    verdict: Verdict = "not resolved"
-    relation = "its FDE is"
-    if best.low is not None and best.high is not None and not best.low <= 1 <= best.high:
-        verdict = "yes" if best.high < 1 else "no"
-        quality = "better" if verdict == "yes" else "worse"
-        relation = f"it forecasts {quality} than {BASELINE}, with an FDE"
-    horizon = f" at {best.horizon_s} s" if best.horizon_s else ""
     name = short_labels([r.method for r in results])[best.method]
-    several = (
-        (f"the best of {len(tested)} predictors under test; intervals are not adjusted for this",)
-        if len(tested) > 1
-        else ()
-    )
+    at = f" at {best.horizon_s} s" if best.horizon_s else ""
+    verdict: Verdict = "not resolved"
+    sentence = f"the FDE of {name}{at} is {interval_text(best)} times that of {BASELINE}"
+    if best.low is not None and best.high is not None and not best.low <= 1 <= best.high:
+        verdict, quality = ("yes", "better") if best.high < 1 else ("no", "worse")
+        sentence = (
+            f"{name} forecasts {quality} than {BASELINE}, with an FDE{at} that is "
+            f"{interval_text(best)} times as large"
+        )
+    details = ["how it drives is measured by asp-env drive"]
+    if len(tested) > 1:
+        details.insert(
+            0,
+            f"the best of {len(tested)} predictors under test; intervals are not adjusted for this",
+        )
     return Answer(
         verdict=verdict,
-        sentence=f"{name}: {relation}{horizon} {interval_text(best)} times that of constant "
-        f"velocity; {targets}.",
-        details=(*several, "how it drives is measured by asp-env drive"),
+        sentence=f"{sentence}; {targets}.",
+        details=tuple(details),
         method=best.method,
     )
 

@@ -89,7 +89,7 @@ def other_metrics(results: Sequence[Result]) -> tuple[list[Payload], str]:
             {
                 "kind": "rows",
                 "title": title,
-                "axis": _axis(title, note.unit, metric_note(metric).better),
+                "axis": _axis("" if pair else note.label, note.unit, note.better),
                 "rows": [_row(r, labels[r.method]) for r in group],
                 "zero": pair[1] if pair else None,
                 "decimals": 1 if note.unit == "%" else 2,
@@ -134,7 +134,9 @@ def tags(results: Sequence[Result]) -> Payload | None:
     }
 
 
-def scenario_differences(results: Sequence[Result], values: ScenarioValues | None) -> Payload | None:
+def scenario_differences(
+    results: Sequence[Result], values: ScenarioValues | None
+) -> Payload | None:
     """The difference of the score in every scenario in which it is not 0, in descending order.
 
     Args:

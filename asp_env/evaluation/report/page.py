@@ -54,6 +54,7 @@ from asp_env.evaluation.report.scenario_values import (
 from asp_env.evaluation.report.tables import (
     breakdown_figures,
     comparison_figures,
+    difference_figures,
     result_figures,
 )
 from asp_env.evaluation.results import SCORE, difference_of
@@ -227,7 +228,7 @@ def _part(
         setting=setting,
         answer=answer or (forecast_answer(forecasts) if not driving else None),
         comparison_tables=comparison_figures(driving),
-        driving_tables=result_figures(driving),
+        driving_tables=[*difference_figures(driving), *result_figures(driving)],
         same=same,
         has_tags=by_tag is not None,
         drives=_drive_lists(driving, values, answer, privileged),

@@ -38,7 +38,7 @@ class MetricNote:
     text: str
     """Definition in a sentence; empty for an unknown metric."""
     decimals: int | None = None
-    """Number of decimals; None for one of percentages, two of other numbers, three of small ones."""
+    """None for one decimal of percentages, two of other numbers, three of small ones."""
 
     @property
     def unit_and_arrow(self) -> str:
@@ -407,7 +407,8 @@ METRIC_NOTES = {
         "Score",
         "",
         "higher",
-        "Score of the rules from 0 to 1: the product of their multipliers times their weighted mean.",
+        "Score of the rules, from 0 to 1: the product of their multipliers times their weighted "
+        "mean.",
         3,
     ),
     "score - constant-velocity": _note(

@@ -1,6 +1,6 @@
 /* Figures as SVG, drawn for the width of their box, and saved as SVG or PNG. */
 const SVG = "http://www.w3.org/2000/svg";
-const ROW = 26, NARROW_ROW = 40, TOP = 10, BOTTOM = 44;
+const NARROW = 430, ROW = 26, NARROW_ROW = 40, TOP = 10, BOTTOM = 44;
 const measure = document.createElement("canvas").getContext("2d");
 const seriesColour = (number) => Number.isInteger(number) && number >= 0 ? `series-${number}` : "muted";
 
@@ -73,19 +73,19 @@ function drawRows(spec, width, chosen = 0) {
   const rows = spec.choices ? spec.choices[chosen].rows : spec.rows;
   const difference = spec.zero !== null;
   const texts = rows.map((row) => valueText(row, spec.decimals, difference));
-  const narrow = width < 520;
+  const narrow = width < NARROW;
   const left = narrow ? 12 : Math.min(Math.max(...rows.map((r) => textWidth(r.label))) + 18, width * 0.34);
   const right = narrow ? 12 : Math.max(...texts.map((text) => textWidth(text))) + 22;
   const rowHeight = narrow ? NARROW_ROW : ROW;
-  const rungs = rungLabels(spec.rungs || []);
+  const rungs = spec.rungs || [];
   const [low, high] = rangeOf(spec, rows);
   const x = (v) => left + (v - low) / (high - low) * (width - left - right);
-  const top = TOP + placeRungs(rungs, x);
+  const placed = placeRungs(rungs, x), top = TOP + placed.height;
   const bottom = top + rows.length * rowHeight, height = bottom + BOTTOM;
   const svg = element("svg", { viewBox: `0 0 ${width} ${height}`, width, height, role: "img" });
   svg.append(element("title", {}, spec.title));
   drawAxis(svg, spec, { low, high, x, top, bottom, left, right: width - right, width });
-  drawRungs(svg, rungs, x, top, bottom);
+  drawRungs(svg, rungs, placed.labels, x, top, bottom);
   rows.forEach((row, i) => {
     const y = top + (i + 0.5) * rowHeight + (narrow ? 8 : 0);
     const group = element("g", { class: `row ${row.class}${row.control ? " control" : ""}` });
@@ -93,7 +93,7 @@ function drawRows(spec, width, chosen = 0) {
     const name = element("text", { class: "name", x: narrow ? left : left - 12, y: narrow ? y - 12 : y + 4,
       "text-anchor": narrow ? "start" : "end" }, shortened(label, narrow ? width - 24 : left - 14));
     group.append(element("title", {}, `${row.label}: ${texts[i]}`));
-    if (difference && row.mde > 0) {
+    if (difference && row.mde > 0 && !row.control) {
       const from = Math.max(x(-row.mde), left), to = Math.min(x(row.mde), width - right);
       if (to > from) group.append(element("rect", { class: "mde", x: from, y: y - 8, width: to - from, height: 16 }));
     }
@@ -124,7 +124,7 @@ function drawValue(group, row, { x, y, left, right }) {
 }
 
 function drawAxis(svg, spec, { low, high, x, top, bottom, left, right, width }) {
-  const { step, values } = ticks(low, high, Math.max(2, (right - left) / 90));
+  const { step, values } = ticks(low, high, Math.max(3, (right - left) / 80));
   for (const value of values) {
     const px = x(value);
     svg.append(element("line", { class: "grid", x1: px, x2: px, y1: top, y2: bottom }));
@@ -133,44 +133,43 @@ function drawAxis(svg, spec, { low, high, x, top, bottom, left, right, width }) 
   if (spec.zero !== null && spec.zero !== undefined) {
     svg.append(element("line", { class: "zero", x1: x(0), x2: x(0), y1: top, y2: bottom }));
   }
-  svg.append(element("text", { class: "axis", x: width < 520 ? width / 2 : (left + right) / 2, y: bottom + 36, "text-anchor": "middle" },
+  svg.append(element("text", { class: "axis", x: width < NARROW ? width / 2 : (left + right) / 2, y: bottom + 36, "text-anchor": "middle" },
     shortened(spec.axis, width - 16)));
 }
 
-/* Rungs at equal places share a label. */
-function rungLabels(rungs) {
-  const merged = [];
-  for (const rung of rungs) {
-    const same = merged.find((other) => other.value === rung.value);
-    if (same) same.label += `, ${rung.label}`; else merged.push({ ...rung });
-  }
-  return merged;
-}
-
-/* Gives every rung a line of text on which it overlaps no other; returns the height of all lines. */
+/* Gives every rung a line of text on which it overlaps no other; rungs at nearly the same place share
+   a label. Returns the labels and the height of all lines. */
 function placeRungs(rungs, x) {
-  const ends = [];
+  const labels = [], ends = [];
   for (const rung of [...rungs].sort((a, b) => a.value - b.value)) {
-    const half = textWidth(rung.label, 12) / 2 + 5, from = x(rung.value) - half;
-    let line = ends.findIndex((end) => end < from);
-    if (line < 0) line = ends.length;
-    ends[line] = x(rung.value) + half;
-    rung.line = line;
+    const px = x(rung.value), before = labels.at(-1);
+    if (before && px - before.px < 8) before.rungs.push(rung);
+    else labels.push({ px, rungs: [rung] });
   }
-  for (const rung of rungs) rung.lines = ends.length;
-  return rungs.length ? 16 * ends.length + 16 : 0;
+  for (const label of labels) {
+    label.text = rungs.filter((rung) => label.rungs.includes(rung)).map((r) => r.label).join(", ");
+    const half = textWidth(label.text, 12) / 2 + 5;
+    const line = ends.findIndex((end) => end < label.px - half);
+    label.line = line < 0 ? ends.length : line;
+    ends[label.line] = label.px + half;
+  }
+  return { labels, height: labels.length ? 16 * ends.length + 16 : 0 };
 }
 
 /* The ladder as a scale: a bar from constant velocity to the oracle with a mark at every rung. */
-function drawRungs(svg, rungs, x, top, bottom) {
+function drawRungs(svg, rungs, labels, x, top, bottom) {
   if (!rungs.length) return;
   const y = top - 8, at = rungs.map((rung) => x(rung.value));
   svg.append(element("line", { class: "ladder", x1: Math.min(...at), x2: Math.max(...at), y1: y, y2: y }));
-  for (const rung of rungs) {
-    const px = x(rung.value), textY = y - 9 - 16 * rung.line;
+  for (const px of at) {
     svg.append(element("line", { class: "guide", x1: px, x2: px, y1: y, y2: bottom }));
-    svg.append(element("line", { class: "ladder", x1: px, x2: px, y1: textY + 4, y2: y + 4 }));
-    svg.append(element("text", { class: "rung", x: px, y: textY, "text-anchor": "middle" }, rung.label));
+    svg.append(element("line", { class: "ladder", x1: px, x2: px, y1: y - 4, y2: y + 4 }));
+  }
+  for (const { px, line } of labels) {
+    svg.append(element("line", { class: "stem", x1: px, x2: px, y1: y - 6 - 16 * line, y2: y }));
+  }
+  for (const { px, text, line } of labels) {
+    svg.append(element("text", { class: "rung", x: px, y: y - 9 - 16 * line, "text-anchor": "middle" }, text));
   }
 }
 
@@ -290,7 +289,7 @@ function choiceOf(figure, spec) {
 }
 
 const KEPT = ["fill", "stroke", "stroke-width", "stroke-dasharray", "stroke-linecap", "stroke-linejoin",
-  "opacity", "fill-opacity", "font-family", "font-size", "font-weight"];
+  "opacity", "fill-opacity", "paint-order", "font-family", "font-size", "font-weight"];
 
 /* A figure as the text of an SVG file, in the light theme, with its title. */
 function chartText(figure, spec) {

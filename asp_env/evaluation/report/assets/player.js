@@ -240,7 +240,7 @@ class Player {
     this.drawStrip();
     const speeds = this.shown.filter((stage) => stage.rollout).map(({ rollout }) => {
       const speed = rollout.speed[Math.min(Math.floor(this.tick), rollout.ticks - 1)];
-      return speed === null ? "–" : (3.6 * speed).toFixed(0);
+      return speed === null ? "–" : printed(3.6 * speed, 0);
     });
     const seconds = (this.tick * this.rollout.dt).toFixed(1);
     this.clock.textContent = `tick ${Math.floor(this.tick)} · ${seconds} s · ${speeds.join(" and ")} km/h`;
@@ -281,8 +281,10 @@ class Player {
       x += ctx.measureText(text).width + 14;
     };
     const colours = [colour("ego"), colour("second")];
+    const names = rollouts.map((each) => each.driver || each.name);
+    const fits = ctx.measureText(names.join("")).width + 220 < width;
     label("speed:", colour("muted"));
-    rollouts.forEach((each, number) => label(each.driver || each.name, colours[number]));
+    names.forEach((name, i) => label(fits ? name : ["first", "second"][i], colours[i]));
     label("recorded (dashed)", colour("muted"));
     line(this.rollout.log_speed, colour("muted"), [4, 3]);
     rollouts.forEach((each, number) => line(each.speed, colours[number], []));
