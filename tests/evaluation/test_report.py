@@ -336,7 +336,8 @@ def test_a_missing_package_is_named_with_its_extra(
 
 def comparison(predictor: str, metric: str, value: float, **cells: object) -> dict[str, object]:
     """A row of a comparison, like those of `drive`."""
-    common = {"data": "d", "planner": "sampling", "predictor": predictor, "subset": "all", "n": 480}
+    common = {"data": "sample:intersection", "traffic": "idm", "latency_ticks": 0}
+    common |= {"planner": "sampling", "predictor": predictor, "subset": "all", "n": 480}
     return {**dict.fromkeys(COLUMNS, ""), **common, "metric": metric, "value": value, **cells}
 
 

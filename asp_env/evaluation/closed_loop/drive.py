@@ -83,7 +83,8 @@ class Drive:
     The default is log for recordings and own for highway:…."""
     scenarios: Annotated[str, tyro.conf.arg(metavar="FILTER|FILE")] = ""
     """Tags and comparisons, such as 'left,!stopping,length>=8',
-    or the scenarios.json of another run. The default is all;
+    or the scenarios.json of another run, or scenarios.json#NAME
+    for one scenario of it. The default is all;
     hard are interactive ones in which constant velocity fails."""
     max_scenarios: int | None = None
     """Largest number of scenarios; they are chosen at even spacing."""

@@ -207,6 +207,34 @@ def forecast_errors(results: Sequence[Result]) -> Iterator[Payload]:
                 }
 
 
+def regret(results: Sequence[Result]) -> Payload | None:
+    """Planning regret removed by predictor, over all scenarios.
+
+    Args:
+        results: Open-loop results of one setting.
+
+    Returns:
+        The figure, None if there is no planning regret.
+    """
+    labels = _labels(results)
+    group = [
+        r
+        for r in results
+        if (r.metric, r.subset) == ("regret removed", "all") and r.value is not None
+    ]
+    if len(group) < 2:
+        return None
+    note = metric_note(group[0].metric)
+    return {
+        "kind": "rows",
+        "title": "Planning regret removed, all scenarios",
+        "axis": _axis(note.label, note.unit),
+        "rows": [_row(r, labels[r.method]) for r in sorted(group, key=lambda r: -(r.value or 0.0))],
+        "zero": None,
+        "decimals": 1,
+    }
+
+
 def errors_over_time(results: Sequence[Result], colours: Mapping[str, int]) -> Iterator[Payload]:
     """Lines of metrics such as `L2@1s` over the time ahead, a figure for each selection.
 

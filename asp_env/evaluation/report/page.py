@@ -219,6 +219,7 @@ def _part(
         "forecasts": [
             *figures.forecast_errors(shown),
             *figures.errors_over_time(shown, colours),
+            figures.regret(shown),
         ],
         "tags": [by_tag],
         "drives": [figures.scenario_differences(driving, values)],
