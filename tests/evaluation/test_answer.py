@@ -115,7 +115,15 @@ def test_controls_alone_bound_what_forecasts_can_gain() -> None:
     assert answer is not None
     assert answer.verdict == "no method under test"
     assert answer.sentence.startswith("the oracle drives by +0.020 [0.010, 0.030] better")
-    assert driving_answer([row("m", "score", 0.9)]) is None
+
+
+def test_methods_without_a_reference_are_not_compared() -> None:
+    answer = driving_answer([row("m", "score", 0.9)], places=1)
+    assert answer is not None
+    assert f"{answer.heading}: {answer.sentence}" == (
+        "Not compared: the score of no method is compared with a reference; 480 drives, 1 place."
+    )
+    assert driving_answer([]) is None
 
 
 def test_forecasts_are_compared_by_their_ratio_to_constant_velocity() -> None:

@@ -191,8 +191,8 @@ def test_several_settings_have_parts_and_a_summary(tmp_path: Path) -> None:
     write_tables(tmp_path, [*metric_rows(), *rows])
     page = write_report(tmp_path, title="x").read_text()
     assert data_of(page)["settings"] == [
-        "sample:intersection · traffic idm",
-        "sample:intersection · traffic log",
+        "traffic idm",
+        "traffic log",
     ]
     assert "2 settings: yes in 1, not resolved in 1." in page
     matrix = page[page.index('<table class="matrix">') :].partition("</table>")[0]

@@ -19,7 +19,7 @@ from asp_env.evaluation.verdicts import oracle_phrase, share_text
 RATIO = "FDE / constant velocity"
 """The metric that the answer in open loop is from."""
 
-Verdict = Literal["yes", "no", "not resolved", "no method under test"]
+Verdict = Literal["yes", "no", "not resolved", "no method under test", "not compared"]
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -51,11 +51,16 @@ def driving_answer(results: Sequence[Result], *, places: int | None = None) -> A
         places: Number of locations of the scenarios, if it is known.
 
     Returns:
-        The answer, None if the results contain no differences of the score.
+        The answer, None without results.
     """
     scores = score_differences(results)
-    if not scores:
+    if not results:
         return None
+    if not scores:
+        sentence = (
+            f"the score of no method is compared with a reference; {_drives(results, places)}."
+        )
+        return Answer(verdict="not compared", sentence=sentence, details=())
     tested = [r for r in scores if under_test(r)]
     drives = _drives(scores, places)
     if not tested:

@@ -40,6 +40,7 @@ from asp_env.evaluation.report.results import (
     methods_of,
     metric_note,
     read_results,
+    setting_labels,
     short_labels,
 )
 from asp_env.evaluation.report.scenario_values import (
@@ -162,7 +163,7 @@ def write_report(
         "colours": colours | {split_name(name)[0]: number for name, number in colours.items()},
         "pictures": examples_payload(examples, map_table) if examples else [],
         "drives": rollouts_payload(episodes, maps or {}, map_table, results.settings),
-        "settings": [setting.label for setting in results.settings],
+        "settings": setting_labels(results.settings),
     }
     data["maps"] = map_table.payloads
     page = _page_template().render(
@@ -311,7 +312,7 @@ def _summary(parts: Sequence[Part], results: Results) -> Summary | None:
     verdicts = [part.answer.verdict for part in parts if part.answer]
     counts = [f"{verdict} in {verdicts.count(verdict)}" for verdict in distinct(verdicts)]
     return Summary(
-        settings=tuple((part.number, part.setting.label) for part in parts),
+        settings=tuple(enumerate(setting_labels(results.settings))),
         rows=tuple(rows),
         sentence=f"{len(parts)} settings: {', '.join(counts)}.",
     )

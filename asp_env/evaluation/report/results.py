@@ -212,6 +212,19 @@ def short_labels(methods: Sequence[MethodResult]) -> dict[MethodResult, str]:
     return {m: name if counts[name] == 1 else m.label for m, name in names.items()}
 
 
+def setting_labels(settings: Sequence[Setting]) -> list[str]:
+    """Labels of settings: what differs between them; all of it for a single one."""
+    if len(settings) == 1:
+        return [settings[0].label]
+    parts = [
+        {setting: setting.data for setting in settings},
+        {setting: f"traffic {setting.traffic}" for setting in settings},
+        {setting: f"latency {setting.latency_ticks or 0}" for setting in settings},
+    ]
+    varying = [part for part in parts if len({*part.values()}) > 1]
+    return [" · ".join(part[setting] for part in varying) for setting in settings]
+
+
 def best_result(results: Iterable[Result], *, better: str) -> Result | None:
     """The best result of a method that is not privileged, None if there is none."""
     comparable = [r for r in results if r.value is not None and not r.method.privileged]
