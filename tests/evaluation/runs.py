@@ -208,15 +208,16 @@ def make_rollout(
 def difference_rows() -> list[dict[str, object]]:
     """Differences of the score to constant velocity, over all scenarios and by tag."""
     gains = {"oracle": 0.2, "ffw-asp:runs/demo": 0.11, "blind": -0.5}
-    return [
-        dict.fromkeys(COLUMNS, "")
-        | {"data": "sample:intersection", "traffic": "idm", "latency_ticks": 0}
-        | {"planner": "sampling", "predictor": predictor, "subset": subset, "n": 240}
-        | {"metric": "score - constant-velocity", "value": gain * share, "p_holm": 0.001}
-        | {"low": gain * share - 0.05, "high": gain * share + 0.05, "mde": 0.07}
-        for predictor, gain in gains.items()
-        for subset, share in (("all", 1.0), ("left", 0.5))
-    ]
+    rows: list[dict[str, object]] = []
+    for predictor, gain in gains.items():
+        for subset, share in (("all", 1.0), ("left", 0.5)):
+            value = gain * share
+            row: dict[str, object] = dict.fromkeys(COLUMNS, "")
+            row |= {"data": "sample:intersection", "traffic": "idm", "latency_ticks": 0}
+            row |= {"planner": "sampling", "predictor": predictor, "subset": subset, "n": 240}
+            row |= {"metric": "score - constant-velocity", "value": value, "p_holm": 0.001}
+            rows.append(row | {"low": value - 0.05, "high": value + 0.05, "mde": 0.07})
+    return rows
 
 
 def write_scenario_values(out: Path, scores: dict[str, tuple[float, float]]) -> None:

@@ -110,9 +110,10 @@ def test_figures_are_drawn_and_can_be_saved(report: Path, browser: webdriver.Chr
     assert size > 10_000
     choice = browser.find_element(By.CSS_SELECTOR, "[data-key=tags] select")
     assert choice.text.split("\n") == ["ffw-asp", "oracle", "blind"]
-    before = browser.find_element(By.CSS_SELECTOR, "[data-key=tags] svg").text
+    drawn_text = "document.querySelector('[data-key=tags] svg').textContent"
+    before = run(browser, drawn_text)
     choice.send_keys("o")
-    assert browser.find_element(By.CSS_SELECTOR, "[data-key=tags] svg").text != before
+    assert run(browser, drawn_text) != before
 
 
 def test_two_methods_play_side_by_side(report: Path, browser: webdriver.Chrome) -> None:

@@ -109,7 +109,7 @@ def _methods(drive: Mapping[str, Any]) -> list[tuple[str, _Method]]:
     planner, runs = str(drive["planner"]), [*drive["predictors"]]
     patterns = drive.get("runs")
     groups: Mapping[str, Sequence[str]] = patterns if isinstance(patterns, Mapping) else {}
-    given = {run: name for name, each in groups.items() for run in each}
+    given: dict[str, str] = {run: name for name, each in groups.items() for run in each}
     short = short_names(runs)
     first = runs[0] if runs else ""
     found = [
