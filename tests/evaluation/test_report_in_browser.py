@@ -92,7 +92,7 @@ def test_figures_are_drawn_and_can_be_saved(report: Path, browser: webdriver.Chr
     saved = browser.execute_async_script(
         """const done = arguments[0], found = [];
         download = (blob, name) => blob.arrayBuffer().then((bytes) => {
-          found.push([name, bytes.byteLength, new TextDecoder().decode(bytes.slice(0, 4000))]);
+          found.push([name, bytes.byteLength, new TextDecoder().decode(bytes.slice(0, 40000))]);
           if (found.length === 2) done(found);
         });
         document.querySelectorAll("[data-key=ranking] .save").forEach((button) => button.click());
