@@ -302,9 +302,17 @@ class ScenarioSet:
         Raises:
             AspEnvError: no scenario has this name; the message lists similar ones.
         """
+        return self[self.index_of(name)]
+
+    def index_of(self, name: str) -> int:
+        """The row of the scenario with a name.
+
+        Raises:
+            AspEnvError: no scenario has this name; the message lists similar ones.
+        """
         names = [each.name for each in self]
         if name in names:
-            return self[names.index(name)]
+            return names.index(name)
         near = difflib.get_close_matches(name, names, n=3, cutoff=0.0)
         raise AspEnvError(
             f"unknown scenario {name!r}: {len(self)} are known, such as {', '.join(near) or 'none'}"

@@ -52,7 +52,8 @@ def choose_scenarios(
     Args:
         recordings: the recordings.
         selection: a `ScenarioFilter` as text, or the path of a file written by `save_scenarios`,
-            which ends in `.json`; empty for everything that `find_scenarios` finds.
+            which ends in `.json`, or `FILE.json#NAME` for one scenario of a file; empty for
+            everything that `find_scenarios` finds.
         dt_s: seconds per tick.
         history: number of ticks of history before each start.
         allowed: of each recording, a mask of the ticks that scenarios and histories may use.
@@ -62,8 +63,12 @@ def choose_scenarios(
             other ticks than those allowed.
         DataError: the file cannot be read, or belongs to other recordings.
     """
-    if selection.strip().endswith(SUFFIX):
-        scenarios = load_scenarios(Path(selection.strip()), recordings, dt_s=dt_s, history=history)
+    path, is_one, name = selection.strip().partition(SUFFIX + "#")
+    path += SUFFIX if is_one else ""
+    if path.endswith(SUFFIX):
+        scenarios = load_scenarios(Path(path), recordings, dt_s=dt_s, history=history)
+        if is_one:
+            scenarios = scenarios.select(np.array([scenarios.index_of(name)]))
         if allowed is not None:
             _check_allowed(scenarios, allowed, selection)
         return scenarios
