@@ -8,7 +8,7 @@ OLDEST_GYMNASIUM := $(shell sed -n 's/.*"gymnasium>=\([0-9.]*\)".*/\1/p' pyproje
 OLDEST_TESTS := tests/envs/test_checkers.py tests/envs/test_vector_contract.py \
 	tests/envs/test_observation_ids.py tests/envs/test_constructors.py
 
-.PHONY: demo test test-oldest check clean
+.PHONY: demo test test-oldest check soak clean
 
 demo: $(INSTALLED)
 	$(BIN)/asp-env demo --out demo
@@ -25,6 +25,10 @@ check: $(INSTALLED)
 	$(BIN)/ruff format --check .
 	$(BIN)/basedpyright
 	$(BIN)/pytest -n 2 --dist worksteal
+
+# An hour: memory, open files, threads and processes stay flat. Writes soak/soak.csv and soak/soak.png.
+soak: $(INSTALLED)
+	$(BIN)/python -m tests.benchmarks.soak
 
 $(INSTALLED): pyproject.toml constraints.txt
 	test -d .venv || $(PYTHON) -m venv .venv
@@ -43,4 +47,4 @@ $(OLDEST)/.installed: $(INSTALLED)
 	touch $@
 
 clean:
-	rm -rf .venv demo build dist *.egg-info .pytest_cache .ruff_cache .hypothesis
+	rm -rf .venv demo build dist *.egg-info .pytest_cache .ruff_cache .hypothesis soak

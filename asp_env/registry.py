@@ -19,12 +19,20 @@ The groups are:
 """
 
 import re
+import tomllib
 from collections import Counter
 from functools import cache
-from importlib.metadata import EntryPoint, entry_points, requires
+from importlib.metadata import (
+    EntryPoint,
+    PackageNotFoundError,
+    distribution,
+    entry_points,
+    requires,
+)
+from pathlib import Path
 from typing import Any, Literal
 
-from asp_env.errors import AspEnvError, unknown_name
+from asp_env.errors import AspEnvError, StaleInstallError, unknown_name
 
 _PACKAGE_OF_MODULE = {"pygame": "pygame-ce", "sumolib": "eclipse-sumo", "traci": "eclipse-sumo"}
 """Packages that have other names than their modules."""
@@ -54,9 +62,12 @@ def find(group: Group, name: str) -> Any:
     Raises:
         AspEnvError: the name is unknown (the message lists all names), a package is missing, or
             the object cannot be imported.
+        StaleInstallError: the name is one of this package, but not of its metadata.
     """
     plugs, kind = _plugs(group), group.rstrip("s")
-    if name not in plugs:
+    if not isinstance(name, str) or name not in plugs:
+        if name in _declared(group):
+            raise _stale_install(kind, name)
         raise unknown_name(kind, name, plugs)
     try:
         return plugs[name].load()
@@ -80,6 +91,34 @@ def package(group: Group, name: str) -> str | None:
     """The top-level package of the object that is registered under a name, None if none is."""
     point = _plugs(group).get(name)
     return None if point is None else point.module.partition(".")[0]
+
+
+@cache
+def _declared(group: Group) -> frozenset[str]:
+    """The names in the project file of a checkout, which are registered when it is installed."""
+    project = Path(__file__).parents[1] / "pyproject.toml"
+    try:
+        tables = tomllib.loads(project.read_text(encoding="utf-8"))["project"]
+        if tables["name"] == "asp-env":
+            return frozenset(tables["entry-points"][f"asp_env.{group}"])
+    except (OSError, ValueError, KeyError, TypeError):
+        pass
+    return frozenset()
+
+
+def _stale_install(kind: str, name: str) -> StaleInstallError:
+    root = Path(__file__).parents[1]
+    install = f"python -m pip install -e '{root}'"
+    try:
+        folder = Path(str(distribution("asp-env").locate_file("")))
+        found = sorted(folder.glob("asp_env*.egg-info"))
+    except PackageNotFoundError:
+        found = []
+    remedy = f"delete {found[0]} and run {install}" if found else f"run {install}"
+    return StaleInstallError(
+        f"{kind} {name!r} is part of this version of asp-env, but not of the metadata that were "
+        f"installed for it, which are of an earlier version: {remedy}"
+    )
 
 
 def _requirement_with(module: str) -> str:

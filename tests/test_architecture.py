@@ -13,10 +13,11 @@ import pytest
 ROOT = Path(__file__).parents[1]
 PACKAGES = ("asp_env", "predictors", "scenarios", "policies")
 
-ON_ALL = {"errors", "registry", "geometry", "files", "workers", "compiled"}
+ON_ALL = {"arguments", "errors", "registry", "geometry", "files", "workers", "compiled"}
 FOR_PREDICTORS = {"views", "metrics", "data", "dynamics"} | ON_ALL
 ARROWS = {
     "__init__": {"envs", "planning", "data", "dynamics", "errors"},
+    "arguments": {"errors"},
     "errors": set[str](),
     "registry": {"errors"},
     "geometry": {"errors", "compiled"},

@@ -8,6 +8,7 @@ may fill the cache at the same time; a file that is damaged or has another stamp
 
 import hashlib
 import json
+import logging
 import os
 import zlib
 from collections.abc import Callable, Iterable, Mapping, Sequence
@@ -19,8 +20,12 @@ import numpy as np
 from asp_env.errors import AspEnvError, DataError
 from asp_env.files import atomic_file, atomic_folder, remove_stale
 
-FORMAT = 8
+FORMAT = 9
 """Version of the readers. Raise it whenever a reader gives other results for the same files."""
+
+_logger = logging.getLogger("asp_env")
+_noted: set[str] = set()
+"""Reasons that have been logged."""
 
 _MAGIC = b"asp-env1"
 _CHECKED = len(_MAGIC) + 4
@@ -51,6 +56,20 @@ def cache_folder() -> Path:
     raise DataError(
         f"cache folder {folder}: {reason}; set ASP_ENV_CACHE to a folder that can be written to"
     )
+
+
+def note_uncached(error: DataError | OSError, path: Path | None = None) -> None:
+    """Logs in one line, once per process and reason, that results are not cached.
+
+    Args:
+        error: why not.
+        path: the file that cannot be written, if the error does not name it.
+    """
+    reason = str(error) if isinstance(error, DataError) else error.strerror or str(error)
+    if reason not in _noted:
+        _noted.add(reason)
+        where = "" if path is None else f"{path}: "
+        _logger.warning("asp-env: results are not cached: %s%s", where, reason)
 
 
 def get_or_create(group: str, name: str, make: Callable[[Path], None]) -> Path:

@@ -13,6 +13,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
+from asp_env import arguments
 from asp_env.data.classes import AgentClass
 from asp_env.data.scenarios.scenario import Scenario
 from asp_env.errors import DataError
@@ -82,7 +83,7 @@ class Rollout:
     """Which events of `event_names` occur at each tick."""
     event_names: tuple[str, ...]
 
-    def save(self, path: Path) -> None:
+    def save(self, path: str | Path) -> None:
         """Writes one compressed `.npz`, atomically."""
         header = {
             "format": FORMAT,
@@ -96,16 +97,17 @@ class Rollout:
             if isinstance(value := getattr(self, field.name), np.ndarray)
         }
         text = np.frombuffer(json.dumps(header).encode(), dtype=np.uint8)
-        with atomic_file(path) as partial, partial.open("wb") as file:
+        with atomic_file(arguments.path("rollout", path)) as partial, partial.open("wb") as file:
             np.savez_compressed(file, header=text, **arrays)
 
     @classmethod
-    def load(cls, path: Path) -> "Rollout":
+    def load(cls, path: str | Path) -> "Rollout":
         """Reads a file written by `save`.
 
         Raises:
             DataError: the file is missing, damaged, or of another format version.
         """
+        path = arguments.path("rollout", path)
         try:
             with path.open("rb") as raw, np.load(raw, allow_pickle=False) as file:
                 arrays = {name: file[name] for name in file.files}

@@ -13,6 +13,7 @@ from typing import Any
 from rich.console import Console
 
 from asp_env import registry
+from asp_env.data.scenarios.selection import save_scenarios
 from asp_env.errors import AspEnvError
 from asp_env.evaluation.closed_loop.drive import ClosedLoopResult, Drive, drive, save_rollouts
 from asp_env.evaluation.closed_loop.scenario_table import write_scenario_table
@@ -154,6 +155,7 @@ def _show(
             **dict(zip(("open_loop", "closed_loop"), manifests, strict=False)),
         )
         if closed_loop is not None:
+            save_scenarios(folder / "scenarios.json", closed_loop.scenarios, closed_loop.recordings)
             write_scenario_table(folder, [closed_loop.driven])
             save_rollouts(folder, closed_loop)
         write_report(

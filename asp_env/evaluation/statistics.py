@@ -27,10 +27,11 @@ two-sided test at 5 % finds with a probability of 80 %, since 1.96 + 0.84 = 2.8.
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from functools import lru_cache
 
 import numpy as np
 from jaxtyping import Float, Shaped
+
+from asp_env.data.bounded_cache import BoundedCache
 
 RESAMPLES = 2000
 """Number of bootstrap resamples. Chosen by hand."""
@@ -327,20 +328,30 @@ def samples_needed(value: float, mde: float, n: int) -> int | None:
     return None if value == 0.0 else math.ceil(n * (mde / value) ** 2)
 
 
-@lru_cache(maxsize=64)
+_resamples = BoundedCache[np.ndarray](64 * 2**20)
+"""Chosen by hand: comparisons have many subsets of different numbers of recordings; those of 40
+recordings have 0.6 MB."""
+
+
 def _resample_counts(groups: int) -> Float[np.ndarray, "resamples groups"]:
     """How often each resample contains each group; the same for every call."""
-    rng = np.random.default_rng(0)
-    counts = rng.multinomial(groups, np.full(groups, 1 / groups), RESAMPLES).astype(float)
-    counts.flags.writeable = False
-    return counts
+
+    def make() -> np.ndarray:
+        rng = np.random.default_rng(0)
+        counts = rng.multinomial(groups, np.full(groups, 1 / groups), RESAMPLES).astype(float)
+        counts.flags.writeable = False
+        return counts
+
+    return _resamples.get(groups, make)
 
 
-@lru_cache(maxsize=64)
 def _run_shares(runs: int, stream: int) -> Float[np.ndarray, "resamples runs"]:
     """Share of each of R > 1 runs among the R - 1 runs of each resample."""
-    rng = np.random.default_rng((1, stream))
-    counts = rng.multinomial(runs - 1, np.full(runs, 1 / runs), RESAMPLES)
-    shares = counts / (runs - 1)
-    shares.flags.writeable = False
-    return shares
+
+    def make() -> np.ndarray:
+        rng = np.random.default_rng((1, stream))
+        shares = rng.multinomial(runs - 1, np.full(runs, 1 / runs), RESAMPLES) / (runs - 1)
+        shares.flags.writeable = False
+        return shares
+
+    return _resamples.get((runs, stream), make)

@@ -7,6 +7,7 @@ import numpy as np
 from jaxtyping import Float
 
 from asp_env import registry
+from asp_env.arguments import text
 from asp_env.data.predictor import Forecast, Predictor
 from asp_env.data.scene import Scene
 from asp_env.errors import AspEnvError
@@ -125,7 +126,7 @@ def load_planner(name: str) -> Planner:
     Raises:
         AspEnvError: the name is unknown, or the planner rejects the argument.
     """
-    kind, colon, argument = name.partition(":")
+    kind, colon, argument = text("planner", name).partition(":")
     factory = registry.find("planners", kind)
     from_name = getattr(factory, "from_name", None)
     if from_name is not None:

@@ -12,7 +12,7 @@ from functools import partial
 from typing import Any, final
 
 import numpy as np
-from jaxtyping import Int
+from jaxtyping import Float, Int
 
 from asp_env.data.predictor import Predictor
 from asp_env.data.recording import ticks
@@ -37,7 +37,11 @@ EPISODES_AT_ONCE = 16
 processes finish at about the same time, and larger ones are no faster."""
 
 SAVED_ROLLOUTS = 6
-"""Number of scenarios whose rollouts are saved, for every method."""
+"""Number of the worst scenarios, whose rollouts are saved for every method."""
+
+TELLING_ROLLOUTS = 3
+"""Number of scenarios with the largest gains over the reference whose rollouts are saved as well,
+and of those with the largest losses."""
 
 EXPERT = "expert"
 """Name of the planner that replays the logged ego; the reference of every comparison."""
@@ -245,27 +249,41 @@ def work_units(scenarios: ScenarioSet, methods: int) -> list[WorkUnit]:
 
 @final
 class ComparisonScores:
-    """Scores of all methods in all scenarios, and the rollouts of the worst scenarios.
+    """Scores of all methods in all scenarios, and the rollouts of the worst and most telling ones.
 
     A method of several training runs counts once for each of them. The worst scenarios have the
     lowest mean score over the methods. The expert counts only if it
-    is the only method. Rules without a score use the product of three metrics instead: no
-    collision, on road and progress.
+    is the only method. The most telling scenarios are those in which one of the methods under test
+    gains most over the reference, and those in which one loses most. Rules without a score use the
+    product of three metrics instead: no collision, on road and progress.
     """
 
-    def __init__(self, methods: int, rules: Rules) -> None:
+    def __init__(
+        self,
+        methods: int,
+        rules: Rules,
+        *,
+        under_test: Sequence[int] = (),
+        reference: int | None = None,
+    ) -> None:
         """Creates an empty collection.
 
         Args:
             methods: number of methods.
             rules: the driving rules.
+            under_test: indices of the methods that are compared with the reference.
+            reference: index of the reference; None for no most telling scenarios.
         """
         self._methods = methods
+        self._under_test = [*under_test]
+        self._reference = reference
+        self._gains: list[_Ranked] = []
+        self._losses: list[_Ranked] = []
         self._ranked_by = ("score",) if rules.weights else ("no collision", "on road", "progress")
         self._incomplete: dict[int, dict[int, EpisodeScores]] = {}
         self._numbers: list[Int[np.ndarray, " b"]] = []
         self._complete: list[Sequence[EpisodeScores]] = []
-        self._worst: list[tuple[float, int, tuple[Rollout, ...]]] = []
+        self._worst: list[_Ranked] = []
 
     def add(self, unit: WorkUnit, scores: EpisodeScores) -> None:
         """Adds the scores of a work unit; units may come in any order."""
@@ -279,26 +297,40 @@ class ComparisonScores:
     def _complete_unit(
         self, numbers: Int[np.ndarray, " b"], by_method: Sequence[EpisodeScores]
     ) -> None:
-        """Stores the scores of all methods in the same scenarios, and the worst rollouts."""
-        products = [
-            np.prod([scores.metrics[name].value for name in self._ranked_by], axis=0)
-            for scores in by_method[1:] or by_method
-        ]
-        means = np.mean(products, axis=0).tolist()
-        rollouts = zip(*(scores.rollouts for scores in by_method), strict=True)
-        ranked = zip(means, numbers.tolist(), rollouts, strict=True)
-        worst = sorted([*self._worst, *ranked], key=lambda each: each[:2])
-        self._worst = worst[:SAVED_ROLLOUTS]
+        """Stores the scores of all methods in the same scenarios, and the rollouts to be saved."""
+        products = np.stack(
+            [
+                np.prod([scores.metrics[name].value for name in self._ranked_by], axis=0)
+                for scores in by_method
+            ]
+        )
+        rollouts = [*zip(*(scores.rollouts for scores in by_method), strict=True)]
+        means = products[min(1, self._methods - 1) :].mean(axis=0)
+        self._worst = _lowest([*self._worst, *_ranked(means, numbers, rollouts)], SAVED_ROLLOUTS)
+        if self._reference is not None and self._under_test:
+            gains = products[self._under_test] - products[self._reference]
+            up = _ranked(-gains.max(axis=0), numbers, rollouts)
+            down = _ranked(gains.min(axis=0), numbers, rollouts)
+            self._gains = _lowest([*self._gains, *_below_zero(up)], TELLING_ROLLOUTS)
+            self._losses = _lowest([*self._losses, *_below_zero(down)], TELLING_ROLLOUTS)
         self._numbers.append(numbers)
         self._complete.append([dataclasses.replace(scores, rollouts=()) for scores in by_method])
 
     @property
-    def worst(self) -> list[int]:
-        """Indices of the scenarios whose rollouts are stored, the worst first."""
-        return [number for _, number, _ in self._worst]
+    def saved(self) -> list[int]:
+        """Indices of the scenarios whose rollouts are stored.
+
+        The worst are first, then those with the largest gains, then those with the largest losses.
+        """
+        return [*self._saved()]
+
+    def _saved(self) -> dict[int, tuple[Rollout, ...]]:
+        """The stored rollouts of all methods by the index of their scenario."""
+        ranked = (*self._worst, *self._gains, *self._losses)
+        return {number: rollouts for _, number, rollouts in ranked}
 
     def of(self, method: int) -> EpisodeScores:
-        """Scores of a method in all scenarios, in their order, with the rollouts of the worst."""
+        """Scores of a method in all scenarios, in their order, with the rollouts of `saved`."""
         order = np.argsort(np.concatenate(self._numbers))
         parts = [by_method[method] for by_method in self._complete]
         endings = [ending for part in parts for ending in part.endings]
@@ -313,5 +345,25 @@ class ComparisonScores:
             },
             endings=tuple(endings[i] for i in order.tolist()),
             faults=tuple(faults[i] for i in order.tolist()),
-            rollouts=tuple(rollouts[method] for _, _, rollouts in self._worst),
+            rollouts=tuple(rollouts[method] for rollouts in self._saved().values()),
         )
+
+
+_Ranked = tuple[float, int, tuple[Rollout, ...]]
+"""A value by which scenarios are ranked, the index of a scenario, its rollouts by method."""
+
+
+def _ranked(
+    values: Float[np.ndarray, " b"],
+    numbers: Int[np.ndarray, " b"],
+    rollouts: Sequence[tuple[Rollout, ...]],
+) -> list[_Ranked]:
+    return [*zip(values.tolist(), numbers.tolist(), rollouts, strict=True)]
+
+
+def _lowest(ranked: Sequence[_Ranked], count: int) -> list[_Ranked]:
+    return sorted(ranked, key=lambda each: each[:2])[:count]
+
+
+def _below_zero(ranked: Sequence[_Ranked]) -> list[_Ranked]:
+    return [each for each in ranked if each[0] < 0]
