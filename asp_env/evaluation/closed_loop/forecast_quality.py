@@ -7,11 +7,13 @@ targets near the ego, and each is defined where the whole horizon lies within th
 """
 
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 
 import numpy as np
 from jaxtyping import Bool, Float
 
 from asp_env.data.predictor import Forecast
+from asp_env.evaluation.results import Row
 from asp_env.metrics.forecast import (
     brier,
     inconsistency,
@@ -125,3 +127,34 @@ def _add(
     for name, each in found.items():
         np.add.at(sums[name], episode[each.valid], each.value[each.valid])
         np.add.at(numbers[name], episode[each.valid], 1)
+
+
+_OPEN_LOOP = {
+    "forecast ADE": ("ADE", "most-probable"),
+    "forecast FDE": ("FDE", "most-probable"),
+    "forecast minADE": ("ADE", "best-of-3"),
+    "forecast minFDE": ("FDE", "best-of-3"),
+}
+"""Names in open loop of errors that are measured while the expert is replayed."""
+
+
+def open_loop_rows(rows: Sequence[Row]) -> list[Row]:
+    """The rows of forecasts at logged states without latency, named as `asp-env evaluate` does.
+
+    Args:
+        rows: rows of the replayed expert with each predictor.
+    """
+    return [
+        replace(
+            row,
+            planner="",
+            traffic="",
+            latency_ticks=None,
+            rules="",
+            metric=_OPEN_LOOP[row.metric][0],
+            selection=_OPEN_LOOP[row.metric][1],
+            subset="moving",
+        )
+        for row in rows
+        if row.metric in _OPEN_LOOP and row.subset == "all" and not row.latency_ticks
+    ]

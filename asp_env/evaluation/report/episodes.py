@@ -108,7 +108,7 @@ def _methods(drive: Mapping[str, Any]) -> list[tuple[str, _Method]]:
     """The methods of a drive by their labels."""
     planner, runs = str(drive["planner"]), [*drive["predictors"]]
     patterns = drive.get("runs")
-    groups: Mapping[str, Sequence[str]] = patterns if isinstance(patterns, Mapping) else {}
+    groups: dict[str, Sequence[str]] = {**patterns} if isinstance(patterns, Mapping) else {}
     given: dict[str, str] = {run: name for name, each in groups.items() for run in each}
     short = short_names(runs)
     first = runs[0] if runs else ""

@@ -44,16 +44,19 @@ def ranking(results: Sequence[Result]) -> Payload | None:
     labels = _labels(results)
     reference = _reference(scores[0])
     note = metric_note(scores[0].metric)
+    ladders = [r for r in scores if rung(r.method.predictor) is not None]
+    planners = distinct(r.method.planner for r in ladders)
     rungs = [
         {"label": _rung_label(share), "value": _number(r.value, note.scale)}
-        for r in scores
-        if (share := rung(r.method.predictor)) is not None
+        for r in ladders
+        if r.method.planner == planners[0] and (share := rung(r.method.predictor)) is not None
     ]
     if reference == BASELINE and rungs:
         rungs.insert(0, {"label": _rung_label(0.0), "value": 0.0})
+    scale = f", over the ladder of {planners[0]}" if len(planners) > 1 else ""
     return {
         "kind": "rows",
-        "title": f"Score less that with {reference}",
+        "title": f"Score less that with {reference}{scale}",
         "axis": _axis(f"score less that with {reference}", note.unit),
         "rows": [_row(r, labels[r.method]) for r in scores],
         "rungs": rungs,

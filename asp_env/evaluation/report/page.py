@@ -120,6 +120,7 @@ def write_report(
     maps: Mapping[str, RoadMap] | None = None,
     examples: ForecastExamples | None = None,
     episodes: Sequence[Episode] | None = None,
+    answers: Mapping[str, Sequence[str]] | None = None,
 ) -> Path:
     """Writes `report.html` into a run folder.
 
@@ -133,9 +134,11 @@ def write_report(
         out: The run folder.
         title: Title of the page, plain text.
         lead: A sentence or two below the title, plain text.
-        maps: Road maps by the names of the rollouts' recordings.
+        maps: Road maps by the names of the rollouts' recordings; `DATA/RECORDING` for a recording
+            whose name occurs in several data.
         examples: Forecasts to draw over the map.
         episodes: The rollouts to show; by default those that `find_episodes` finds.
+        answers: Sentences that answer further questions, by question.
 
     Returns:
         The path of the page.
@@ -178,9 +181,10 @@ def write_report(
         saved={(each.label, each.path.stem) for each in episodes},
         names=_names(results),
         notes=_notes(results),
+        answers=answers or {},
         run=manifest,
         data=data,
-        sections=_sections(parts, data),
+        sections=_sections(parts, data, answers or {}),
     )
     path = out / "report.html"
     with atomic_file(path) as partial:
@@ -318,7 +322,9 @@ def _summary(parts: Sequence[Part], results: Results) -> Summary | None:
     )
 
 
-def _sections(parts: Sequence[Part], data: Mapping[str, Any]) -> dict[str, str]:
+def _sections(
+    parts: Sequence[Part], data: Mapping[str, Any], answers: Mapping[str, Sequence[str]]
+) -> dict[str, str]:
     """Headings of the sections that have something to show in any part, by their anchors."""
     sections = {
         "ranking": ("Ranking", any(p.comparison_tables or p.driving_tables for p in parts)),
@@ -326,6 +332,7 @@ def _sections(parts: Sequence[Part], data: Mapping[str, Any]) -> dict[str, str]:
         "examples": ("Example forecasts", data["pictures"]),
         "tags": ("What decides", any(p.has_tags for p in parts)),
         "drives": ("Drives", any(p.drives or "drives" in p.figures for p in parts)),
+        "questions": ("Questions", answers),
         "player": ("Player", data["drives"]),
         "metrics": ("Metrics", True),
         "manifest": ("Manifest", True),

@@ -228,7 +228,7 @@ def rollouts_payload(
 
     Args:
         episodes: The episodes.
-        road_maps: Road maps by the name of the recording.
+        road_maps: Road maps by the name of the recording, or by `DATA/RECORDING`.
         maps: The table that receives the maps.
         settings: The settings of the page; an episode has the index of its own.
 
@@ -239,6 +239,8 @@ def rollouts_payload(
     for episode in episodes:
         rollout = Rollout.load(episode.path)
         name = rollout.scenario.recording_name
+        own = f"{rollout.scenario.source}/{name}"
+        name = own if own in road_maps else name
         if name not in road_maps:
             known = ", ".join(sorted(road_maps)) or "none"
             raise DataError(

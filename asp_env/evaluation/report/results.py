@@ -9,7 +9,7 @@ from pathlib import Path, PurePath
 from typing import Literal
 
 from asp_env.errors import DataError
-from asp_env.evaluation.results import HEADROOM, ORACLE_SHARE, Row, difference_of
+from asp_env.evaluation.results import ANSWER, HEADROOM, ORACLE_SHARE, Row, difference_of
 from asp_env.evaluation.selection import split_name
 
 SELECTIONS = ("most-probable", "best-of-3", "")
@@ -164,7 +164,7 @@ class Results:
 
 
 def read_results(path: Path, *, privileged: Collection[str] = ()) -> Results:
-    """Reads `metrics.csv`.
+    """Reads `metrics.csv`, without rows that answer a question of a study.
 
     Args:
         path: The file. Names of columns in older files are understood.
@@ -184,7 +184,7 @@ def read_results(path: Path, *, privileged: Collection[str] = ()) -> Results:
     missing = [name for name in COLUMNS if name not in columns]
     if set(missing) - set(ADDED_COLUMNS):
         raise DataError(f"{path}: no column {missing[0]!r}, expected {', '.join(COLUMNS)}")
-    rows = [dict.fromkeys(missing, "") | row for row in rows]
+    rows = [dict.fromkeys(missing, "") | row for row in rows if row.get("subset") != ANSWER]
     return Results(
         open_loop=_results(path, [row for row in rows if not row["planner"]], privileged),
         driving=_results(path, [row for row in rows if row["planner"]], privileged),

@@ -27,6 +27,9 @@ from asp_env.planning.planner import load_planner
 from asp_env.sim.traffic.log import LogDriver
 from asp_env.sim.world import world_class
 
+BLIND = "blind"
+"""Name of the predictor that forecasts all agents far away, whose errors state nothing."""
+
 DELAYED = "delayed"
 """Name of the predictor that states what another one forecast some ticks ago."""
 
@@ -135,6 +138,7 @@ def _static_groups(settings: StudySettings, data: str, groups: Sequence[Group]) 
             and group.condition.latency_ticks == latency
             and group.uses_forecasts
             for name, each in group.runs.items()
+            if name != BLIND
         }
         if runs:
             found.append(_make_group(settings, condition, EXPERT, runs))

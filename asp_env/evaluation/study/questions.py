@@ -16,7 +16,7 @@ from asp_env.evaluation.closed_loop.scenario_table import DrivenScenarios
 from asp_env.evaluation.closed_loop.summary import MethodScores
 from asp_env.evaluation.ladder import ORACLE
 from asp_env.evaluation.rank_agreement import MetricColumn, RankAgreement, rank_agreement
-from asp_env.evaluation.results import SCORE, Row, difference_name
+from asp_env.evaluation.results import ANSWER, SCORE, Row, difference_name
 from asp_env.evaluation.statistics import Difference, difference, interval, resampled_means
 
 LOGGED = "logged states"
@@ -64,6 +64,7 @@ class Driven:
             traffic=self.place.traffic,
             latency_ticks=self.place.latency_ticks,
             runs=len(self.method.runs) if self.method.predictor else None,
+            subset=ANSWER,
             metric=metric,
             value=estimate.value,
             low=estimate.low,

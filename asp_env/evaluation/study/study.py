@@ -3,6 +3,7 @@
 import fcntl
 import json
 import os
+import shlex
 from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
@@ -19,7 +20,7 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, T
 from asp_env.data.scenarios.selection import save_scenarios
 from asp_env.errors import AspEnvError
 from asp_env.evaluation.closed_loop.comparison import EXPERT, EpisodeScores, Methods
-from asp_env.evaluation.closed_loop.forecast_quality import FORECAST_METRICS
+from asp_env.evaluation.closed_loop.forecast_quality import open_loop_rows
 from asp_env.evaluation.closed_loop.scenario_table import DrivenScenarios, write_scenario_table
 from asp_env.evaluation.closed_loop.summary import (
     Comparison,
@@ -27,7 +28,8 @@ from asp_env.evaluation.closed_loop.summary import (
     comparison_rows,
     scores_by_method,
 )
-from asp_env.evaluation.report import check_report_possible, write_report
+from asp_env.evaluation.ladder import BASELINE, is_under_test
+from asp_env.evaluation.report import Episode, Setting, check_report_possible, write_report
 from asp_env.evaluation.results import SCORE, Row, write_manifest, write_metrics
 from asp_env.evaluation.selection import PartChoice
 from asp_env.evaluation.study.cells import CellFolder
@@ -55,8 +57,9 @@ IN_THIS_PROCESS: DriveTasks = partial(drive_tasks, jobs=1)
 SETTINGS = "study.json"
 """File with the settings of the last study in a folder."""
 
-SHOWN_SCENARIOS = 6
-"""Number of scenarios of each DATA whose rollouts are stored, for every method: the worst."""
+WORST, TELLING = 6, 3
+"""Numbers of scenarios of each DATA and planner whose drives are shown: those with the lowest mean
+score, and those with the largest gains and losses over constant velocity."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -155,11 +158,35 @@ class StudyResult:
     """Names of the planners and predictors that use the recorded future."""
     predictors: Mapping[str, Mapping[str, str]]
     """Metadata of the predictors by the name of their run."""
-    rollout_tasks: list[tuple[str, Task]]
-    """Cells with rollouts to show, with the label of their method."""
+    shown: list["ShownCell"]
+    """Cells with drives to show."""
     cells: int
     """Number of different cells."""
     groups: list[Group]
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class ShownCell:
+    """A cell with drives to show."""
+
+    task: Task
+    label: str
+    """Name of the method and run, for the player."""
+    planner: str
+    predictor: str
+    """Name of the predictor as given; empty if the planner uses no forecasts."""
+    run: str
+    condition: Condition
+
+    def command(self, settings: StudySettings, scenario: str, scenarios_file: str) -> str:
+        """The command that drives one of the scenarios again; `OUT` is the folder of the study."""
+        condition = self.condition
+        words = ["asp-env", "drive", condition.data, "--planner", self.planner]
+        words += ["--predictors", self.run] if self.run else []
+        words += ["--scenarios", f"OUT/{scenarios_file}#{scenario}", "--part", "all"]
+        words += ["--traffic", condition.traffic, "--rules", settings.rules]
+        words += ["--horizon", f"{settings.horizon_s:g}", "--dt", f"{settings.dt_s:g}"]
+        return shlex.join([*words, "--out", "episode"])
 
 
 def run_study(
@@ -208,7 +235,7 @@ def _summarized(
     driven: list[DrivenScenarios] = []
     privileged = [EXPERT]
     predictors: dict[str, Mapping[str, str]] = {}
-    tasks: list[tuple[str, Task]] = []
+    shown: list[ShownCell] = []
     with_expert: set[Condition] = set()
     for number, group in enumerate(groups):
         methods, condition = group.methods(), group.condition
@@ -225,7 +252,7 @@ def _summarized(
             comparison = replace(comparison, compared=[], reference=None, replayed=False)
         found = comparison_rows(comparison)
         if group.is_static:
-            found = [row for row in found if row.metric in FORECAST_METRICS]
+            found = open_loop_rows(found)
         elif condition in with_expert:  # it drives beside every planner
             by_method = [each for each in by_method if each.planner != EXPERT]
             found = [row for row in found if row.planner != EXPERT]
@@ -247,7 +274,8 @@ def _summarized(
             if methods.predictors[runs[0]].privileged and name not in privileged:
                 privileged.append(name)
         if condition == _shown_condition(groups, condition.data) and not group.is_static:
-            tasks += _rollout_tasks(own, methods, by_run, first=number == _first(groups, condition))
+            first = number == _first(groups, condition)
+            shown += _shown_cells(own, group, methods, by_run, with_expert=first)
     found_answers = answers(driven, privileged)
     rows += [
         replace(row, horizon_s=settings.horizon_s, rules=find_rules(settings.rules).label)
@@ -262,7 +290,7 @@ def _summarized(
         data_sets=data_sets,
         privileged=privileged,
         predictors=predictors,
-        rollout_tasks=tasks,
+        shown=shown,
         cells=len({cell.key for cell in cells}),
         groups=groups,
     )
@@ -331,19 +359,51 @@ def _comparison(
     )
 
 
-def _rollout_tasks(
-    cells: Sequence[Cell], methods: Methods, by_run: Sequence[EpisodeScores], *, first: bool
-) -> list[tuple[str, Task]]:
-    """Cells of the scenarios with the lowest mean score over all methods but the expert."""
-    name = SCORE if SCORE in by_run[0].metrics else "progress"
-    means = np.mean([each.metrics[name].value for each in by_run[1:] or by_run], axis=0)
-    worst = set(np.argsort(means, kind="stable")[:SHOWN_SCENARIOS].tolist())
-    tasks = []
+def _shown_cells(
+    cells: Sequence[Cell],
+    group: Group,
+    methods: Methods,
+    by_run: Sequence[EpisodeScores],
+    *,
+    with_expert: bool,
+) -> list["ShownCell"]:
+    """Cells of the scenarios whose drives are shown, for every method of a group.
+
+    They are those with the lowest mean score over all methods but the expert, and those in which
+    a method under test gains most over the reference, or loses most.
+    """
+    if SCORE not in by_run[0].metrics:
+        return []
+    scores = np.stack([each.metrics[SCORE].value for each in by_run])
+    chosen = [*np.argsort(scores[min(1, len(scores) - 1) :].mean(axis=0), kind="stable")][:WORST]
+    names = [method.predictor_name for method in methods.all]
+    tested = [
+        number
+        for number, method in enumerate(methods.all)
+        if names[number] and is_under_test(names[number], privileged=method.predictor.privileged)
+    ]
+    if BASELINE in names and tested:
+        gains = scores[tested] - scores[names.index(BASELINE)]
+        best, worst = gains.max(axis=0), gains.min(axis=0)
+        chosen += [i for i in np.argsort(-best, kind="stable")[:TELLING] if best[i] > 0]
+        chosen += [i for i in np.argsort(worst, kind="stable")[:TELLING] if worst[i] < 0]
+    shown = {int(number) for number in chosen}
+    found = []
     for cell in cells:
-        at = tuple(i for i, number in enumerate(cell.unit.numbers.tolist()) if number in worst)
-        if at and (first or cell.unit.method > 0):
-            tasks.append((methods.labels[cell.unit.method], Task(cell=cell, rollouts=at)))
-    return tasks
+        at = tuple(i for i, number in enumerate(cell.unit.numbers.tolist()) if number in shown)
+        if at and (with_expert or cell.unit.method > 0):
+            method = methods.all[cell.unit.method]
+            found.append(
+                ShownCell(
+                    task=Task(cell=cell, rollouts=at),
+                    label=methods.labels[cell.unit.method],
+                    planner=method.planner.name,
+                    predictor=method.predictor_name,
+                    run=method.run,
+                    condition=group.condition,
+                )
+            )
+    return found
 
 
 def write_study(result: StudyResult, out: Path, *, drive: DriveTasks = IN_THIS_PROCESS) -> None:
@@ -358,7 +418,7 @@ def write_study(result: StudyResult, out: Path, *, drive: DriveTasks = IN_THIS_P
         AspEnvError: a process ended repeatedly, or a package is missing.
     """
     settings = result.settings
-    _write_rollouts(result, out, drive)
+    episodes = _write_rollouts(result, out, drive)
     write_metrics(out, result.rows)
     write_scenario_table(out, result.driven)
     write_manifest(
@@ -383,41 +443,77 @@ def write_study(result: StudyResult, out: Path, *, drive: DriveTasks = IN_THIS_P
         cells=result.cells,
         intervals="95 %, bootstrap over recordings and, with several, over training runs",
     )
-    for number, each in enumerate(result.data_sets.values()):
-        name = "scenarios.json" if len(result.data_sets) == 1 else f"scenarios-{number + 1}.json"
-        save_scenarios(out / name, each.scenarios, each.recordings)
-    shown = {
-        scenario.recording_name: (data, scenario.recording)
-        for data, each in result.data_sets.items()
+    for name, each in result.data_sets.items():
+        save_scenarios(out / _scenarios_file(result, name), each.scenarios, each.recordings)
+    maps = {
+        f"{name}/{scenario.recording_name}": each.recordings[scenario.recording].road_map
+        for name, each in result.data_sets.items()
         for scenario in each.scenarios
     }
-    maps = {
-        name: result.data_sets[data].recordings[recording].road_map
-        for name, (data, recording) in shown.items()
-    }
-    write_report(out, title=f"Study on {', '.join(settings.data)}", maps=maps)
+    write_report(
+        out,
+        title=f"Study on {', '.join(settings.data)}",
+        maps=maps,
+        episodes=episodes,
+        answers={each.question: each.sentences for each in result.answers if each.sentences},
+    )
     write_text(out / SETTINGS, json.dumps(settings.as_json(), indent=1) + "\n")
 
 
-def _write_rollouts(result: StudyResult, out: Path, drive: DriveTasks) -> None:
-    """Drives the scenarios that are shown once more, unless their rollouts are stored."""
+def _scenarios_file(result: StudyResult, data: str) -> str:
+    """Name of the file with the scenarios of DATA."""
+    if len(result.data_sets) == 1:
+        return "scenarios.json"
+    return f"scenarios-{[*result.data_sets].index(data) + 1}.json"
+
+
+def _write_rollouts(result: StudyResult, out: Path, drive: DriveTasks) -> list[Episode]:
+    """Drives the scenarios that are shown once more, unless their rollouts are stored.
+
+    Returns:
+        All episodes that the page shows.
+    """
+    episodes: list[Episode] = []
     wanted: dict[str, list[tuple[Path, int]]] = {}
     tasks: dict[str, Task] = {}
-    for label, task in result.rollout_tasks:
+    for shown in result.shown:
+        task, condition = shown.task, shown.condition
+        place = str([*result.data_sets].index(condition.data) + 1)
+        folder = out / "rollouts" / (place if len(result.data_sets) > 1 else "") / shown.label
         for position in task.rollouts:
             name = task.cell.unit.scenarios[position].name
-            path = out / "rollouts" / label / f"{name}.npz"
+            path = folder / f"{name}.npz"
             stamp = path.with_suffix(".key")
             if not path.exists() or not stamp.exists() or stamp.read_text() != task.cell.key:
                 wanted.setdefault(task.cell.key, []).append((path, position))
                 tasks[task.cell.key] = task
-    if not tasks:
-        return
-    for task, scores in drive(result.groups, result.settings.dt_s, [*tasks.values()]):
-        for path, position in wanted[task.cell.key]:
-            path.parent.mkdir(parents=True, exist_ok=True)
-            scores.rollouts[task.rollouts.index(position)].save(path)
-            write_text(path.with_suffix(".key"), task.cell.key)
+            episodes.append(
+                Episode(
+                    path=path,
+                    label=shown.label,
+                    planner=shown.planner,
+                    predictor=shown.predictor,
+                    setting=Setting(
+                        data=condition.data,
+                        traffic=condition.traffic,
+                        latency_ticks=str(condition.latency_ticks),
+                    ),
+                    command=shown.command(
+                        result.settings, name, _scenarios_file(result, condition.data)
+                    ),
+                )
+            )
+    if tasks:
+        for task, scores in drive(result.groups, result.settings.dt_s, [*tasks.values()]):
+            for path, position in wanted[task.cell.key]:
+                path.parent.mkdir(parents=True, exist_ok=True)
+                scores.rollouts[task.rollouts.index(position)].save(path)
+                write_text(path.with_suffix(".key"), task.cell.key)
+    kept = {path for each in episodes for path in (each.path, each.path.with_suffix(".key"))}
+    for path in (out / "rollouts").rglob("*.*"):
+        if path.is_file() and path not in kept:
+            path.unlink()  # of a study with other options
+    return episodes
 
 
 def _fault_counts(driven: Sequence[DrivenScenarios]) -> dict[str, dict[str, int]]:

@@ -107,7 +107,7 @@ def test_only_what_depends_on_a_changed_option_is_driven(data: str, tmp_path: Pa
         counted.study(settings(data, **changes), tmp_path)
     # 2 traffics of (expert, turn rate, constant velocity, oracle, idm), and 3 at logged states;
     # blind; 3 predictors that are late; everything by other rules.
-    assert counted.counts == [2 * 5 + 3, 0, 2 + 1, 0, 2 * 3 + 3, 2 * 5 + 3]
+    assert counted.counts == [2 * 5 + 3, 0, 2, 0, 2 * 3 + 3, 2 * 5 + 3]
 
 
 def test_the_same_bytes_by_any_number_of_processes_and_after_a_kill(
