@@ -119,7 +119,7 @@ def _methods(drive: Mapping[str, Any]) -> list[tuple[str, _Method]]:
     found += [
         (
             f"{planner} + {short[run]}",
-            _Method(planner=planner, predictor=given.get(run, run), run=run, drive=drive),
+            _Method(planner=planner, predictor=given.get(run) or run, run=run, drive=drive),
         )
         for run in runs
     ]
