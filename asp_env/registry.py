@@ -29,6 +29,8 @@ from asp_env.errors import AspEnvError, unknown_name
 _PACKAGE_OF_MODULE = {"pygame": "pygame-ce", "sumolib": "eclipse-sumo", "traci": "eclipse-sumo"}
 """Packages that have other names than their modules."""
 
+_OWN = "asp-env"
+
 Group = Literal[
     "predictors", "planners", "drivers", "readers", "sources", "worlds", "views", "commands"
 ]
@@ -44,6 +46,19 @@ def names(group: Group) -> tuple[str, ...]:
     return tuple(sorted(_plugs(group)))
 
 
+def package_of(group: Group, name: str) -> str | None:
+    """Name and version of the package that registers a name, such as `asp-env 0.1.0`."""
+    plug = _plugs(group).get(name)
+    return None if plug is None or plug.dist is None else f"{plug.dist.name} {plug.dist.version}"
+
+
+def described(group: Group, name: str) -> str:
+    """A registered plug in messages: `reader 'sind'`, or `reader 'x' of the package other 1.0`."""
+    package = package_of(group, name)
+    origin = "" if package is None or package.split()[0] == _OWN else f" of the package {package}"
+    return f"{group.rstrip('s')} {name!r}{origin}"
+
+
 def find(group: Group, name: str) -> Any:
     """Imports and returns the object registered under a name.
 
@@ -56,6 +71,11 @@ def find(group: Group, name: str) -> Any:
             the object cannot be imported.
     """
     plugs, kind = _plugs(group), group.rstrip("s")
+    if not plugs and not names("commands"):
+        raise AspEnvError(
+            f"{kind} {name!r} is not registered, since asp-env is imported from a folder that is "
+            "not installed: pip install -e FOLDER"
+        )
     if name not in plugs:
         raise unknown_name(kind, name, plugs)
     try:
@@ -66,13 +86,13 @@ def find(group: Group, name: str) -> Any:
         missing = error.name if isinstance(error, ModuleNotFoundError) else None
         if missing is not None and not _is_within(plugs[name].module, missing):
             raise AspEnvError(
-                f"{kind} {name!r} needs the package {missing!r}, which is not "
+                f"{described(group, name)} needs the package {missing!r}, which is not "
                 f"installed: pip install {_requirement_with(missing)}"
             ) from error
         reason = " ".join(f"{type(error).__name__}: {error}".split())
         raise AspEnvError(
-            f"{kind} {name!r} cannot be imported from its entry point {plugs[name].value} "
-            f"({reason}): repair the package that registers it, or uninstall it"
+            f"{described(group, name)} cannot be imported from its entry point "
+            f"{plugs[name].value} ({reason}): repair the package that registers it, or uninstall it"
         ) from error
 
 
@@ -81,9 +101,9 @@ def _requirement_with(module: str) -> str:
     package = _PACKAGE_OF_MODULE.get(module, module).replace("_", "-")
     sizes: Counter[str] = Counter()
     having = set()
-    for requirement in requires("asp-env") or ():
+    for requirement in requires(_OWN) or ():
         found = re.match(r"([\w.-]+).*extra == [\"'](.+)[\"']", requirement)
-        if found and found[1] != "asp-env":  # an extra of this package is that extra's own entry
+        if found and found[1] != _OWN:  # an extra of this package is that extra's own entry
             sizes[found[2]] += 1
             if found[1] == package:
                 having.add(found[2])

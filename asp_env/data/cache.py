@@ -38,9 +38,7 @@ def cache_folder() -> Path:
     Raises:
         DataError: the folder cannot be created or written to.
     """
-    named = os.environ.get("ASP_ENV_CACHE")
-    base = os.environ.get("XDG_CACHE_HOME") or os.path.expanduser("~/.cache")
-    folder = Path(named) if named else Path(base) / "asp-env"
+    folder, _ = cache_location()
     reason = "no permission to write"
     try:
         folder.mkdir(parents=True, exist_ok=True)
@@ -51,6 +49,14 @@ def cache_folder() -> Path:
     raise DataError(
         f"cache folder {folder}: {reason}; set ASP_ENV_CACHE to a folder that can be written to"
     )
+
+
+def cache_location() -> tuple[Path, str]:
+    """The folder of derived data, which may not exist, and what its place follows from."""
+    for variable, below in (("ASP_ENV_CACHE", ""), ("XDG_CACHE_HOME", "asp-env")):
+        if base := os.environ.get(variable):
+            return Path(base) / below, f"${variable}"
+    return Path(os.path.expanduser("~/.cache")) / "asp-env", "the default"
 
 
 def get_or_create(group: str, name: str, make: Callable[[Path], None]) -> Path:
