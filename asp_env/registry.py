@@ -18,11 +18,14 @@ The groups are:
   command of a group: `asp-env rl train`.
 """
 
+import inspect
 import re
+import traceback
 from collections import Counter
+from collections.abc import Callable, Iterable
 from functools import cache
 from importlib.metadata import EntryPoint, entry_points, requires
-from typing import Any, Literal
+from typing import Any, Literal, Protocol
 
 from asp_env.errors import AspEnvError, unknown_name
 
@@ -55,7 +58,7 @@ def package_of(group: Group, name: str) -> str | None:
 def described(group: Group, name: str) -> str:
     """A registered plug in messages: `reader 'sind'`, or `reader 'x' of the package other 1.0`."""
     package = package_of(group, name)
-    origin = "" if package is None or package.split()[0] == _OWN else f" of the package {package}"
+    origin = "" if package is None or _is_own(group, name) else f" of the package {package}"
     return f"{group.rstrip('s')} {name!r}{origin}"
 
 
@@ -94,6 +97,54 @@ def find(group: Group, name: str) -> Any:
             f"{described(group, name)} cannot be imported from its entry point "
             f"{plugs[name].value} ({reason}): repair the package that registers it, or uninstall it"
         ) from error
+
+
+def make(group: Group, name: str, call: Callable[[Any], Any], protocol: type) -> Any:
+    """Lets the object registered under a name make something, and checks what it makes.
+
+    Args:
+        group: the group.
+        name: the registered name.
+        call: takes the registered object and returns what it makes.
+        protocol: what is to be made.
+
+    Raises:
+        AspEnvError: the name is unknown, the object refuses, or, if another package registers it,
+            it fails in any other way or makes something that lacks a part of the protocol. The
+            message names the package.
+    """
+    plug = find(group, name)
+    try:
+        made = call(plug)
+    except (AspEnvError, OSError):
+        raise
+    except Exception as error:  # another package may raise anything
+        if package_of(group, name) is None or _is_own(group, name):
+            raise
+        last = traceback.extract_tb(error.__traceback__)[-1]
+        reason = " ".join(f"{type(error).__name__}: {error}".split())
+        raise AspEnvError(
+            f"{described(group, name)} cannot be made ({reason}, at {last.filename}:"
+            f"{last.lineno}): repair the package, or uninstall it"
+        ) from error
+    parts = {part for base in protocol.__mro__ for part in (*vars(base), *_fields(base))}
+    parts -= set(dir(Protocol))
+    missing = sorted(part for part in parts if part[0] != "_" and not hasattr(made, part))
+    if missing:
+        raise AspEnvError(
+            f"{described(group, name)} is no {protocol.__name__}: {type(made).__name__} lacks "
+            f"{', '.join(missing)}"
+        )
+    return made
+
+
+def _fields(kind: type) -> Iterable[str]:
+    return inspect.get_annotations(kind)
+
+
+def _is_own(group: Group, name: str) -> bool:
+    """Whether this package registers a name."""
+    return (package_of(group, name) or "").split()[:1] == [_OWN]
 
 
 def _requirement_with(module: str) -> str:

@@ -163,7 +163,7 @@ DATASETS: tuple[PublicDataset, ...] = (
     PublicDataset(
         name="DLR-UT",
         title="DLR Urban Traffic (DLR UT)",
-        holds="12 h of the inner ring of Brunswick: vehicles, vulnerable road users, traffic lights",
+        holds="12 h of the inner ring of Brunswick: vehicles, VRUs, traffic lights",
         licence="CC BY 4.0",
         access="download",
         obtain="Zenodo record 15754836 (https://doi.org/10.5281/zenodo.15754836)",
@@ -182,7 +182,7 @@ DATASETS: tuple[PublicDataset, ...] = (
         "beside maps/LOCATION.osm",
         reader="interaction",
         tested="published files",
-        notes="velocities and headings have faults: states are derived from positions, docs/data.md",
+        notes="velocities and headings have faults; states are derived from positions",
     ),
 )
 """The data sets, those with the most users first."""

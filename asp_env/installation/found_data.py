@@ -3,7 +3,6 @@
 import warnings
 from collections.abc import Callable
 from dataclasses import dataclass
-from pathlib import Path
 
 from asp_env.data.readers.layout import archive_hint
 from asp_env.data.source import Recordings, find_by_reader, source_folder

@@ -17,7 +17,7 @@ EXTRAS: Mapping[str, str] = {
     "export": "asp-env export",
     "rl": "asp-env rl train, evaluate, compare; planner sb3; asp_env.parallel_env, sb3_vec_env",
     "offline": "asp-env rl demonstrations",
-    "synthetic": "data synthetic:…, suites intersection-v1 and roundabout-v1; asp-env synthesize, demo",
+    "synthetic": "data synthetic:…, other suites than highway-v1; asp-env synthesize, demo",
     "report": "asp-env evaluate, drive, benchmark, table, demo, which write report.html",
     "highway": "data highway:…, suite highway-v1, asp_env/HighwayIntersection-v0 and the like",
     "render": "asp-env watch; videos and windows of environments",
@@ -153,4 +153,4 @@ def _numbers(version: str) -> tuple[int, ...]:
     """The release numbers of a version: (2, 13, 0) for `2.13.0+cpu` and (3, 11, 0) for `3.11`."""
     release = re.match(r"[0-9]+(\.[0-9]+)*", version)
     numbers = [int(number) for number in release[0].split(".")] if release else []
-    return tuple((numbers + [0, 0, 0])[:3])
+    return tuple([*numbers, 0, 0, 0][:3])

@@ -111,7 +111,7 @@ def test_a_cache_that_cannot_be_made_is_a_problem(
 
 
 def test_leftovers_and_a_wrong_clock_are_found(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     """A temporary file of two hours ago counts, one of now does not; a clock of 1970 is told."""
     folder = cache.cache_folder()
@@ -163,7 +163,7 @@ def test_a_torch_that_cannot_be_imported_is_a_problem(
 
 
 def test_readers_that_fail_are_problems(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+    capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     def broken(_folder: Path) -> list[Any]:
         raise RuntimeError("no licence")

@@ -27,7 +27,7 @@ def test_version_is_one_line(capsys: pytest.CaptureFixture[str]) -> None:
         assert re.search(r"\(commit [0-9a-f]{12}(-dirty)?\)", line)
 
 
-def test_a_checkout_that_is_not_installed_has_a_version_and_says_what_to_do(tmp_path: Path) -> None:
+def test_a_checkout_that_is_not_installed_has_a_version_and_says_what_to_do() -> None:
     """Without metadata the version is that of `pyproject.toml`, and no command is registered."""
     code = (
         "import importlib.metadata as m, sys\n"
