@@ -23,6 +23,7 @@ ARROWS = {
     "compiled": set[str](),
     "files": {"errors"},
     "workers": {"errors"},
+    "__main__": {"cli"},
     "cli": {"installation"} | ON_ALL,
     "installation": {"data"} | ON_ALL,
     "dynamics": ON_ALL,
