@@ -26,7 +26,7 @@ smoke:
 	rm -rf $(SMOKE)
 	$(PYTHON) -m venv $(SMOKE)
 	$(SMOKE)/bin/pip install --quiet --disable-pip-version-check --constraint constraints.txt '.[report]'
-	cd $(SMOKE) && bin/python $(CURDIR)/tests/smoke.py
+	cd $(SMOKE) && bin/python -P $(CURDIR)/tests/smoke.py
 
 check: $(INSTALLED)
 	$(BIN)/ruff check .

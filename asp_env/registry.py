@@ -87,7 +87,7 @@ def find(group: Group, name: str) -> Any:
         raise
     except Exception as error:  # a module of another package may raise anything
         missing = error.name if isinstance(error, ModuleNotFoundError) else None
-        if missing is not None and not _is_within(plugs[name].module, missing):
+        if missing is not None and _top(missing) != _top(plugs[name].module):
             raise AspEnvError(
                 f"{described(group, name)} needs the package {missing!r}, which is not "
                 f"installed: pip install {_requirement_with(missing)}"
@@ -163,6 +163,6 @@ def _requirement_with(module: str) -> str:
     return f"'asp-env[{min(having, key=lambda extra: (sizes[extra], extra))}]'"
 
 
-def _is_within(module: str, package: str) -> bool:
-    """Whether a module is a package, or is in it."""
-    return f"{module}.".startswith(f"{package}.")
+def _top(module: str) -> str:
+    """The package that a module is in."""
+    return module.partition(".")[0]

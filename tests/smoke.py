@@ -1,16 +1,33 @@
 """The core without torch: a step of the environment, and one drive. A script, not a test.
 
-`make smoke` runs it with other versions of Python, a test with torch made unavailable.
+`make smoke` runs it with other versions of Python. The folder `tests` must not be on the path of
+modules (`python -P`), since its packages have names of the project's.
 """
 
 import sys
 import tempfile
+from collections.abc import Sequence
+from importlib.abc import MetaPathFinder
 from pathlib import Path
+
+
+class WithoutTorch(MetaPathFinder):
+    """Makes torch unavailable, where it is installed."""
+
+    def find_spec(self, fullname: str, path: Sequence[str] | None, target: object = None) -> None:
+        """Refuses torch.
+
+        Raises:
+            ModuleNotFoundError: the module is torch.
+        """
+        del path, target
+        if fullname == "torch":
+            raise ModuleNotFoundError("No module named 'torch'", name="torch")
 
 
 def main() -> int:
     """Steps and drives; returns the exit status of the drive."""
-    sys.modules["torch"] = None  # type: ignore[assignment]
+    sys.meta_path.insert(0, WithoutTorch())
     import gymnasium as gym
 
     import asp_env
