@@ -106,7 +106,8 @@ def python_problem() -> str | None:
 def plugs_of_other_packages() -> tuple[PlugState, ...]:
     """The plugs that other packages register; each is imported."""
     found = []
-    for group in get_args(registry.Group):
+    groups: tuple[registry.Group, ...] = get_args(registry.Group)
+    for group in groups:
         for name in registry.names(group):
             package = registry.package_of(group, name)
             if package is None or package.split()[0] == PACKAGE:

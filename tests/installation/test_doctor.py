@@ -118,7 +118,8 @@ def test_leftovers_and_a_wrong_clock_are_found(
     for name, age_s in (("old", 7_200.0), ("new", 0.0)):
         path = folder / f".{name}.bin.01234567.partial"
         path.write_bytes(b"1")
-        os.utime(path, (time.time() - age_s,) * 2)
+        written_s = time.time() - age_s
+        os.utime(path, (written_s, written_s))
     state = caches.cache_state()
     assert (state.num_leftovers, state.problem) == (1, None)
     now_s = time.time()

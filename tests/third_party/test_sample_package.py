@@ -147,7 +147,7 @@ def test_gym_make_uses_all(data: str) -> None:
     assert observation["raster"].shape[0] == 1
     assert any("forecast" in name for name in observation)
     observation, reward, *_ = env.step(np.zeros(2, dtype=np.float32))
-    assert np.isfinite(reward)
+    assert np.isfinite(float(reward))
     assert observation["raster"].max() == 255
 
 

@@ -1,6 +1,6 @@
 """A reader: tables `NAME.sample.csv` with the columns agent, time_s, east_m and north_m."""
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from pathlib import Path
 
 import numpy as np
@@ -13,8 +13,14 @@ from asp_env.data.readers import (
     has_columns,
     read_table,
 )
+from asp_env.data.readers.tables import Kind
 
-COLUMNS = {"agent": "whole", "time_s": "number", "east_m": "number", "north_m": "number"}
+COLUMNS: Mapping[str, Kind] = {
+    "agent": "whole",
+    "time_s": "number",
+    "east_m": "number",
+    "north_m": "number",
+}
 
 
 def find_recordings(folder: Path) -> Iterator[FoundRecording]:
