@@ -2,13 +2,14 @@
 PYTHON ?= python3
 BIN := .venv/bin
 INSTALLED := .venv/.installed
+SMOKE := .venv/smoke
 # The same packages with the oldest Gymnasium that pyproject.toml declares; .venv has the newest.
 OLDEST := .venv/oldest
 OLDEST_GYMNASIUM := $(shell sed -n 's/.*"gymnasium>=\([0-9.]*\)".*/\1/p' pyproject.toml)
 OLDEST_TESTS := tests/envs/test_checkers.py tests/envs/test_vector_contract.py \
 	tests/envs/test_observation_ids.py tests/envs/test_constructors.py
 
-.PHONY: demo test test-oldest check soak clean
+.PHONY: demo test test-oldest smoke check soak clean
 
 demo: $(INSTALLED)
 	$(BIN)/asp-env demo --out demo
@@ -19,6 +20,13 @@ test: $(INSTALLED)
 
 test-oldest: $(OLDEST)/.installed
 	$(OLDEST)/bin/python -m pytest -p no:cacheprovider -n 2 --dist worksteal $(OLDEST_TESTS)
+
+# The core without torch, with another PYTHON in an environment of its own.
+smoke:
+	rm -rf $(SMOKE)
+	$(PYTHON) -m venv $(SMOKE)
+	$(SMOKE)/bin/pip install --quiet --disable-pip-version-check --constraint constraints.txt '.[report]'
+	cd $(SMOKE) && bin/python -P $(CURDIR)/tests/smoke.py
 
 check: $(INSTALLED)
 	$(BIN)/ruff check .

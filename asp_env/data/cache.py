@@ -43,9 +43,7 @@ def cache_folder() -> Path:
     Raises:
         DataError: the folder cannot be created or written to.
     """
-    named = os.environ.get("ASP_ENV_CACHE")
-    base = os.environ.get("XDG_CACHE_HOME") or os.path.expanduser("~/.cache")
-    folder = Path(named) if named else Path(base) / "asp-env"
+    folder, _ = cache_location()
     reason = "no permission to write"
     try:
         folder.mkdir(parents=True, exist_ok=True)
@@ -70,6 +68,14 @@ def note_uncached(error: DataError | OSError, path: Path | None = None) -> None:
         _noted.add(reason)
         where = "" if path is None else f"{path}: "
         _logger.warning("asp-env: results are not cached: %s%s", where, reason)
+
+
+def cache_location() -> tuple[Path, str]:
+    """The folder of derived data, which may not exist, and what its place follows from."""
+    for variable, below in (("ASP_ENV_CACHE", ""), ("XDG_CACHE_HOME", "asp-env")):
+        if base := os.environ.get(variable):
+            return Path(base) / below, f"${variable}"
+    return Path(os.path.expanduser("~/.cache")) / "asp-env", "the default"
 
 
 def get_or_create(group: str, name: str, make: Callable[[Path], None]) -> Path:

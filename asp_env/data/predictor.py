@@ -221,10 +221,13 @@ def load_predictor(name: str, *, horizon: int, dt_s: float) -> Predictor:
     whole_number("horizon", horizon, least=1, most=MAX_HORIZON)
     positive_number("time step", dt_s, "s")
     kind, _, argument = name.partition(":")
-    plug: PredictorPlug = registry.find("predictors", kind)
-    predictor = plug.from_name(argument, horizon=horizon, dt_s=dt_s)
-    _accept_about(predictor)
-    return predictor
+
+    def made_by(plug: PredictorPlug) -> Any:
+        predictor = plug.from_name(argument, horizon=horizon, dt_s=dt_s)
+        _accept_about(predictor)
+        return predictor
+
+    return registry.make("predictors", kind, made_by, Predictor)
 
 
 def make_forecast(

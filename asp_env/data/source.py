@@ -341,29 +341,60 @@ def source_folder(source: str) -> Path:
     return Path(registry.find("sources", scheme)(argument))
 
 
-def _find(folder: Path) -> tuple[RecordingFiles, ...]:
-    """The recordings that all registered readers find in a folder, this package's layouts first."""
+def find_by_reader(folder: Path) -> dict[str, list[RecordingFiles] | AspEnvError]:
+    """What each registered reader finds in a folder, this package's first layouts first.
+
+    Args:
+        folder: an existing folder.
+
+    Returns:
+        The recordings of each reader, or why it fails. A reader of another package may fail in any
+        way; an `OSError` of any reader is a `DataError`.
+    """
     names = [*_FIRST, *(name for name in registry.names("readers") if name not in _FIRST)]
-    found: list[RecordingFiles] = []
+    found: dict[str, list[RecordingFiles] | AspEnvError] = {}
     for name in names:
         try:
-            found += registry.find("readers", name)(folder)
+            found[name] = list(registry.find("readers", name)(folder))
         except StaleInstallError:
             raise
         except OSError as error:
-            raise DataError(f"{error.filename or folder}: {error.strerror or error}") from error
+            found[name] = DataError(f"{error.filename or folder}: {error.strerror or error}")
         except Exception as error:  # a reader of another package may raise anything
             reason = " ".join(f"{type(error).__name__}: {error}".split())
-            warnings.warn(f"reader {name!r} is left out: {reason}", stacklevel=3)
-    taken = {path for each in found if not isinstance(each, LevelxFiles) for path in each.tables}
-    return tuple(
-        each
-        for each in found
-        if not (
-            isinstance(each, LevelxFiles)  # whose names others have, too: Veh_smoothed_tracks.csv
-            and {path for path in each.tables if path.is_file()} <= taken
-        )
+            plug = registry.described("readers", name)
+            found[name] = AspEnvError(f"{plug} is left out: {reason}")
+    lists = [each for each in found.values() if isinstance(each, list)]
+    taken = {
+        path
+        for each in lists
+        for files in each
+        if not isinstance(files, LevelxFiles)
+        for path in files.tables
+    }
+    for each in lists:
+        each[:] = [files for files in each if not _is_taken(files, taken)]
+    return found
+
+
+def _is_taken(files: RecordingFiles, taken: set[Path]) -> bool:
+    """Whether files with the names of inD are those of another layout: Veh_smoothed_tracks.csv."""
+    return isinstance(files, LevelxFiles) and (
+        {path for path in files.tables if path.is_file()} <= taken
     )
+
+
+def _find(folder: Path) -> tuple[RecordingFiles, ...]:
+    """The recordings that all readers find in a folder; a reader that fails is left out."""
+    found: list[RecordingFiles] = []
+    for each in find_by_reader(folder).values():
+        if isinstance(each, DataError):
+            raise each
+        if isinstance(each, AspEnvError):
+            warnings.warn(str(each), stacklevel=3)
+        else:
+            found += each
+    return tuple(found)
 
 
 def _sample(site: str) -> Path:

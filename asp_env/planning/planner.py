@@ -1,7 +1,7 @@
 """The socket for planners, and `expert`: the recorded ego, the reference for every planner."""
 
 from dataclasses import dataclass
-from typing import NoReturn, Protocol, TypeVar, runtime_checkable
+from typing import Any, NoReturn, Protocol, TypeVar, runtime_checkable
 
 import numpy as np
 from jaxtyping import Float
@@ -127,15 +127,18 @@ def load_planner(name: str) -> Planner:
         AspEnvError: the name is unknown, or the planner rejects the argument.
     """
     kind, colon, argument = text("planner", name).partition(":")
-    factory = registry.find("planners", kind)
-    from_name = getattr(factory, "from_name", None)
-    if from_name is not None:
-        if not argument:
-            raise AspEnvError(f"planner {kind}: name a run as well, such as {kind}:RUN")
-        return from_name(argument)
-    if colon:
-        raise AspEnvError(f"planner {name}: {kind} takes no argument; write {kind}")
-    return factory()
+
+    def made_by(factory: Any) -> Any:
+        from_name = getattr(factory, "from_name", None)
+        if from_name is not None:
+            if not argument:
+                raise AspEnvError(f"planner {kind}: name a run as well, such as {kind}:RUN")
+            return from_name(argument)
+        if colon:
+            raise AspEnvError(f"planner {name}: {kind} takes no argument; write {kind}")
+        return factory()
+
+    return registry.make("planners", kind, made_by, Planner)
 
 
 class Expert:

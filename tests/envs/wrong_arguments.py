@@ -5,6 +5,8 @@ functions. Right is an `AspEnvError` of one short line, or where Python's or Gym
 demand it an error of theirs.
 """
 
+# pyright: reportArgumentType=false
+
 import json
 import math
 import sys

@@ -68,7 +68,7 @@ def identity(name: str, groups: Iterable[Group]) -> list[str]:
     """
     found: list[str] = []
     for part in _SEPARATORS.split(name):
-        packages = {registry.package(group, part) for group in groups} - {None}
+        packages = {registry.module_of(group, part) for group in groups} - {None}
         found += sorted(package_hash(each) for each in packages if each is not None)
         path = Path(part.partition("@")[0])
         if not packages and path.name and path.exists():

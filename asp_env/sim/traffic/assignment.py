@@ -186,5 +186,8 @@ def _controllable_class(key: str) -> AgentClass:
 
 def _make_driver(name: str, dt_s: float) -> Driver:
     kind, _, argument = name.partition(":")
-    plug: DriverPlug = registry.find("drivers", kind)
-    return plug.from_name(argument, dt_s=dt_s)
+
+    def made_by(plug: DriverPlug) -> Any:
+        return plug.from_name(argument, dt_s=dt_s)
+
+    return registry.make("drivers", kind, made_by, Driver)
