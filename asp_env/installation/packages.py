@@ -18,8 +18,9 @@ EXTRAS: Mapping[str, str] = {
     "rl": "asp-env rl train, evaluate, compare; planner sb3; asp_env.parallel_env, sb3_vec_env",
     "offline": "asp-env rl demonstrations",
     "synthetic": "data synthetic:…, other suites than highway-v1; asp-env synthesize, demo",
-    "report": "asp-env evaluate, drive, benchmark, table, demo, which write report.html",
+    "report": "asp-env evaluate, drive, study, benchmark, table, demo, which write report.html",
     "highway": "data highway:…, suite highway-v1, asp_env/HighwayIntersection-v0 and the like",
+    "ray": "asp-env study --ray",
     "render": "asp-env watch; videos and windows of environments",
 }
 """What each extra of this package is needed for."""
