@@ -37,7 +37,7 @@ from asp_env.evaluation.statistics import (
     is_resolved,
     resampled_sums,
 )
-from asp_env.files import write_text
+from asp_env.files import is_vacant, write_text
 from asp_env.metrics.driving.rules import DEFAULT_RULES, find_rules
 from asp_env.metrics.driving.scores import driving_metrics
 from asp_env.planning.planner import Planner, load_planner
@@ -389,7 +389,7 @@ def check_out(out: Path, settings: Mapping[str, Any]) -> None:
     if path.exists():
         if json.loads(path.read_text())["settings"] != json.loads(text):
             raise AspEnvError(f"{out} holds another comparison; choose another --out")
-    elif out.exists() and any(out.iterdir()):
+    elif not is_vacant(out):
         raise AspEnvError(f"{out} exists and holds no comparison; choose another --out")
     else:
         out.mkdir(parents=True, exist_ok=True)
