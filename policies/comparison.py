@@ -12,6 +12,7 @@ import os
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cache, partial
+from html import escape
 from pathlib import Path
 from typing import Any
 
@@ -408,7 +409,8 @@ def curves_figure(curves: Mapping[str, Float[np.ndarray, "points 4"]]) -> Any:
     import plotly.graph_objects as go
 
     figure = go.Figure()
-    for number, (name, curve) in enumerate(curves.items()):
+    for number, (row, curve) in enumerate(curves.items()):
+        name = escape(row)  # plotly reads labels as HTML
         steps, mean, low, high = curve.T
         colour = COLOURS[number % len(COLOURS)]
         figure.add_scatter(

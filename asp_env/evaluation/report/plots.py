@@ -1,7 +1,11 @@
-"""Metrics as plotly figures in JSON; the page sets the colours of text and grids."""
+"""Metrics as plotly figures in JSON; the page sets the colours of text and grids.
+
+Plotly reads the text of labels as HTML, so names are escaped.
+"""
 
 import math
 from collections.abc import Sequence
+from html import escape
 
 import plotly.graph_objects as go
 from plotly.subplots import make_subplots
@@ -41,16 +45,16 @@ def final_errors(results: Sequence[Result], colour: dict[str, str]) -> str | Non
     if not results:
         return None
     selections = distinct((r.selection for r in results), first=SELECTIONS)
-    figure = _panels([selection.replace("-", " ") for selection in selections])
+    figure = _panels([escape(selection.replace("-", " ")) for selection in selections])
     for panel, selection in enumerate(selections, start=1):
         for method in methods_of(results):
             group = [r for r in results if (r.method, r.selection) == (method, selection)]
             group.sort(key=lambda r: SUBSETS.index(r.subset) if r.subset in SUBSETS else 9)
             bar = go.Bar(
-                name=method.label,
-                legendgroup=method.label,
+                name=escape(method.label),
+                legendgroup=escape(method.label),
                 showlegend=panel == 1,
-                x=[r.subset for r in group],
+                x=[escape(r.subset) for r in group],
                 y=_values(group),
                 error_y=_whiskers(group),
                 marker={"color": _colour(method, colour), "cornerradius": 3},
@@ -73,13 +77,13 @@ def errors_over_time(results: Sequence[Result], colour: dict[str, str]) -> str |
         return None
     results = sorted((r for r in results if r.subset == subset), key=lambda r: r.at_s or 0.0)
     selections = distinct((r.selection for r in results), first=SELECTIONS)
-    figure = _panels([f"{s.replace('-', ' ')} · {subset} targets" for s in selections])
+    figure = _panels([escape(f"{s.replace('-', ' ')} · {subset} targets") for s in selections])
     for panel, selection in enumerate(selections, start=1):
         for method in methods_of(results):
             group = [r for r in results if (r.method, r.selection) == (method, selection)]
             line = go.Scatter(
-                name=method.label,
-                legendgroup=method.label,
+                name=escape(method.label),
+                legendgroup=escape(method.label),
                 showlegend=panel == 1,
                 x=[r.at_s for r in group],
                 y=_values(group),
@@ -118,7 +122,7 @@ def driving_metrics(results: Sequence[Result], colour: dict[str, str]) -> str | 
         shared_yaxes=True,
         horizontal_spacing=0.025,
         vertical_spacing=75 / height if rows > 1 else 0,
-        subplot_titles=[_panel_title(metric) for metric in metrics],
+        subplot_titles=[escape(_panel_title(metric)) for metric in metrics],
     )
     for number, metric in enumerate(metrics):
         row, column = number // columns + 1, number % columns + 1
@@ -129,7 +133,7 @@ def driving_metrics(results: Sequence[Result], colour: dict[str, str]) -> str | 
             scale = 100.0 if percent else 1.0
             point = go.Scatter(
                 x=_values(group, scale),
-                y=[method.label] * len(group),
+                y=[escape(method.label)] * len(group),
                 error_x=_whiskers(group, scale),
                 mode="markers",
                 marker={"color": _colour(method, colour), "size": 10},
