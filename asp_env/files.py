@@ -89,7 +89,8 @@ def atomic_file(path: Path) -> Iterator[Path]:
         os.replace(partial, target)
     except OSError as error:
         if error.filename is None or os.fsdecode(error.filename) == str(partial):
-            error.filename, error.filename2 = str(path), None
+            with suppress(AttributeError):  # in errors of av, names cannot be changed
+                error.filename, error.filename2 = str(path), None
         raise
     finally:
         with suppress(OSError):
