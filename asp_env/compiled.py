@@ -80,7 +80,7 @@ class _CheckedFiles(IndexDataCacheFile):
             raise PermissionError(f"{file.name} may be written by others")
 
     @contextmanager
-    def _open_for_write(self, filepath: str) -> Iterator[IO[bytes]]:
+    def _open_for_write(self, filepath: str) -> Iterator[Any]:
         with atomic_file(Path(filepath)) as partial, partial.open("wb") as file:
             mode = os.fstat(file.fileno()).st_mode
             os.fchmod(file.fileno(), stat.S_IMODE(mode) & ~_WRITABLE_BY_OTHERS)

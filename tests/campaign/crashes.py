@@ -34,7 +34,7 @@ from rich.table import Table
 
 from tests.crossing_files import ON_ROAD, write_crossing
 
-POLL_S = 0.002
+POLL_S = 0.005
 END_S = 20.0
 """Longest time that processes of a killed command may take to end. They end at once, but a busy
 machine may not run them at once."""
