@@ -6,10 +6,12 @@ SMOKE := .venv/smoke
 # The same packages with the oldest Gymnasium that pyproject.toml declares; .venv has the newest.
 OLDEST := .venv/oldest
 OLDEST_GYMNASIUM := $(shell sed -n 's/.*"gymnasium>=\([0-9.]*\)".*/\1/p' pyproject.toml)
+# Tools that look at .venv from outside of it.
+AUDIT := .venv/audit
 OLDEST_TESTS := tests/envs/test_checkers.py tests/envs/test_vector_contract.py \
 	tests/envs/test_observation_ids.py tests/envs/test_constructors.py
 
-.PHONY: demo test test-oldest smoke check soak clean
+.PHONY: demo test test-oldest smoke check soak crash-campaign sbom audit clean
 
 demo: $(INSTALLED)
 	$(BIN)/asp-env demo --out demo
@@ -54,5 +56,24 @@ $(OLDEST)/.installed: $(INSTALLED)
 	--no-deps 'gymnasium==$(OLDEST_GYMNASIUM)'
 	touch $@
 
+# Kills commands at random moments, and compares what their reruns write: about ten CPU minutes.
+crash-campaign: $(INSTALLED)
+	$(BIN)/python -m tests.campaign.crashes
+
+# Lists what is installed in .venv, in CycloneDX's format, in sbom.json.
+sbom: $(AUDIT)/.installed
+	$(AUDIT)/bin/cyclonedx-py environment --output-reproducible --pyproject pyproject.toml \
+	--output-file sbom.json $(BIN)/python
+
+# Compares the pinned packages with the known vulnerabilities, which needs a network.
+audit: $(AUDIT)/.installed
+	$(AUDIT)/bin/pip-audit --requirement constraints.txt --no-deps --disable-pip --strict
+
+$(AUDIT)/.installed: $(INSTALLED)
+	rm -rf $(AUDIT)
+	$(PYTHON) -m venv $(AUDIT)
+	$(AUDIT)/bin/pip install --quiet --disable-pip-version-check cyclonedx-bom pip-audit
+	touch $@
+
 clean:
-	rm -rf .venv demo build dist *.egg-info .pytest_cache .ruff_cache .hypothesis soak
+	rm -rf .venv demo build dist soak sbom.json *.egg-info .pytest_cache .ruff_cache .hypothesis

@@ -12,6 +12,7 @@ import os
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cache, partial
+from html import escape
 from pathlib import Path
 from typing import Any
 
@@ -36,7 +37,7 @@ from asp_env.evaluation.statistics import (
     interval,
     resampled_means,
 )
-from asp_env.files import write_text
+from asp_env.files import is_vacant, write_text
 from asp_env.metrics.driving.rules import DEFAULT_RULES, find_rules
 from asp_env.metrics.driving.scores import driving_metrics
 from asp_env.planning.planner import Planner, load_planner
@@ -369,7 +370,7 @@ def check_out(out: Path, settings: Mapping[str, Any]) -> None:
     if path.exists():
         if json.loads(path.read_text())["settings"] != json.loads(text):
             raise AspEnvError(f"{out} holds another comparison; choose another --out")
-    elif out.exists() and any(out.iterdir()):
+    elif not is_vacant(out):
         raise AspEnvError(f"{out} exists and holds no comparison; choose another --out")
     else:
         out.mkdir(parents=True, exist_ok=True)
@@ -388,7 +389,8 @@ def curves_figure(curves: Mapping[str, Float[np.ndarray, "points 4"]]) -> Any:
     import plotly.graph_objects as go
 
     figure = go.Figure()
-    for number, (name, curve) in enumerate(curves.items()):
+    for number, (row, curve) in enumerate(curves.items()):
+        name = escape(row)  # plotly reads labels as HTML
         steps, mean, low, high = curve.T
         colour = COLOURS[number % len(COLOURS)]
         figure.add_scatter(

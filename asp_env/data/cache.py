@@ -18,7 +18,7 @@ from typing import Any
 import numpy as np
 
 from asp_env.errors import AspEnvError, DataError
-from asp_env.files import atomic_file, atomic_folder, remove_stale
+from asp_env.files import atomic_file, atomic_folder
 
 FORMAT = 9
 """Version of the readers. Raise it whenever a reader gives other results for the same files."""
@@ -192,7 +192,6 @@ def save(
             checksum = zlib.crc32(block, checksum)
         file.seek(len(_MAGIC))
         file.write(checksum.to_bytes(4, "little"))
-    remove_stale(path)
 
 
 def digest(path: Path) -> str:

@@ -20,7 +20,7 @@ import numpy as np
 from asp_env.errors import DataError
 from asp_env.evaluation.closed_loop.comparison import EpisodeScores
 from asp_env.evaluation.closed_loop.containment import Fault
-from asp_env.files import atomic_file, remove_partials
+from asp_env.files import atomic_file, remove_abandoned
 from asp_env.metrics.masked import Masked
 from asp_env.sim.world import Ending
 
@@ -111,8 +111,6 @@ class CellFolder:
             ) from error
 
     def remove_leftovers(self) -> None:
-        """Removes the temporary files of processes that were killed.
-
-        No other process may write to the folder.
-        """
-        remove_partials(self._folder)
+        """Removes the temporary files of processes that were killed."""
+        for folder in self._folder.glob("*"):
+            remove_abandoned(folder)

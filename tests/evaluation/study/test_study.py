@@ -257,7 +257,7 @@ def test_comparison_is_paired_by_scenario(data: str, tmp_path: Path) -> None:
 
 def test_cells_of_a_killed_process_leave_nothing(tmp_path: Path) -> None:
     folder = CellFolder(tmp_path)
-    partial = tmp_path / "cells" / "ab" / ".abc.npz.0123abcd.partial"
+    partial = tmp_path / "cells" / "ab" / ".abc.npz.0123456789ab.partial"
     partial.parent.mkdir(parents=True)
     partial.touch()
     folder.remove_leftovers()
