@@ -8,8 +8,6 @@ from collections.abc import Iterable
 from dataclasses import dataclass
 from pathlib import Path
 
-from asp_env.files import STALE_S
-
 CLOCK_TOLERANCE_S = 5.0
 """Largest difference of the clocks of this machine and of the cache's file system that is not
 reported. Chosen by hand: file systems round times to up to 2 s."""
@@ -28,8 +26,6 @@ class CacheState:
     num_files: int
     num_bytes: int
     free_bytes: int | None
-    num_leftovers: int
-    """Temporary files of processes that were killed: none has written to them for an hour."""
     clock_ahead_s: float | None
     """Time of a file that is written now, less that of this machine."""
     problem: str | None
@@ -81,14 +77,13 @@ def cache_state() -> CacheState:
         )
     if problem is None and free is not None and free < SMALLEST_FREE_BYTES:
         problem = f"cache folder {folder}: only {free / 1e6:.0f} MB are free on its disk"
-    num_files, num_bytes, num_leftovers = _content(folder)
+    num_files, num_bytes = _content(folder)
     return CacheState(
         folder=folder,
         named_by=named_by,
         num_files=num_files,
         num_bytes=num_bytes,
         free_bytes=free,
-        num_leftovers=num_leftovers,
         clock_ahead_s=None if ahead_s is None else round(ahead_s, 3),
         problem=problem,
     )
@@ -116,14 +111,12 @@ def compiled_state() -> CompiledState:
     )
 
 
-def _content(folder: Path) -> tuple[int, int, int]:
-    """Number of files, bytes, and temporary files that nobody writes any more."""
+def _content(folder: Path) -> tuple[int, int]:
+    """Number of files, and bytes."""
     if not folder.is_dir():
-        return 0, 0, 0
+        return 0, 0
     files = [path for path in folder.rglob("*") if path.is_file()]
-    temporary = list(folder.glob(".*.partial"))
-    ages_s = [time.time() - path.stat().st_mtime for path in temporary if path.exists()]
-    return len(files), sum(_sizes(files)), sum(age_s > STALE_S for age_s in ages_s)
+    return len(files), sum(_sizes(files))
 
 
 def _sizes(paths: Iterable[Path]) -> Iterable[int]:

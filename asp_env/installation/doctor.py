@@ -163,8 +163,6 @@ def _show(diagnosis: Diagnosis, console: Console) -> None:
         f"cache: {cache.folder} (by {cache.named_by}), {cache.num_files} files, "
         f"{cache.num_bytes / 1e6:.1f} MB{free}"
     )
-    if cache.num_leftovers:
-        line(f"  {cache.num_leftovers} temporary files of processes that were killed")
     line(_compiled_line(compiled))
     line(f"GPU: {diagnosis.gpu}")
     for each in diagnosis.data:
