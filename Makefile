@@ -10,8 +10,13 @@ OLDEST_GYMNASIUM := $(shell sed -n 's/.*"gymnasium>=\([0-9.]*\)".*/\1/p' pyproje
 AUDIT := .venv/audit
 OLDEST_TESTS := tests/envs/test_checkers.py tests/envs/test_vector_contract.py \
 	tests/envs/test_observation_ids.py tests/envs/test_constructors.py
+# Mutation testing (docs/mutation.md), and which mutants are tested: the default is a tenth of them,
+# those whose number within a function ends with 7; MUTANTS='*' is all.
+MUTMUT := mutmut==3.8.1
+MUTANTS ?= *__mutmut_*7
+MUTATED := build/mutation
 
-.PHONY: demo test test-oldest smoke check soak crash-campaign sbom audit clean
+.PHONY: demo test test-oldest smoke check mutants soak crash-campaign sbom audit clean
 
 demo: $(INSTALLED)
 	$(BIN)/asp-env demo --out demo
@@ -39,6 +44,18 @@ check: $(INSTALLED)
 # An hour: memory, open files, threads and processes stay flat. Writes soak/soak.csv and soak/soak.png.
 soak: $(INSTALLED)
 	$(BIN)/python -m tests.benchmarks.soak
+
+# A copy without the decorators of kernels: mutmut skips decorated functions, and NUMBA_DISABLE_JIT
+# leaves no compiled or cached code that a mutant could not reach.
+mutants: .venv/mutmut/.installed
+	mkdir -p $(MUTATED)
+	git ls-files -z asp_env policies predictors scenarios tests pyproject.toml \
+	| xargs -0 cp --parents --preserve=timestamps --target-directory=$(MUTATED)
+	find $(MUTATED)/asp_env -name '*.py' -exec \
+	sed -i -E '/^@(njit\(.*\)|no_type_check)$$/d' {} +
+	cd $(MUTATED) && NUMBA_DISABLE_JIT=1 OMP_NUM_THREADS=1 \
+	$(CURDIR)/.venv/mutmut/bin/mutmut run --max-children 2 '$(MUTANTS)'
+	cd $(MUTATED) && $(CURDIR)/.venv/mutmut/bin/mutmut results
 
 $(INSTALLED): pyproject.toml constraints.txt
 	test -d .venv || $(PYTHON) -m venv .venv
@@ -73,6 +90,16 @@ $(AUDIT)/.installed: $(INSTALLED)
 	rm -rf $(AUDIT)
 	$(PYTHON) -m venv $(AUDIT)
 	$(AUDIT)/bin/pip install --quiet --disable-pip-version-check cyclonedx-bom pip-audit
+
+# Its own packages come first on its path, those of .venv after them.
+.venv/mutmut/.installed: $(INSTALLED)
+	rm -rf .venv/mutmut
+	$(PYTHON) -m venv .venv/mutmut
+	.venv/mutmut/bin/pip install --quiet --disable-pip-version-check --constraint constraints.txt \
+	'$(MUTMUT)'
+	.venv/mutmut/bin/python -c "import sysconfig, pathlib; \
+	pathlib.Path(sysconfig.get_path('purelib'), 'project.pth') \
+	.write_text('import site; site.addsitedir(%r)' % sysconfig.get_path('purelib', vars={'base': '$(CURDIR)/.venv'}))"
 	touch $@
 
 clean:

@@ -7,7 +7,7 @@ from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
-from hypothesis import settings
+from hypothesis import Phase, settings
 from selenium import webdriver
 
 from tests import checked_calls
@@ -20,6 +20,11 @@ os.environ["SDL_VIDEODRIVER"] = "dummy"
 checked_calls.install()
 
 settings.register_profile("same-every-time", derandomize=True, deadline=None, max_examples=30)
+settings.register_profile(
+    "without-shrinking",  # for mutants, of which one failure is enough
+    settings.get_profile("same-every-time"),
+    phases=[Phase.explicit, Phase.generate],
+)
 settings.load_profile("same-every-time")
 
 

@@ -17,6 +17,7 @@ from asp_env.evaluation.statistics import (
     is_resolved,
     mean,
     ratio,
+    ratio_over_runs,
     resampled_means,
     resampled_sums,
     samples_needed,
@@ -117,6 +118,37 @@ def test_runs_and_recordings_are_both_resampled():
     assert set(draws[1:].tolist()) == {0.0, 4.0, 8.0}
     # a resample is 8 only with the second run (1/2) and the second recording twice (1/4)
     assert (draws[1:] == 8.0).mean() == pytest.approx(1 / 8, abs=0.03)
+
+
+def test_a_ratio_over_runs_by_hand():
+    """Runs whose values are 0 and 8 everywhere: one of them is drawn, so 0 and 8 are the bounds."""
+    numerators = np.array([[0.0, 0.0], [8.0, 8.0]])
+    estimate = ratio_over_runs(numerators, np.ones(2), np.array([0, 1]))
+    assert estimate == Estimate(value=4.0, low=0.0, high=8.0, n=2)
+    twice = ratio_over_runs(numerators, np.full((2, 2), 2.0), np.array([0, 1]))
+    assert twice == Estimate(value=2.0, low=0.0, high=4.0, n=2)
+
+
+def test_resamples_without_a_value_are_left_out_of_a_ratio_over_runs():
+    """A quarter of the resamples has the recording without a value twice, 0 / 0."""
+    estimate = ratio_over_runs(np.array([[3.0, 0.0]]), np.array([[1.0, 0.0]]), np.array(["a", "b"]))
+    assert estimate == Estimate(value=3.0, low=3.0, high=3.0, n=2)
+
+
+def test_a_ratio_over_runs_has_the_resamples_of_its_stream():
+    """The interval is that of the quotients of `resampled_sums` with the same stream."""
+    rng = np.random.default_rng(3)
+    numerators, groups = rng.normal(size=(5, 12)), np.arange(12) % 6
+    found = [ratio_over_runs(numerators, np.ones(12), groups, stream=k) for k in range(3)]
+    for stream, estimate in enumerate(found):
+        sums = resampled_sums(numerators, groups, stream=stream)
+        draws = sums / resampled_sums(np.ones((1, 12)), groups)
+        expected = interval(draws, n=12)
+        assert (estimate.value, estimate.low, estimate.high) == pytest.approx(
+            (expected.value, expected.low, expected.high)
+        )
+    assert found[0] == ratio_over_runs(numerators, np.ones(12), groups)
+    assert len({estimate.low for estimate in found}) == 3
 
 
 def test_the_variance_over_runs_is_unbiased():

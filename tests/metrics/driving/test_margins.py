@@ -169,6 +169,22 @@ def test_the_ego_continues_along_its_curvature() -> None:
     assert measures(on_circle)[1][0] < 3  # the time to collision extrapolates straight on
 
 
+@pytest.mark.parametrize("side", [1, -1])
+def test_the_ego_brakes_for_a_car_on_its_circle(side: int) -> None:
+    """A car stands 20 m further along a circle of 20 m, to the left or the right: 10² / (2 · 16).
+
+    On the other side it is not in the way.
+    """
+    angle = np.arange(5) * 10 * DT_S / 20
+    path = np.stack([20 * np.sin(angle), 20 - 20 * np.cos(angle), angle, 10 + 0 * angle], axis=-1)
+    ahead = np.tile([20 * math.sin(1), 20 - 20 * math.cos(1), 1.0, 0.0], (5, 1))
+    mirror = np.array([1, side, side, 1])
+    inside = np.stack([path * mirror, ahead * mirror], axis=1)[None]
+    outside = np.stack([path * mirror, ahead * mirror * [1, -1, -1, 1]], axis=1)[None]
+    assert measures(inside, wide_sector=True)[2][0] == pytest.approx(100 / 32, abs=0.1)
+    assert measures(outside, wide_sector=True)[2][0] == 0
+
+
 states = st.tuples(
     st.floats(-20, 40), st.floats(-15, 15), st.floats(-math.pi, math.pi), st.floats(0, 12)
 )
