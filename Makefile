@@ -16,7 +16,7 @@ MUTMUT := mutmut==3.8.1
 MUTANTS ?= *__mutmut_*7
 MUTATED := build/mutation
 
-.PHONY: demo test test-oldest smoke check mutants soak crash-campaign sbom audit clean
+.PHONY: demo test test-oldest smoke check mutants soak campaign crash-campaign sbom audit docs clean
 
 demo: $(INSTALLED)
 	$(BIN)/asp-env demo --out demo
@@ -57,6 +57,10 @@ mutants: .venv/mutmut/.installed
 	$(CURDIR)/.venv/mutmut/bin/mutmut run --max-children 2 '$(MUTANTS)'
 	cd $(MUTATED) && $(CURDIR)/.venv/mutmut/bin/mutmut results
 
+# 5,000 damaged inputs of each format; hours, see docs/robustness.md.
+campaign: $(INSTALLED)
+	$(BIN)/python -m tests.campaigns
+
 $(INSTALLED): pyproject.toml constraints.txt
 	test -d .venv || $(PYTHON) -m venv .venv
 	$(BIN)/pip install --quiet --disable-pip-version-check --constraint constraints.txt --editable '.[dev]'
@@ -75,7 +79,7 @@ $(OLDEST)/.installed: $(INSTALLED)
 
 # Kills commands at random moments, and compares what their reruns write: about ten CPU minutes.
 crash-campaign: $(INSTALLED)
-	$(BIN)/python -m tests.campaign.crashes
+	$(BIN)/python -m tests.campaigns.crashes
 
 # Lists what is installed in .venv, in CycloneDX's format, in sbom.json.
 sbom: $(AUDIT)/.installed

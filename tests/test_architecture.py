@@ -13,7 +13,10 @@ import pytest
 ROOT = Path(__file__).parents[1]
 PACKAGES = ("asp_env", "predictors", "scenarios", "policies")
 
-ON_ALL = {"arguments", "errors", "registry", "geometry", "files", "workers", "compiled"}
+ON_ALL = {
+    *("arguments", "errors", "registry", "geometry"),
+    *("files", "stored", "workers", "compiled"),
+}
 FOR_PREDICTORS = {"views", "metrics", "data", "dynamics"} | ON_ALL
 ARROWS = {
     "__init__": {"envs", "planning", "data", "dynamics", "errors"},
@@ -23,6 +26,7 @@ ARROWS = {
     "geometry": {"errors", "compiled"},
     "files": {"errors"},
     "compiled": {"files", "errors"},
+    "stored": {"errors"},
     "workers": {"errors"},
     "__main__": {"cli"},
     "cli": {"installation"} | ON_ALL,

@@ -33,6 +33,8 @@ _CHECKED = len(_MAGIC) + 4
 _HEAD = _CHECKED + 4
 _ALIGNMENT = 64
 _BLOCK = 1 << 20
+_SHOWN = 40
+"""Characters of the source's name in that of its file: names of files have at most 255 bytes."""
 
 
 def cache_folder() -> Path:
@@ -107,7 +109,7 @@ def get_or_create(group: str, name: str, make: Callable[[Path], None]) -> Path:
 def entry_path(folder: Path, source: Path, *salt: object) -> Path:
     """The cache file for data read from `source`; `salt` distinguishes several of one source."""
     key = hashlib.sha256(repr((str(source.resolve()), salt)).encode()).hexdigest()[:20]
-    return folder / f"{source.name.split('.')[0]}-{key}.bin"
+    return folder / f"{source.name.split('.')[0][:_SHOWN]}-{key}.bin"
 
 
 def stamp(files: Iterable[Path]) -> list[list[Any]]:

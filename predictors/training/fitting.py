@@ -20,6 +20,7 @@ from asp_env.data.recording import ticks
 from asp_env.data.source import join_data
 from asp_env.errors import AspEnvError
 from asp_env.files import is_temporary
+from asp_env.stored import parse_json
 from asp_env.views import make_view, with_history
 from predictors.inference.calibration import calibrate
 from predictors.inference.checkpoint import (
@@ -329,7 +330,7 @@ def _resumes(out: Path, run: dict[str, Any], *, first_stage: Path | None) -> boo
     check_folder(out, first_stage=first_stage)
     if (out / STATE / RUN).exists():
         try:
-            stored = json.loads((out / STATE / RUN).read_text())
+            stored = parse_json((out / STATE / RUN).read_bytes())
         except ValueError:
             stored = None
         if stored != json.loads(json.dumps(run)):

@@ -299,6 +299,12 @@ def test_missing_or_damaged_files_are_refused(tmp_path: Path) -> None:
     table.write_text(table.read_text().replace(",0.5", ",half"))
     with pytest.raises(DataError, match=r"scenario '00-1-2': could not convert"):
         write_report(tmp_path, title="x")
+    write_tables(tmp_path, metric_rows()[:2])
+    whole = (tmp_path / "metrics.csv").read_text()
+    for cut in (whole.rstrip()[:-20], whole.rstrip() + ",1\n"):
+        (tmp_path / "metrics.csv").write_text(cut)
+        with pytest.raises(DataError, match="row 3: has another number of cells"):
+            write_report(tmp_path, title="x")
     recording = make_recording(duration_s=30.0)
     write_run(tmp_path, [recording])
     with pytest.raises(DataError, match="no map of recording '00' was given; given were 01"):

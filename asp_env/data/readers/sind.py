@@ -26,6 +26,7 @@ from asp_env.data.readers.layout import (
     ClassNames,
     is_hidden,
     map_suffix,
+    may_be_read,
     shorten,
     walk,
     with_parents,
@@ -133,7 +134,7 @@ def _map(place: Path, root: Path) -> Path | None:
             path
             for each in (folder, *inside)
             for path in each.iterdir()
-            if map_suffix(path) == ".osm" and not is_hidden(path.name)
+            if map_suffix(path) == ".osm" and not is_hidden(path.name) and may_be_read(path)
         )
         if maps:
             location = place.parent.name.lower()

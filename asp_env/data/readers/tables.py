@@ -18,6 +18,7 @@ from jaxtyping import Float, Int
 
 from asp_env.data.readers.ranges import Limit
 from asp_env.errors import DataError
+from asp_env.stored import brief
 
 Kind = Literal["id", "whole", "number", "number or empty", "text"]
 """What the cells of a column must be: whole numbers of any size, whole numbers below `EXACT`,
@@ -471,8 +472,8 @@ def _diagnose(
             if expected := _expected(row[index], kind, limits.get(name)):
                 more = _count_beyond(path, index, limits.get(name))
                 raise DataError(
-                    f"{path}, line {number}: {name} is {row[index]!r}{more}, expected {expected}; "
-                    "correct the line or remove it"
+                    f"{path}, line {number}: {name} is {brief(repr(row[index]))}{more}, expected "
+                    f"{expected}; correct the line or remove it"
                 )
 
 

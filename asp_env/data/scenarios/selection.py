@@ -29,6 +29,7 @@ from asp_env.data.scenarios.scenario import (
 from asp_env.data.source import Recordings
 from asp_env.errors import AspEnvError, DataError
 from asp_env.files import atomic_file
+from asp_env.stored import parse_json
 
 SUFFIX = ".json"
 """Suffix of scenario files."""
@@ -226,7 +227,7 @@ def load_scenarios(path: Path, recordings: Recordings, *, dt_s: float, history: 
             with other content.
     """
     try:
-        head = json.loads(path.read_text())
+        head = parse_json(path.read_bytes())
         table = np.array(head["scenarios"], dtype=np.int64).reshape(-1, len(_FIELDS))
         contents = [(str(name), str(content)) for name, content in head["recordings"]]
         version, file_dt_s, file_history = (

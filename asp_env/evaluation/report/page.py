@@ -4,7 +4,6 @@ For every setting, that is data, traffic and latency, the page answers first: on
 ranking of the methods, the forecasts, what decides, and drives to look at.
 """
 
-import json
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cache
@@ -61,6 +60,7 @@ from asp_env.evaluation.report.tables import (
 from asp_env.evaluation.results import SCORE, difference_of
 from asp_env.evaluation.selection import split_name
 from asp_env.files import atomic_file
+from asp_env.stored import parse_json
 
 ASSETS = files("asp_env.evaluation.report") / "assets"
 SCRIPTS = ("draw.js", "charts.js", "pictures.js", "stage.js", "player.js", "page.js")
@@ -194,7 +194,7 @@ def write_report(
 
 def _read_manifest(path: Path) -> dict[str, Any]:
     try:
-        manifest = json.loads(path.read_text(encoding="utf-8"))
+        manifest = parse_json(path.read_bytes())
     except (OSError, ValueError) as error:
         raise DataError(f"{path}: not a manifest that can be read ({error})") from error
     if not isinstance(manifest, dict):

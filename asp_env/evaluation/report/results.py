@@ -182,6 +182,11 @@ def read_results(path: Path, *, privileged: Collection[str] = ()) -> Results:
     except (OSError, ValueError, csv.Error) as error:
         raise DataError(f"{path}: not a table of metrics ({error})") from error
     missing = [name for name in COLUMNS if name not in columns]
+    if cut := next((n for n, row in enumerate(rows, 2) if None in row or None in row.values()), 0):
+        raise DataError(
+            f"{path}, row {cut}: has another number of cells than the header, {len(columns)}; make "
+            "the results again"
+        )
     if set(missing) - set(ADDED_COLUMNS):
         raise DataError(f"{path}: no column {missing[0]!r}, expected {', '.join(COLUMNS)}")
     rows = [dict.fromkeys(missing, "") | row for row in rows if row.get("subset") != ANSWER]

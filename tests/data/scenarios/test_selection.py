@@ -202,7 +202,7 @@ def test_one_scenario_of_a_file(
         choose_scenarios(recordings, f"{path}#x", **TICKS)
 
 
-@pytest.mark.parametrize("text", ["", "[1, 2]", "{", "3", '"a"', "\x00"])
+@pytest.mark.parametrize("text", ["", "[1, 2]", "{", "3", '"a"', "\x00", "[" * 100_000])
 def test_other_and_missing_files_are_rejected(
     text: str, recordings: Recordings, tmp_path: Path
 ) -> None:

@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from tests.campaign import crashes
+from tests.campaigns import crashes
 
 
 @pytest.fixture(scope="module")

@@ -1,6 +1,6 @@
 """Kills commands at random moments, and compares what their reruns write with undisturbed runs.
 
-    python -m tests.campaign.crashes --kills 8 --seed 0
+    python -m tests.campaigns.crashes --kills 8 --seed 0
 
 Every case is a command of `asp-env` on tiny data. It runs once undisturbed, while the folder that
 it writes is watched: each change of a name, a size or a time stamp there is a moment. Then it is
