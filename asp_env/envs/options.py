@@ -90,8 +90,9 @@ def raster_size(raster_px: int | Sequence[int] | None) -> tuple[int, int] | None
     """
     if raster_px is None:
         return None
-    is_pair = not isinstance(raster_px, str) and isinstance(raster_px, Sequence)
-    sizes: list[Any] = list(raster_px) if is_pair else [raster_px] * 2
+    sizes: list[Any] = [raster_px] * 2
+    if isinstance(raster_px, Sequence) and not isinstance(raster_px, str):
+        sizes = list(raster_px)
     try:
         height, width = (whole_number("", size, least=1, most=MAX_RASTER_PX) for size in sizes)
     except (AspEnvError, ValueError):

@@ -99,7 +99,7 @@ _DRIVERS: dict[str, CellDriver] = {}
 
 def _drive(state: tuple[_Setup, str, Mapping[str, str]], task: Task) -> EpisodeScores:
     """Drives a cell in a worker."""
-    import ray
+    import ray  # pyright: ignore[reportMissingImports]
 
     setup, code, expected = state
     found = versions()
@@ -126,7 +126,7 @@ def _connected(address: str) -> Any:
     """
     os.environ.setdefault("RAY_ACCEL_ENV_VAR_OVERRIDE_ON_ZERO", "0")
     try:
-        import ray
+        import ray  # pyright: ignore[reportMissingImports]
     except ModuleNotFoundError as error:
         raise MissingExtraError("ray", "ray", "--ray") from error
     try:

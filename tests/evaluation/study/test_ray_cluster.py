@@ -28,7 +28,7 @@ def test_two_nodes_and_lost_workers_give_the_bytes_of_one_process(
 ) -> None:
     """With data from the file system and from the object store; one node is killed on the way."""
     pytest.importorskip("ray")
-    from ray.cluster_utils import Cluster
+    from ray.cluster_utils import Cluster  # pyright: ignore[reportMissingImports]
 
     monkeypatch.setenv("RAY_ENABLE_UV_RUN_RUNTIME_ENV", "0")
     drives = ((*ON_ROAD, car(-60, 8)), (ON_ROAD[1], car(-95, 8), car(-40, 7)))
@@ -77,7 +77,7 @@ def test_files_that_are_sent_are_written_once(tmp_path: Path, monkeypatch) -> No
 
 def test_without_a_cluster_or_without_ray_one_line_says_so() -> None:
     try:
-        import ray  # noqa: F401
+        import ray  # noqa: F401  # pyright: ignore[reportMissingImports]
     except ModuleNotFoundError:
         with pytest.raises(MissingExtraError, match=r"pip install 'asp-env\[ray\]'"):
             next(drive_on_ray([], 0.2, [], "auto"))
