@@ -141,7 +141,9 @@ def _parse(name: str, command: Any, args: Sequence[str]) -> Any:
 def _print_plugs(command: Any) -> None:
     """Prints the registered names that options of a command take, of all installed packages."""
     options = getattr(command, "__annotations__", {})
-    groups = dict.fromkeys(PLUGS_OF_OPTION[name] for name in options if name in PLUGS_OF_OPTION)
+    groups: dict[registry.Group, None] = {
+        PLUGS_OF_OPTION[name]: None for name in options if name in PLUGS_OF_OPTION
+    }
     for group in groups:
         sys.stdout.write(f"{group}: {', '.join(registry.names(group))}\n")
 
