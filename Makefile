@@ -8,7 +8,7 @@ OLDEST_GYMNASIUM := $(shell sed -n 's/.*"gymnasium>=\([0-9.]*\)".*/\1/p' pyproje
 OLDEST_TESTS := tests/envs/test_checkers.py tests/envs/test_vector_contract.py \
 	tests/envs/test_observation_ids.py tests/envs/test_constructors.py
 
-.PHONY: demo test test-oldest check clean
+.PHONY: demo test test-oldest check docs clean
 
 demo: $(INSTALLED)
 	$(BIN)/asp-env demo --out demo
@@ -25,6 +25,10 @@ check: $(INSTALLED)
 	$(BIN)/ruff format --check .
 	$(BIN)/basedpyright
 	$(BIN)/pytest -n 2 --dist worksteal
+
+# The site is in build/site; warnings are errors.
+docs: $(INSTALLED)
+	NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --strict --quiet
 
 $(INSTALLED): pyproject.toml constraints.txt
 	test -d .venv || $(PYTHON) -m venv .venv
