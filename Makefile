@@ -16,7 +16,7 @@ MUTMUT := mutmut==3.8.1
 MUTANTS ?= *__mutmut_*7
 MUTATED := build/mutation
 
-.PHONY: demo test test-oldest smoke check mutants soak campaign crash-campaign sbom audit docs clean
+.PHONY: demo test test-oldest smoke check docs mutants soak campaign crash-campaign sbom audit clean
 
 demo: $(INSTALLED)
 	$(BIN)/asp-env demo --out demo
@@ -60,6 +60,10 @@ mutants: .venv/mutmut/.installed
 # 5,000 damaged inputs of each format; hours, see docs/robustness.md.
 campaign: $(INSTALLED)
 	$(BIN)/python -m tests.campaigns
+
+# The site is in build/site; warnings are errors.
+docs: $(INSTALLED)
+	NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --strict --quiet
 
 $(INSTALLED): pyproject.toml constraints.txt
 	test -d .venv || $(PYTHON) -m venv .venv
