@@ -7,6 +7,7 @@ from hypothesis import strategies as st
 
 from asp_env.evaluation.statistics import (
     RESAMPLES,
+    Difference,
     Estimate,
     average_runs,
     difference,
@@ -17,6 +18,7 @@ from asp_env.evaluation.statistics import (
     mean,
     ratio,
     ratio_over_runs,
+    resampled_means,
     resampled_sums,
     samples_needed,
 )
@@ -207,6 +209,29 @@ def test_resolved_needs_both_the_interval_and_the_effect():
     assert is_resolved(-0.03, -0.05, -0.01, 0.028)
     assert not is_resolved(0.03, 0.001, 0.06, 0.042)  # an interval above 0, less than the MDE
     assert not is_resolved(0.03, -0.001, 0.05, 0.028)  # the MDE, but 0 in the interval
+
+
+def test_text_of_estimates_and_differences():
+    estimate = Estimate(value=0.5, low=0.25, high=0.75, n=4)
+    assert f"{estimate:.2f}" == "0.50 [0.25, 0.75]"
+    assert f"{Estimate(value=0.5, low=None, high=None, n=4):+.1f}" == "+0.5"
+    resolved = Difference(estimate=estimate, mde=0.4, p=0.01)
+    assert f"{resolved:+.2f}" == "+0.50 [+0.25, +0.75]"
+    assert f"{Difference(estimate=estimate, mde=0.6, p=0.04):+.1f}" == (
+        "+0.5 [+0.2, +0.8], not resolved (smallest that could be seen 0.6)"
+    )
+    alone = Difference(estimate=Estimate(value=-1.0, low=None, high=None, n=1), mde=None, p=None)
+    assert f"{alone:+.1f}" == "-1.0, not resolved"
+
+
+def test_means_are_ratios_of_sums():
+    values, groups = np.array([[1.0, 2.0, 6.0], [3.0, 2.0, 4.0]]), np.array([0, 0, 1])
+    means = resampled_means(values, groups)
+    assert means[0] == 3.0
+    # Resamples draw both groups once, or one of the groups twice, with equal shares of the runs or
+    # one run alone: all lie between the least and the largest group mean of a run.
+    assert means.min() == 1.5
+    assert means.max() == 6.0
 
 
 def test_samples_needed_by_hand():
