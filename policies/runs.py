@@ -296,7 +296,8 @@ def _read_space(content: Any, folder: Path) -> spaces.Dict:
         )
     except (KeyError, TypeError, ValueError, AttributeError) as error:
         raise AspEnvError(
-            f"{folder / CONFIG}: damaged ({type(error).__name__}: {brief(error)}); train the policy again"
+            f"{folder / CONFIG}: damaged ({type(error).__name__}: {brief(error)}); train the "
+            "policy again"
         ) from None
 
 
