@@ -146,11 +146,13 @@ def _fits(value: object, hint: Any) -> bool:
             isinstance(key, str) and _fits(each, parts[1]) for key, each in value.items()
         )
     if hint is int:
-        is_whole = isinstance(value, int) and not isinstance(value, bool)
-        return is_whole and abs(value) < WHOLE_BELOW
+        if not isinstance(value, int) or isinstance(value, bool):
+            return False
+        return abs(value) < WHOLE_BELOW
     if hint is float:
-        is_number = isinstance(value, int | float) and not isinstance(value, bool)
-        return is_number and abs(value) < math.inf
+        if not isinstance(value, int | float) or isinstance(value, bool):
+            return False
+        return abs(value) < math.inf
     return isinstance(value, hint) if hint in (bool, str, types.NoneType) else True
 
 

@@ -190,6 +190,6 @@ def settings_from(content: Any, path: Path) -> PolicySettings:
         )
     except (TypeError, KeyError, ValueError) as error:
         raise AspEnvError(
-            f"{path}: not the settings of a policy ({type(error).__name__}: {brief(error)}); train "
-            "the policy again"
+            f"{path}: not the settings of a policy ({type(error).__name__}: {brief(error)}); "
+            "train the policy again"
         ) from None

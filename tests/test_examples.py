@@ -1,4 +1,4 @@
-"""The examples and the code in the documentation of the environments run."""
+"""The examples and the code in the documentation run."""
 
 import re
 from pathlib import Path
@@ -8,7 +8,8 @@ import cv2
 import numpy as np
 import pytest
 
-from asp_env import Planner
+from asp_env import Planner, registry
+from asp_env.cli import main
 from asp_env.data.classes import AgentClass
 from examples import (
     own_predictor,
@@ -19,6 +20,7 @@ from examples import (
     train_a_policy,
 )
 from tests.builders import Drive
+from tests.data.readers.test_own_readers import write_geo_trax
 from tests.planning.situations import STEPS, approach, two_modes
 
 EXAMPLES = sorted(Path(own_predictor.__file__).parent.glob("*.py"))
@@ -29,7 +31,10 @@ def test_examples_have_at_most_80_lines(path: Path) -> None:
     assert len(path.read_text().splitlines()) <= 80
 
 
-@pytest.mark.parametrize("page", ["environment.md", "planners.md", "rl.md"])
+@pytest.mark.parametrize(
+    "page",
+    ["environment.md", "guides/own_planner.md", "guides/own_driver.md", "rl.md", "offline.md"],
+)
 def test_python_code_in_the_documentation_runs(page: str) -> None:
     """The blocks of a page run one after another, trainings at reduced length.
 
@@ -41,9 +46,45 @@ def test_python_code_in_the_documentation_runs(page: str) -> None:
             exec(re.sub(r"\.learn\([\d_]+\)", ".learn(64)", code), names)
 
 
+README = Path(own_predictor.__file__).parents[1] / "README.md"
+
+
+def test_python_code_of_the_readme_runs() -> None:
+    for code in re.findall(r"```python\n(.*?)```", README.read_text(), re.DOTALL):
+        exec(code, {})
+
+
+def test_commands_of_the_readme_run(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Those in blocks, and the first steps with the sample, with one scenario each."""
+    text = README.read_text()
+    commands = [
+        line.removeprefix("asp-env ")
+        for block in re.findall(r"```sh\n(.*?)```", text, re.DOTALL)
+        for line in block.splitlines()
+    ]
+    commands += re.findall(r"`asp-env ([^`]*sample:[^`]*)`", text)
+    assert len(commands) == 3
+    monkeypatch.chdir(tmp_path)
+    for command in commands:
+        assert main(re.sub(r"--max-scenarios \d+", "--max-scenarios 1", command).split()) == 0
+    output = capsys.readouterr().out
+    assert "oracle" in output
+    assert len(list(tmp_path.glob("*/report.html"))) == 3
+
+
+def test_every_command_is_in_the_readme() -> None:
+    """Every command has a line in its table, and every line of it a command."""
+    named = set(re.findall(r"^\| `asp-env ([a-z]+(?: [a-z]+)?)", README.read_text(), re.MULTILINE))
+    commands = set(registry.names("commands"))
+    found = {name for name in commands if any(f"{word} ".startswith(f"{name} ") for word in named)}
+    assert commands - found == {"demo", "rl demonstrations"}  # make demo, docs/rl.md
+
+
 def test_the_planner_of_the_documentation() -> None:
     """At most 30 lines; it brakes by 3 m/s² from a probability of 20 % on."""
-    code = _python_blocks("planners.md")[0]
+    code = _python_blocks("guides/own_planner.md")[0]
     assert len(code.splitlines()) <= 30
     names: dict[str, Any] = {}
     exec(code, names)
@@ -58,6 +99,19 @@ def test_the_planner_of_the_documentation() -> None:
     assert (likely.actions[0, :, 0] == -3.0).all()
     assert (rare.actions[0, :, 0] > 0.0).all()
     assert likely.states[0, -1, 3] == pytest.approx(10.0 - 3.0 * 0.2 * STEPS, abs=1e-3)
+
+
+def test_the_reader_of_the_documentation(tmp_path: Path) -> None:
+    """It finds the table, and a bus that drives at 10 m/s along +y beside a car that stands."""
+    names: dict[str, Any] = {}
+    exec(_python_blocks("readers.md")[0], names)
+    (found,) = names["find_recordings"](write_geo_trax(tmp_path / "songdo").parent)
+    measured = found.read_tables().measurements
+    bus = measured.track == 1
+    velocity = np.gradient(measured.positions[bus], measured.time_ms[bus] / 1000, axis=0)
+    np.testing.assert_allclose(np.median(velocity, axis=0), (0.0, 10.0), atol=0.05)
+    assert (measured.classes[bus] == AgentClass.BUS).all()
+    assert (np.ptp(measured.positions[~bus], axis=0) == 0).all()
 
 
 def _python_blocks(page: str) -> list[str]:

@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
+from asp_env import arguments
 from asp_env.data.classes import AgentClass
 from asp_env.data.scenarios.scenario import Scenario
 from asp_env.errors import DataError
@@ -80,7 +81,7 @@ class Rollout:
     """Which events of `event_names` occur at each tick."""
     event_names: tuple[str, ...]
 
-    def save(self, path: Path) -> None:
+    def save(self, path: str | Path) -> None:
         """Writes one compressed `.npz`, atomically."""
         header = {
             "format": FORMAT,
@@ -94,16 +95,17 @@ class Rollout:
             if isinstance(value := getattr(self, field.name), np.ndarray)
         }
         text = np.frombuffer(json.dumps(header).encode(), dtype=np.uint8)
-        with atomic_file(path) as partial, partial.open("wb") as file:
+        with atomic_file(arguments.path("rollout", path)) as partial, partial.open("wb") as file:
             np.savez_compressed(file, header=text, **arrays)
 
     @classmethod
-    def load(cls, path: Path) -> "Rollout":
+    def load(cls, path: str | Path) -> "Rollout":
         """Reads a file written by `save`.
 
         Raises:
             DataError: the file is missing, damaged, or of another format version.
         """
+        path = arguments.path("rollout", path)
         try:
             arrays = read_arrays(path)
             header = parse_json(arrays.pop("header").tobytes())

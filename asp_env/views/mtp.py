@@ -39,7 +39,8 @@ from jaxtyping import Int64, UInt8, UInt32
 
 from asp_env.compiled import njit
 from asp_env.data.classes import VULNERABLE, AgentClass
-from asp_env.data.road_map import LineType, MapCache, RoadMap
+from asp_env.data.map_cache import MapCache
+from asp_env.data.road_map import LineType, RoadMap
 from asp_env.errors import AspEnvError
 from asp_env.stored import check_fields
 from asp_env.views.draw import draw_coloured_agents, draw_coloured_lines

@@ -20,7 +20,7 @@ from asp_env.data.predictor import Predictor
 from asp_env.data.split import TrainedOn
 from asp_env.dynamics.bicycle import Integrator
 from asp_env.errors import AspEnvError, CheckpointError, unknown_name
-from asp_env.files import atomic_file, remove_stale
+from asp_env.files import atomic_file
 from asp_env.stored import check_fields, parse_json
 from asp_env.views import BinaryView, SceneView, view_from_config
 from predictors.guarded import Guarded
@@ -396,10 +396,9 @@ def write_json(content: dict[str, Any], path: Path) -> None:
 
 
 def write_file(content: bytes, path: Path) -> None:
-    """Writes a file atomically, and removes what killed processes left beside it."""
+    """Writes a file atomically."""
     with atomic_file(path) as partial:
         partial.write_bytes(content)
-    remove_stale(path)
 
 
 def _brief(error: BaseException) -> str:

@@ -23,7 +23,7 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from asp_env.errors import CheckpointError
-from asp_env.files import atomic_file, remove_stale
+from asp_env.files import atomic_file
 
 FEATURES = "features.safetensors"
 """File of the statistics within the folder of a run."""
@@ -82,7 +82,6 @@ class FeatureDistance:
         path = folder / FEATURES
         with atomic_file(path) as partial:
             partial.write_bytes(save(arrays))
-        remove_stale(path)
 
     @classmethod
     def load(cls, folder: Path, *, name: str, features: int) -> "FeatureDistance":

@@ -1,7 +1,7 @@
 """Export of a trained predictor to an ONNX file that documents itself.
 
 Inputs and outputs are tensors of any number of targets, in the targets' frames now; the file
-describes each of them, as does `docs/predictors.md`. The file's metadata are the run's
+describes each of them, as does `docs/export.md`. The file's metadata are the run's
 `config.json`, the predicted classes, and how segments are chained.
 """
 
