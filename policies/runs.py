@@ -296,7 +296,8 @@ def _read_space(content: Any, folder: Path) -> spaces.Dict:
         )
     except (KeyError, TypeError, ValueError, AttributeError) as error:
         raise AspEnvError(
-            f"{folder / CONFIG}: damaged ({type(error).__name__}: {error}); train the policy again"
+            f"{folder / CONFIG}: damaged ({type(error).__name__}: {brief(error)}); train the "
+            "policy again"
         ) from None
 
 
@@ -317,7 +318,7 @@ def read_tensors(path: Path) -> dict[str, Tensor]:
             f"{path}: missing, the training has not ended; resume it with asp-env rl train --resume"
         ) from None
     except (OSError, SafetensorError) as error:
-        raise AspEnvError(f"{path}: damaged ({error}); train the policy again") from None
+        raise AspEnvError(f"{path}: damaged ({brief(error)}); train the policy again") from None
 
 
 def write_tensors(path: Path, tensors: Mapping[str, Tensor]) -> None:

@@ -10,7 +10,7 @@ from typing import Any, Literal, get_args
 
 from asp_env.data.recording import DEFAULT_DT_S
 from asp_env.errors import AspEnvError, unknown_name
-from asp_env.stored import check_fields, parse_json
+from asp_env.stored import brief, check_fields, parse_json
 
 Algorithm = Literal["ppo", "sac", "recurrent-ppo", "bc"]
 ALGORITHMS: tuple[str, ...] = get_args(Algorithm)
@@ -165,7 +165,7 @@ def read_settings(folder: Path) -> PolicySettings:
             "asp-env rl train"
         ) from None
     except (OSError, ValueError) as error:
-        raise AspEnvError(f"{path}: damaged ({error}); train the policy again") from None
+        raise AspEnvError(f"{path}: damaged ({brief(error)}); train the policy again") from None
     return settings_from(content.get("settings") if isinstance(content, dict) else None, path)
 
 
@@ -190,6 +190,6 @@ def settings_from(content: Any, path: Path) -> PolicySettings:
         )
     except (TypeError, KeyError, ValueError) as error:
         raise AspEnvError(
-            f"{path}: not the settings of a policy ({type(error).__name__}: {error}); train the "
-            "policy again"
+            f"{path}: not the settings of a policy ({type(error).__name__}: {brief(error)}); "
+            "train the policy again"
         ) from None

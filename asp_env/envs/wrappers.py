@@ -170,12 +170,13 @@ class VectorPredictionFeatures(VectorObservationWrapper):
             AspEnvError: the environment, the predictor or an argument is invalid.
             TypeError: `env` is no environment.
         """
-        super().__init__(env)
-        if env.metadata.get("autoreset_mode") is AutoresetMode.SAME_STEP:
+        metadata = env.metadata if isinstance(env, VectorEnv) else {}
+        if metadata.get("autoreset_mode") is AutoresetMode.SAME_STEP:
             raise AspEnvError(
                 "VectorPredictionFeatures: autoreset_mode 'SameStep' needs the forecasts of ended "
                 "episodes; make the environment itself with predictor=…, or with 'NextStep'"
             )
+        super().__init__(env)
         options = ForecastOptions(
             agents=agents,
             modes=modes,

@@ -26,6 +26,9 @@ from asp_env.errors import AspEnvError, LeftOutWarning, RepairWarning
 from tests.campaigns.formats import Format, NotFinite
 from tests.campaigns.mutations import mutate_file, mutate_folder
 
+COMPILING_S = 120.0
+"""Largest CPU time of an input that is not changed, in which functions may be compiled."""
+
 LIMIT_S = 10.0
 """CPU time of one mutant."""
 
@@ -73,7 +76,7 @@ def run_mutants(
     origin.mkdir()
     kind.make(origin)
     shutil.copytree(origin, changed)
-    verdict = judge(kind, changed, -1, "unchanged")
+    verdict = judge(kind, changed, -1, "unchanged", limit_s=COMPILING_S)
     if verdict.outcome != "accepted":
         raise AssertionError(
             f"{kind.name}: the unchanged input is {verdict.outcome}: {verdict.detail}"
@@ -97,7 +100,9 @@ def mutate(rng: np.random.Generator, kind: Format, folder: Path) -> str:
     return ", ".join(names)
 
 
-def judge(kind: Format, folder: Path, mutant: int, mutation: str) -> Verdict:
+def judge(
+    kind: Format, folder: Path, mutant: int, mutation: str, *, limit_s: float = LIMIT_S
+) -> Verdict:
     """Uses an input and judges how that ends.
 
     Args:
@@ -105,10 +110,11 @@ def judge(kind: Format, folder: Path, mutant: int, mutation: str) -> Verdict:
         folder: the input.
         mutant: its number.
         mutation: what was changed.
+        limit_s: largest CPU time.
     """
     outcome, detail = "accepted", ""
     try:
-        with _limits(), warnings.catch_warnings(), contextlib.redirect_stderr(io.StringIO()):
+        with _limits(limit_s), warnings.catch_warnings(), contextlib.redirect_stderr(io.StringIO()):
             warnings.simplefilter("error")
             for category in (RepairWarning, LeftOutWarning):
                 warnings.simplefilter("ignore", category)
@@ -142,14 +148,14 @@ def _place(error: BaseException) -> str:
 
 
 @contextlib.contextmanager
-def _limits() -> Iterator[None]:
+def _limits(limit_s: float) -> Iterator[None]:
     def exceeded(number: int, _: object) -> None:
-        raise _Exceeded("over 10 s" if number == signal.SIGPROF else "blocked")
+        raise _Exceeded(f"over {limit_s:g} s" if number == signal.SIGPROF else "blocked")
 
     before = [signal.signal(number, exceeded) for number in (signal.SIGPROF, signal.SIGALRM)]
     memory = resource.getrlimit(resource.RLIMIT_DATA)
     try:
-        signal.setitimer(signal.ITIMER_PROF, LIMIT_S)
+        signal.setitimer(signal.ITIMER_PROF, limit_s)
         signal.setitimer(signal.ITIMER_REAL, BLOCKED_S)
         resource.setrlimit(resource.RLIMIT_DATA, (_data_bytes() + LIMIT_BYTES, memory[1]))
         yield

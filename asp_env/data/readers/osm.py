@@ -1,5 +1,6 @@
 """Elements of an OSM file: nodes, ways and relations with their tags."""
 
+import warnings
 import xml.etree.ElementTree as ElementTree
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -64,9 +65,14 @@ def read_osm(path: Path) -> Osm:
             declares entities.
     """
     try:
-        _check_prolog(path)
-        return _read(path)
-    except (ElementTree.ParseError, expat.ExpatError, ValueError, LookupError) as error:
+        with warnings.catch_warnings():
+            warnings.simplefilter("error", DeprecationWarning)  # of codecs such as unicode_escape
+            _check_prolog(path)
+            return _read(path)
+    except (
+        *(ElementTree.ParseError, expat.ExpatError, ValueError, LookupError),
+        DeprecationWarning,
+    ) as error:
         if isinstance(error, DataError):
             raise
         raise DataError(

@@ -60,7 +60,7 @@ from asp_env.evaluation.report.tables import (
 from asp_env.evaluation.results import SCORE, difference_of
 from asp_env.evaluation.selection import split_name
 from asp_env.files import atomic_file
-from asp_env.stored import parse_json
+from asp_env.stored import brief, parse_json
 
 ASSETS = files("asp_env.evaluation.report") / "assets"
 SCRIPTS = ("draw.js", "charts.js", "pictures.js", "stage.js", "player.js", "page.js")
@@ -199,6 +199,12 @@ def _read_manifest(path: Path) -> dict[str, Any]:
         raise DataError(f"{path}: not a manifest that can be read ({error})") from error
     if not isinstance(manifest, dict):
         raise DataError(f"{path}: expected a JSON object, found {type(manifest).__name__}")
+    privileged = manifest.get("privileged", [])
+    if not (isinstance(privileged, list) and all(isinstance(name, str) for name in privileged)):
+        raise DataError(
+            f"{path}: privileged is {brief(repr(privileged))}, expected a list of names; make the "
+            "results again"
+        )
     return manifest
 
 
