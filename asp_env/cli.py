@@ -5,7 +5,7 @@ import io
 import re
 import sys
 import warnings
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from typing import Any
 
 import tyro
@@ -14,11 +14,24 @@ from rich.table import Table
 
 from asp_env import registry
 from asp_env.errors import AspEnvError, LeftOutWarning
+from asp_env.installation.version import version_line
+
+PLUGS_OF_OPTION: Mapping[str, registry.Group] = {
+    "predictor": "predictors",
+    "predictors": "predictors",
+    "planner": "planners",
+    "traffic": "drivers",
+    "view": "views",
+    "data": "readers",
+}
+"""Groups of plugs that options of commands name; `--help` lists them."""
 
 BAD_INPUT = 2
 """Exit status for input that a command rejects."""
 
 HELP = ("-h", "--help")
+
+VERSION = "--version"
 
 STRICT = "--strict"
 """Option of every command: a recording that cannot be read is an error."""
@@ -40,10 +53,13 @@ def main(argv: Sequence[str] | None = None) -> int:
         argv: the command and its options, by default those of the process.
 
     Returns:
-        The exit status: 0 on success, 2 with one line on stderr for bad input, 130 when
-        interrupted.
+        The exit status: 0 on success or that of the command, 2 with one line on stderr for bad
+        input, 130 when interrupted.
     """
     args = list(sys.argv[1:] if argv is None else argv)
+    if args[:1] == [VERSION]:
+        sys.stdout.write(f"{version_line()}\n")
+        return 0
     group = args.pop(0) if args and args[0] in _groups() else ""
     if not args or args[0] in HELP:
         _print_commands(group)
@@ -54,7 +70,7 @@ def main(argv: Sequence[str] | None = None) -> int:
         strict = STRICT in options
         options = _with_current_names(name, [option for option in options if option != STRICT])
         with _one_line_warnings(strict=strict):
-            _parse(name, command, options).run()
+            status = _parse(name, command, options).run()
     except AspEnvError as error:
         return _report(str(error))
     except LeftOutWarning as warning:
@@ -65,7 +81,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     except KeyboardInterrupt:
         sys.stderr.write("asp-env: interrupted\n")
         return 130
-    return 0
+    return status or 0
 
 
 @contextlib.contextmanager
@@ -114,11 +130,22 @@ def _parse(name: str, command: Any, args: Sequence[str]) -> Any:
             return tyro.cli(command, prog=f"asp-env {name}", args=args)
     except SystemExit as stop:
         if not stop.code:
+            _print_plugs(command)
             raise
         lines = [line.strip("│─ ") or ";" for line in stderr.getvalue().splitlines()[1:-1]]
         text = " ".join(lines).replace(" ;", ";")
         problem = re.split("; (?:For full|Argument) helptext", text)[0].rstrip(".")
         raise AspEnvError(f"{problem}; see asp-env {name} --help") from None
+
+
+def _print_plugs(command: Any) -> None:
+    """Prints the registered names that options of a command take, of all installed packages."""
+    options = getattr(command, "__annotations__", {})
+    groups: dict[registry.Group, None] = {
+        PLUGS_OF_OPTION[name]: None for name in options if name in PLUGS_OF_OPTION
+    }
+    for group in groups:
+        sys.stdout.write(f"{group}: {', '.join(registry.names(group))}\n")
 
 
 def _report(message: str) -> int:
@@ -142,7 +169,8 @@ def _print_commands(group: str = "") -> None:
     console.print(f"usage: {prog} COMMAND …    ({prog} COMMAND --help lists its options)\n")
     console.print(table)
     console.print(
-        f"\n{STRICT}, with every command: a recording of DATA that cannot be read is an error; "
+        f"\nasp-env {VERSION} prints versions and platform.\n"
+        f"{STRICT}, with every command: a recording of DATA that cannot be read is an error; "
         "without it, the recording is left out with a warning."
     )
 

@@ -3,23 +3,51 @@
 Numba's own cache raises errors at every start if a file of it is damaged, and at import where no
 folder can be written. Here such a file counts as absent, and without a folder functions are
 compiled anew in each process; one line says so.
+
+The files are pickles, and whoever writes a pickle decides what a program does that reads it. A file
+counts as absent, too, unless it belongs to this user, to root or to the owner of the function's
+source, and nobody else may write it.
 """
 
 import hashlib
 import logging
+import os
 import pickle
-from collections.abc import Callable
-from typing import Any
+import secrets
+import stat
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import IO, Any
 
 import numba
 from numba.core.caching import FunctionCache, IndexDataCacheFile
 
+from asp_env.files import atomic_file
+
 _logger = logging.getLogger("asp_env")
 _noted: set[str] = set()
+
+_WRITABLE_BY_OTHERS = stat.S_IWGRP | stat.S_IWOTH
 
 
 class _CheckedFiles(IndexDataCacheFile):
     """An index and data files, each of which begins with the SHA-256 hash of its content."""
+
+    def __init__(self, *, owners: frozenset[int], **options: Any) -> None:
+        super().__init__(**options)
+        self._owners = owners
+
+    def save(self, key: Any, data: Any) -> None:
+        """Stores compiled code in a file with a name of its own.
+
+        Numba's names are numbers that count up. Two processes that compile different signatures
+        at the same time take the same one, and each signature may then get the other's code.
+        """
+        overloads = self._load_index()
+        name = overloads.setdefault(key, self._data_name(secrets.randbits(32)))
+        self._save_index(overloads)
+        self._save_data(name, data)
 
     def _dump(self, obj: Any) -> bytes:
         content = super()._dump(obj)
@@ -28,6 +56,7 @@ class _CheckedFiles(IndexDataCacheFile):
     def _load_index(self) -> dict[Any, str]:
         try:
             with open(self._index_path, "rb") as file:
+                self._check(file)
                 if pickle.load(file) != self._version:
                     return {}
                 stamp, overloads = _checked(file.read())
@@ -37,7 +66,25 @@ class _CheckedFiles(IndexDataCacheFile):
 
     def _load_data(self, name: str) -> Any:
         with open(self._data_path(name), "rb") as file:
+            self._check(file)
             return _checked(file.read())
+
+    def _check(self, file: IO[bytes]) -> None:
+        """Refuses a file that somebody else could have written.
+
+        Raises:
+            PermissionError: somebody else could.
+        """
+        status = os.fstat(file.fileno())
+        if status.st_uid not in self._owners or status.st_mode & _WRITABLE_BY_OTHERS:
+            raise PermissionError(f"{file.name} may be written by others")
+
+    @contextmanager
+    def _open_for_write(self, filepath: str) -> Iterator[Any]:
+        with atomic_file(Path(filepath)) as partial, partial.open("wb") as file:
+            mode = os.fstat(file.fileno()).st_mode
+            os.fchmod(file.fileno(), stat.S_IMODE(mode) & ~_WRITABLE_BY_OTHERS)
+            yield file
 
 
 class _CheckedCache(FunctionCache):
@@ -49,6 +96,7 @@ class _CheckedCache(FunctionCache):
             cache_path=self._cache_path,
             filename_base=self._impl.filename_base,
             source_stamp=self._impl.locator.get_source_stamp(),
+            owners=frozenset({0, os.geteuid(), os.stat(function.__code__.co_filename).st_uid}),
         )
 
     def load_overload(self, sig: Any, target_context: Any) -> Any:

@@ -37,19 +37,23 @@ class MissingExtraError(AspEnvError, ImportError):
         )
 
 
+class StaleInstallError(AspEnvError):
+    """The metadata of the installed package are older than its code, and lack names of it."""
+
+
 class LeftOutWarning(UserWarning):
     """Recordings of DATA that cannot be read are left out. An error with `--strict`."""
 
 
-def unknown_name(kind: str, given: str, known: Iterable[str]) -> AspEnvError:
+def unknown_name(kind: str, given: object, known: Iterable[str]) -> AspEnvError:
     """An error that suggests the most similar known name and lists all of them.
 
     Args:
         kind: what the name stands for, such as `predictor`.
-        given: the unknown name.
+        given: the unknown name, or what was given in its place.
         known: all known names.
     """
     names = sorted(known)
-    near = difflib.get_close_matches(given, names, n=1)
+    near = difflib.get_close_matches(given, names, n=1) if isinstance(given, str) else []
     hint = f" (did you mean {near[0]!r}?)" if near else ""
     return AspEnvError(f"unknown {kind} {given!r}{hint}: known are {', '.join(names)}")

@@ -17,7 +17,8 @@ an idle process and waits for the reply. The processes are new Python interprete
 - On Ctrl-C it waits until running tasks are done.
 
 Processes end with the program that started them, even if that is killed: the kernel then closes
-its end of the socket, which a thread of every worker process waits for.
+its end of the socket, which a thread of every worker process waits for. The programs that they have
+started, such as SUMO, end with them: each worker process leads a process group.
 """
 
 import os
@@ -43,9 +44,6 @@ from asp_env.errors import AspEnvError
 
 Task = TypeVar("Task")
 Result = TypeVar("Result")
-
-ABANDONED = 3
-"""Exit status of a worker process whose parent process has ended."""
 
 _END = b""
 """Ends a worker process. Pickled tasks are never empty."""
@@ -142,7 +140,7 @@ class WorkerPool(Generic[Task, Result]):
             worker.wait()
 
     def terminate(self) -> None:
-        """Ends the processes at once with SIGTERM."""
+        """Ends the processes, and the programs that they have started, at once with SIGTERM."""
         for worker in self._workers:
             worker.terminate()
         self._threads.shutdown(cancel_futures=True)
@@ -218,7 +216,7 @@ class _Worker:
     def terminate(self) -> None:
         with self._lock:
             if self._process.returncode is None:
-                os.kill(self._process.pid, signal.SIGTERM)
+                os.killpg(self._process.pid, signal.SIGTERM)
 
     def wait(self) -> int:
         """Waits until the process has ended; its exit status."""
@@ -243,14 +241,19 @@ def _serve(socket: Connection) -> None:
         while (task := socket.recv_bytes()) != _END:
             socket.send_bytes(_reply(work, task))
     except (EOFError, OSError):
-        os._exit(ABANDONED)
+        _end_group()
 
 
 def _end_with_parent(descriptor: int) -> None:
     poll = select.poll()
     poll.register(descriptor, 0)  # waits for POLLHUP alone: the other end is closed
     poll.poll()
-    os._exit(ABANDONED)
+    _end_group()
+
+
+def _end_group() -> None:
+    """Ends this process, whose parent process has ended, and the programs that it has started."""
+    os.killpg(os.getpgrp(), signal.SIGKILL)
 
 
 def _set_up(initializer: bytes, work: bytes) -> Callable[[Any], Any]:

@@ -197,7 +197,7 @@ class RLEvaluate:
                 table.add_row(
                     str(folder),
                     str(len(driven.scenarios)),
-                    *(_cell(estimates[name]) for name in METRICS),
+                    *(f"{estimates[name]:.2f}" for name in METRICS),
                 )
                 results[str(folder)] = {
                     name: {"value": each.value, "low": each.low, "high": each.high, "n": each.n}
@@ -292,12 +292,6 @@ class RLCompare:
         )
         folder = self.out / name.replace(" ", "-") / str(seed)
         return Cell(row=name, settings=settings, privileged=observed.privileged, folder=folder)
-
-
-def _cell(estimate: Any) -> str:
-    if estimate.low is None:
-        return f"{estimate.value:.2f}"
-    return f"{estimate.value:.2f} [{estimate.low:.2f}, {estimate.high:.2f}]"
 
 
 def _training() -> Any:

@@ -12,6 +12,7 @@ import os
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cache, partial
+from html import escape
 from pathlib import Path
 from typing import Any
 
@@ -34,10 +35,9 @@ from asp_env.evaluation.statistics import (
     Estimate,
     difference,
     interval,
-    is_resolved,
-    resampled_sums,
+    resampled_means,
 )
-from asp_env.files import write_text
+from asp_env.files import is_vacant, write_text
 from asp_env.metrics.driving.rules import DEFAULT_RULES, find_rules
 from asp_env.metrics.driving.scores import driving_metrics
 from asp_env.planning.planner import Planner, load_planner
@@ -264,9 +264,7 @@ def compare_rows(
         for metric in METRICS:
             if metric in seeds[0]:
                 values = np.stack([each[metric] for each in seeds])
-                parts = np.stack([values, np.ones_like(values)], axis=-1)
-                sums = resampled_sums(parts, groups, stream=stream)
-                draws[name][metric] = sums[:, 0] / sums[:, 1]
+                draws[name][metric] = resampled_means(values, groups, stream=stream)
     count = len(groups)
     return [
         ComparedRow(
@@ -353,29 +351,12 @@ def rendered(rows: Sequence[ComparedRow], reference: str) -> Table:
         table.add_column(metric)
     table.add_column(f"score less {reference}")
     for row in rows:
-        cells = [_text(row.estimates.get(metric), "{:.3f}") for metric in METRICS]
-        table.add_row(row.name, str(row.seeds), *cells, _verdict(row.less_reference.get("score")))
+        means = [
+            f"{row.estimates[metric]:.3f}" if metric in row.estimates else "" for metric in METRICS
+        ]
+        less = f"{row.less_reference['score']:+.3f}" if "score" in row.less_reference else ""
+        table.add_row(row.name, str(row.seeds), *means, less)
     return table
-
-
-def _text(estimate: Estimate | None, form: str) -> str:
-    if estimate is None:
-        return ""
-    text = form.format(estimate.value)
-    if estimate.low is None or estimate.high is None:
-        return text
-    return f"{text} [{form.format(estimate.low)}, {form.format(estimate.high)}]"
-
-
-def _verdict(given: Difference | None) -> str:
-    if given is None:
-        return ""
-    estimate, mde = given.estimate, given.mde
-    text = _text(estimate, "{:+.3f}")
-    if is_resolved(estimate.value, estimate.low, estimate.high, mde):
-        return text
-    smallest = "" if mde is None else f" (smallest that could be seen {mde:.3f})"
-    return f"{text}, not resolved{smallest}"
 
 
 def check_out(out: Path, settings: Mapping[str, Any]) -> None:
@@ -389,7 +370,7 @@ def check_out(out: Path, settings: Mapping[str, Any]) -> None:
     if path.exists():
         if json.loads(path.read_text())["settings"] != json.loads(text):
             raise AspEnvError(f"{out} holds another comparison; choose another --out")
-    elif out.exists() and any(out.iterdir()):
+    elif not is_vacant(out):
         raise AspEnvError(f"{out} exists and holds no comparison; choose another --out")
     else:
         out.mkdir(parents=True, exist_ok=True)
@@ -408,7 +389,8 @@ def curves_figure(curves: Mapping[str, Float[np.ndarray, "points 4"]]) -> Any:
     import plotly.graph_objects as go
 
     figure = go.Figure()
-    for number, (name, curve) in enumerate(curves.items()):
+    for number, (row, curve) in enumerate(curves.items()):
+        name = escape(row)  # plotly reads labels as HTML
         steps, mean, low, high = curve.T
         colour = COLOURS[number % len(COLOURS)]
         figure.add_scatter(

@@ -7,13 +7,14 @@ with `observations` and `infos` of T + 1 ticks, and `actions`, `rewards`, `termi
 the names of its scenario, recording and ending.
 """
 
+import io
 import json
 import re
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from types import ModuleType
-from typing import Any
+from typing import Any, final
 
 import numpy as np
 from gymnasium import spaces
@@ -111,15 +112,19 @@ def write_dataset(
 
     Raises:
         MissingExtraError: h5py is not installed.
+        OSError: the file cannot be written.
     """
     h5py = import_h5py("writing a data set")
     (folder / "data").mkdir()
     num_episodes = num_steps = 0
-    with h5py.File(folder / DATA_FILE, "w", track_order=True) as file:
-        for episode in episodes:
-            _write_episode(file.create_group(f"episode_{num_episodes}"), num_episodes, episode)
-            num_episodes += 1
-            num_steps += len(episode.actions)
+    with _LateErrors(folder / DATA_FILE) as disk:
+        with h5py.File(disk, "w", track_order=True) as file:
+            for episode in episodes:
+                _write_episode(file.create_group(f"episode_{num_episodes}"), num_episodes, episode)
+                num_episodes += 1
+                num_steps += len(episode.actions)
+                disk.check()
+        disk.check()
     metadata = {
         "total_episodes": num_episodes,
         "total_steps": num_steps,
@@ -136,6 +141,45 @@ def write_dataset(
         "dataset_size": round((folder / DATA_FILE).stat().st_size / 1e6, 1),
     }
     (folder / METADATA_FILE).write_text(json.dumps(metadata))
+
+
+@final
+class _LateErrors(io.FileIO):
+    """A file whose writing never fails; `check` raises the first error.
+
+    HDF5 ends the process if it cannot write the rest of a file, as on a full disk.
+    """
+
+    def __init__(self, path: Path) -> None:
+        super().__init__(path, "w+b")
+        self._path = path
+        self._error: OSError | None = None
+
+    def write(self, content: Any, /) -> int:
+        left = memoryview(content).cast("B")
+        count = len(left)
+        try:
+            while self._error is None and len(left):
+                left = left[super().write(left) or 0 :]
+        except OSError as error:
+            self._error = error
+        return count
+
+    def truncate(self, size: int | None = None, /) -> int:
+        try:
+            return super().truncate(size)
+        except OSError as error:
+            self._error = self._error or error
+        return self.tell() if size is None else size
+
+    def check(self) -> None:
+        """Raises the first error, with the name of the file.
+
+        Raises:
+            OSError: something could not be written.
+        """
+        if self._error is not None:
+            raise OSError(self._error.errno, self._error.strerror, str(self._path))
 
 
 def _write_episode(group: Any, number: int, episode: RecordedEpisode) -> None:

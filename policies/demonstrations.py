@@ -18,7 +18,7 @@ from asp_env.data.source import scheme_of
 from asp_env.envs.replay import ReplayEnv
 from asp_env.envs.vector import ReplayVectorEnv
 from asp_env.errors import AspEnvError
-from asp_env.files import atomic_folder
+from asp_env.files import atomic_folder, is_vacant
 from asp_env.sim.world import Ending, world_class
 from policies.dataset import ID_PATTERN, RecordedEpisode, import_h5py, write_dataset
 
@@ -104,7 +104,7 @@ class Demonstrations:
                 f"--out {self.out}: the name is the id of the data set, expected letters, digits "
                 f"and a version at the end, such as {self.out.name or 'demonstrations'}-v0"
             )
-        if self.out.exists() and not (self.out.is_dir() and not any(self.out.iterdir())):
+        if not is_vacant(self.out):
             raise AspEnvError(f"--out {self.out}: exists already; choose another or remove it")
         if self.max_scenarios is not None and self.max_scenarios < 1:
             raise AspEnvError(f"--max-scenarios {self.max_scenarios}: expected at least 1")

@@ -13,6 +13,8 @@ the rewards |
 
 import dataclasses
 import json
+import math
+import zlib
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -32,11 +34,19 @@ from torch import Tensor, nn
 from asp_env.data.predictor import Predictor
 from asp_env.errors import AspEnvError, MissingExtraError
 from asp_env.files import atomic_file, write_text
+from asp_env.stored import brief, parse_json
 from policies.networks import RasterFeatures, TrafficFeatures
 from policies.settings import CONFIG, PolicySettings, read_settings
 
 POLICY = "policy.safetensors"
 CHECKPOINT = "checkpoint.safetensors"
+
+CHECKSUM = "checksum"
+"""Name of the tensor with the checksum of the others in a file."""
+
+MAX_ENTRY = 10_000_000
+"""Largest number of values of an entry of an observation, which bounds the memory. Chosen by
+hand."""
 
 LOG_STD = -1.0
 """Logarithm of the deviation of actions at the start. Chosen by hand: that of stable-baselines3, 0,
@@ -137,6 +147,8 @@ class TrainedPolicy:
         actions, self._memory = self._policy.predict(
             shown, state=self._memory, episode_start=starts, deterministic=True
         )
+        if not np.isfinite(actions).all():
+            raise AspEnvError("a policy's action is not finite, so its weights are damaged")
         return np.asarray(actions, dtype=np.float32)
 
 
@@ -147,7 +159,7 @@ def load_policy(folder: Path) -> TrainedPolicy:
         AspEnvError: there is no finished run, or a file is damaged.
     """
     settings = read_settings(folder)
-    content = json.loads((folder / CONFIG).read_text())
+    content = parse_json((folder / CONFIG).read_bytes())
     space = _read_space(content, folder)
     weights = read_tensors(folder / POLICY)
     policy = algorithm_classes(settings.algorithm).policy(
@@ -164,7 +176,24 @@ def load_policy(folder: Path) -> TrainedPolicy:
             "train the policy again"
         ) from None
     policy.set_training_mode(False)
+    _check_space(policy, space, folder)
     return TrainedPolicy(settings, space, policy)
+
+
+def _check_space(policy: BasePolicy, space: spaces.Dict, folder: Path) -> None:
+    """Checks that the observation in `config.json` is what the network reads: it acts once.
+
+    Raises:
+        AspEnvError: it is not.
+    """
+    zeros = {name: np.zeros((1, *box.shape), box.dtype) for name, box in space.items()}  # pyright: ignore[reportOptionalIterable, reportCallIssue, reportArgumentType]
+    try:
+        policy.predict(zeros, episode_start=np.ones(1, dtype=bool), deterministic=True)
+    except (KeyError, IndexError, RuntimeError, TypeError, ValueError) as error:
+        raise AspEnvError(
+            f"{folder / CONFIG}: damaged, its observation is not that of the network "
+            f"({brief(error)}); train the policy again"
+        ) from None
 
 
 def _no_learning(left: float | int) -> float:
@@ -226,7 +255,14 @@ def check_predictor(folder: Path, predictor: Predictor | None) -> None:
     Raises:
         AspEnvError: it is another one, or has other weights.
     """
-    trained_with = json.loads((folder / CONFIG).read_text())["predictor"]
+    try:
+        trained_with = parse_json((folder / CONFIG).read_bytes())["predictor"]
+        if trained_with is not None:
+            trained_with = {key: str(trained_with[key]) for key in ("name", "weights")}
+    except (OSError, KeyError, TypeError, ValueError) as error:
+        raise AspEnvError(
+            f"{folder / CONFIG}: damaged ({brief(error)}); train the policy again"
+        ) from None
     given = predictor_identity(predictor)
     if trained_with != given:
         raise AspEnvError(
@@ -244,6 +280,9 @@ def _identity_text(identity: Mapping[str, str] | None) -> str:
 
 def _read_space(content: Any, folder: Path) -> spaces.Dict:
     try:
+        for name, box in content["observation"].items():
+            if not 0 < math.prod(box["shape"]) <= MAX_ENTRY:
+                raise ValueError(f"{name} of shape {box['shape']}")
         return spaces.Dict(
             {
                 name: spaces.Box(
@@ -257,7 +296,8 @@ def _read_space(content: Any, folder: Path) -> spaces.Dict:
         )
     except (KeyError, TypeError, ValueError, AttributeError) as error:
         raise AspEnvError(
-            f"{folder / CONFIG}: damaged ({type(error).__name__}: {error}); train the policy again"
+            f"{folder / CONFIG}: damaged ({type(error).__name__}: {brief(error)}); train the "
+            "policy again"
         ) from None
 
 
@@ -268,20 +308,38 @@ def read_tensors(path: Path) -> dict[str, Tensor]:
         AspEnvError: there is no such file, or it is damaged.
     """
     try:
-        return load(path.read_bytes())
+        tensors = load(path.read_bytes())
+        checksum = tensors.pop(CHECKSUM, None)  # older runs have none
+        if checksum is not None and not torch.equal(checksum, _checksum(tensors)):
+            raise SafetensorError("its checksum differs")
+        return tensors
     except FileNotFoundError:
         raise AspEnvError(
             f"{path}: missing, the training has not ended; resume it with asp-env rl train --resume"
         ) from None
     except (OSError, SafetensorError) as error:
-        raise AspEnvError(f"{path}: damaged ({error}); train the policy again") from None
+        raise AspEnvError(f"{path}: damaged ({brief(error)}); train the policy again") from None
 
 
 def write_tensors(path: Path, tensors: Mapping[str, Tensor]) -> None:
-    """Writes a safetensors file atomically."""
-    content = save({name: value.detach().contiguous().clone() for name, value in tensors.items()})
+    """Writes a safetensors file with a checksum, atomically."""
+    plain = {name: value.detach().cpu().contiguous().clone() for name, value in tensors.items()}
+    content = save(plain | {CHECKSUM: _checksum(plain)})
     with atomic_file(path) as partial:
         partial.write_bytes(content)
+
+
+def _checksum(tensors: Mapping[str, Tensor]) -> Tensor:
+    """The CRC-32 of the names and the content of some tensors."""
+    value = 0
+    for name in sorted(tensors):
+        value = zlib.crc32(name.encode(), value)
+        value = zlib.crc32(_bytes(tensors[name]), value)
+    return torch.tensor([value], dtype=torch.int64)
+
+
+def _bytes(tensor: Tensor) -> bytes:
+    return tensor.contiguous().reshape(-1).view(torch.uint8).numpy().tobytes()
 
 
 def flatten_state(state: Mapping[Any, Any], prefix: str) -> dict[str, Tensor]:

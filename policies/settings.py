@@ -10,6 +10,7 @@ from typing import Any, Literal, get_args
 
 from asp_env.data.recording import DEFAULT_DT_S
 from asp_env.errors import AspEnvError, unknown_name
+from asp_env.stored import brief, check_fields, parse_json
 
 Algorithm = Literal["ppo", "sac", "recurrent-ppo", "bc"]
 ALGORITHMS: tuple[str, ...] = get_args(Algorithm)
@@ -63,6 +64,9 @@ class EnvironmentSettings:
 MAX_NEIGHBOURS = 15
 """The vectors show the target and 15 others."""
 
+MAX_WIDTH = 4_096
+"""Largest width of the layers, which bounds the memory. Chosen by hand."""
+
 MAX_MAP_LINES = 64
 """The vectors show 64 pieces of lines."""
 
@@ -109,6 +113,8 @@ class PolicySettings:
         for name, least in (("steps", 1), ("num_envs", 1), ("width", 1), ("demonstrations", 0)):
             if getattr(self, name) < least:
                 raise AspEnvError(f"{name} {getattr(self, name)}: expected at least {least}")
+        if self.width > MAX_WIDTH:
+            raise AspEnvError(f"width {self.width}: expected at most {MAX_WIDTH:,}")
         if self.algorithm == "bc" and not self.demonstrations:
             raise AspEnvError(
                 "algorithm bc, behaviour cloning: give the number of epochs, such as "
@@ -152,14 +158,14 @@ def read_settings(folder: Path) -> PolicySettings:
     """
     path = folder / CONFIG
     try:
-        content = json.loads(path.read_text())
+        content = parse_json(path.read_bytes())
     except FileNotFoundError:
         raise AspEnvError(
             f"{folder}: no run of a policy there ({CONFIG} is missing); train one with "
             "asp-env rl train"
         ) from None
     except (OSError, ValueError) as error:
-        raise AspEnvError(f"{path}: damaged ({error}); train the policy again") from None
+        raise AspEnvError(f"{path}: damaged ({brief(error)}); train the policy again") from None
     return settings_from(content.get("settings") if isinstance(content, dict) else None, path)
 
 
@@ -172,6 +178,8 @@ def settings_from(content: Any, path: Path) -> PolicySettings:
     try:
         fields = dict(content)
         environment = dict(fields.pop("environment"))
+        check_fields(EnvironmentSettings, environment)
+        check_fields(PolicySettings, fields)
         pixels = environment.pop("raster_px", None)
         return PolicySettings(
             environment=EnvironmentSettings(
@@ -182,6 +190,6 @@ def settings_from(content: Any, path: Path) -> PolicySettings:
         )
     except (TypeError, KeyError, ValueError) as error:
         raise AspEnvError(
-            f"{path}: not the settings of a policy ({type(error).__name__}: {error}); train the "
-            "policy again"
+            f"{path}: not the settings of a policy ({type(error).__name__}: {brief(error)}); "
+            "train the policy again"
         ) from None

@@ -15,6 +15,7 @@ from torch import Tensor
 
 from asp_env.data.predictor import Predictor
 from asp_env.errors import AspEnvError
+from asp_env.files import is_vacant
 from asp_env.workers import one_thread
 from policies.cloning import clone
 from policies.curriculum import Curriculum
@@ -95,6 +96,7 @@ def train_policy(
         _keep_progress(out, done)
     else:
         out.mkdir(parents=True, exist_ok=True)
+        _remove_logs(out)
         space = envs.observation_space
         assert isinstance(space, spaces.Dict)
         save_config(out, settings, space, predictor, 0)
@@ -112,10 +114,10 @@ def train_policy(
             algorithm.learn(left, callback=CallbackList(callbacks), reset_num_timesteps=not done)
     finally:
         algorithm.logger.close()
-    write_tensors(out / POLICY, algorithm.policy.state_dict())
     space = envs.observation_space
     assert isinstance(space, spaces.Dict)
     save_config(out, settings, space, predictor, algorithm.num_timesteps)
+    write_tensors(out / POLICY, algorithm.policy.state_dict())  # last: the training has ended
     (out / CHECKPOINT).unlink(missing_ok=True)
     envs.close()
 
@@ -204,12 +206,13 @@ def _check_folder(settings: PolicySettings, out: Path, resume: bool) -> bool:
         AspEnvError: the folder does not fit.
     """
     if not resume:
-        if out.exists() and any(out.iterdir()):
+        if not is_vacant(out):
             raise AspEnvError(
                 f"{out} exists and is not an empty folder; choose another, or go on with --resume"
             )
         return False
     if (out / POLICY).exists():
+        (out / CHECKPOINT).unlink(missing_ok=True)
         raise AspEnvError(f"{out}: the training has ended; there is nothing to resume")
     if not (out / CONFIG).exists():
         raise AspEnvError(f"{out}: no run to resume; train without --resume")
@@ -225,6 +228,12 @@ def _check_folder(settings: PolicySettings, out: Path, resume: bool) -> bool:
             "same, or choose another folder"
         )
     return (out / CHECKPOINT).exists()
+
+
+def _remove_logs(out: Path) -> None:
+    """Removes the statistics of a training that was interrupted before its first checkpoint."""
+    for path in (*out.glob("progress*.csv"), *out.glob("events.out.tfevents.*")):
+        path.unlink()
 
 
 def _keep_progress(out: Path, done: int) -> None:

@@ -1,21 +1,42 @@
 """Reproducible tests with a cache folder of their own."""
 
+import gc
 import os
 import shutil
 from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
-from hypothesis import settings
+from hypothesis import Phase, settings
 from selenium import webdriver
+
+from tests import checked_calls
 
 # Several test processes share the cores, and sums by several threads differ in their last bits.
 os.environ.setdefault("OMP_NUM_THREADS", "1")
 # Windows are invisible; tests that need a screen start their own.
 os.environ["SDL_VIDEODRIVER"] = "dummy"
 
+checked_calls.install()
+
 settings.register_profile("same-every-time", derandomize=True, deadline=None, max_examples=30)
+settings.register_profile(
+    "without-shrinking",  # for mutants, of which one failure is enough
+    settings.get_profile("same-every-time"),
+    phases=[Phase.explicit, Phase.generate],
+)
 settings.load_profile("same-every-time")
+
+
+def pytest_collection_finish() -> None:
+    """Spares garbage collections the millions of objects of the modules and of the tests."""
+    gc.collect()
+    gc.freeze()
+
+
+def pytest_runtest_logstart() -> None:
+    """Begins a test."""
+    checked_calls.begin_test()
 
 
 @pytest.fixture(autouse=True, scope="session")

@@ -13,17 +13,24 @@ import pytest
 ROOT = Path(__file__).parents[1]
 PACKAGES = ("asp_env", "predictors", "scenarios", "policies")
 
-ON_ALL = {"errors", "registry", "geometry", "files", "workers", "compiled"}
+ON_ALL = {
+    *("arguments", "errors", "registry", "geometry"),
+    *("files", "stored", "workers", "compiled"),
+}
 FOR_PREDICTORS = {"views", "metrics", "data", "dynamics"} | ON_ALL
 ARROWS = {
     "__init__": {"envs", "planning", "data", "dynamics", "errors"},
+    "arguments": {"errors"},
     "errors": set[str](),
     "registry": {"errors"},
     "geometry": {"errors", "compiled"},
-    "compiled": set[str](),
     "files": {"errors"},
+    "compiled": {"files", "errors"},
+    "stored": {"errors"},
     "workers": {"errors"},
-    "cli": ON_ALL,
+    "__main__": {"cli"},
+    "cli": {"installation"} | ON_ALL,
+    "installation": {"data"} | ON_ALL,
     "dynamics": ON_ALL,
     "data": {"dynamics"} | ON_ALL,
     "metrics": {"data", "dynamics"} | ON_ALL,

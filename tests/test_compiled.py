@@ -1,10 +1,14 @@
 """Compiled functions: damaged caches and folders that cannot be written do no harm."""
 
+import hashlib
 import importlib.util
 import logging
+import os
+import pickle
 from pathlib import Path
 from types import ModuleType
 
+import numba
 import pytest
 from numba.core.caching import FunctionCache
 
@@ -90,3 +94,76 @@ def test_a_full_disk_is_one_line(
     with caplog.at_level(logging.WARNING, "asp_env"):
         assert load(source).double(3) == 6
     assert "No space left on device" in caplog.text
+
+
+class Payload:
+    """An object whose pickle creates a file when it is read."""
+
+    def __init__(self, path: Path) -> None:
+        self.path = path
+
+    def __reduce__(self) -> tuple[object, ...]:
+        return Path.touch, (self.path,)
+
+
+def plant(source: Path, marker: Path) -> Path:
+    """Replaces the index of the cache by one that is valid and runs code; returns its path."""
+    (index,) = source.parent.rglob("*.nbi")
+    content = pickle.dumps(Payload(marker))
+    head = pickle.dumps(numba.__version__, protocol=-1)
+    index.write_bytes(head + hashlib.sha256(content).digest() + content)
+    return index
+
+
+@pytest.mark.parametrize("mode", [0o666, 0o664, 0o602])
+def test_files_that_others_may_write_are_not_unpickled(source: Path, mode: int) -> None:
+    """They are replaced by files that only their owner may write, whatever the umask."""
+    load(source).double(3)
+    marker = source.with_name("marker")
+    index = plant(source, marker)
+    index.chmod(mode)
+    before = os.umask(0)
+    try:
+        assert load(source).double(3) == 6
+    finally:
+        os.umask(before)
+    assert not marker.exists()
+    assert [path.stat().st_mode & 0o777 for path in source.parent.rglob("*.nb[ic]")] == [0o644] * 3
+    again = load(source)
+    assert again.double(3) == 6
+    assert hits(again) == 1
+
+    plant(source, marker).chmod(0o644)
+    load(source).double(3)
+    assert marker.exists()  # the test's pickle does run where it is trusted
+
+
+def test_files_of_others_are_not_unpickled(source: Path) -> None:
+    """Those of root and of the owner of the source are."""
+    if os.geteuid() != 0:
+        pytest.skip("only root may give files away")
+    load(source).double(3)
+    marker = source.with_name("marker")
+    index = plant(source, marker)
+    os.chown(index, 65534, -1)
+    assert load(source).double(3) == 6
+    assert not marker.exists()
+    os.chown(plant(source, marker), 65534, -1)
+    os.chown(source, 65534, -1)
+    load(source).double(3)
+    assert marker.exists()
+
+
+def test_signatures_compiled_at_the_same_time_keep_their_own_code(source: Path) -> None:
+    """Two processes that read the same index store their signatures in different files."""
+    first, second = load(source), load(source)
+    states = [module.double._cache._cache_file for module in (first, second)]
+    empty: dict[object, str] = {}
+    for state in states:
+        state._load_index = lambda: dict(empty)
+    assert first.double(3) == 6
+    assert second.double(1.5) == 3.0
+    assert len(list(source.parent.rglob("*.nbc"))) == 2
+    third = load(source)
+    assert (third.double(3), third.double(1.5)) == (6, 3.0)
+    assert hits(third) == 1

@@ -44,7 +44,7 @@ def test_a_trained_predictor_is_evaluated_only_on_held_out_recordings(
     assert manifest["recordings"] == 1
     assert {row["predictor"] for row in _rows(out)} == set(names)
     assert {row["selection"] for row in _rows(out)} == {"most-probable", "best-of-3", ""}
-    assert (out / "report.html").stat().st_size > 1_000_000
+    assert (out / "report.html").stat().st_size > 100_000
 
 
 def test_drives_are_logged_and_the_expert_comes_first(

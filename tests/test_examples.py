@@ -8,7 +8,8 @@ import cv2
 import numpy as np
 import pytest
 
-from asp_env import Planner
+from asp_env import Planner, registry
+from asp_env.cli import main
 from asp_env.data.classes import AgentClass
 from examples import (
     own_predictor,
@@ -43,6 +44,42 @@ def test_python_code_in_the_documentation_runs(page: str) -> None:
     for code in _python_blocks(page):
         if not any(name in code for name in ("minari", "d3rlpy", "load_steps")):
             exec(re.sub(r"\.learn\([\d_]+\)", ".learn(64)", code), names)
+
+
+README = Path(own_predictor.__file__).parents[1] / "README.md"
+
+
+def test_python_code_of_the_readme_runs() -> None:
+    for code in re.findall(r"```python\n(.*?)```", README.read_text(), re.DOTALL):
+        exec(code, {})
+
+
+def test_commands_of_the_readme_run(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Those in blocks, and the first steps with the sample, with one scenario each."""
+    text = README.read_text()
+    commands = [
+        line.removeprefix("asp-env ")
+        for block in re.findall(r"```sh\n(.*?)```", text, re.DOTALL)
+        for line in block.splitlines()
+    ]
+    commands += re.findall(r"`asp-env ([^`]*sample:[^`]*)`", text)
+    assert len(commands) == 3
+    monkeypatch.chdir(tmp_path)
+    for command in commands:
+        assert main(re.sub(r"--max-scenarios \d+", "--max-scenarios 1", command).split()) == 0
+    output = capsys.readouterr().out
+    assert "oracle" in output
+    assert len(list(tmp_path.glob("*/report.html"))) == 3
+
+
+def test_every_command_is_in_the_readme() -> None:
+    """Every command has a line in its table, and every line of it a command."""
+    named = set(re.findall(r"^\| `asp-env ([a-z]+(?: [a-z]+)?)", README.read_text(), re.MULTILINE))
+    commands = set(registry.names("commands"))
+    found = {name for name in commands if any(f"{word} ".startswith(f"{name} ") for word in named)}
+    assert commands - found == {"demo", "rl demonstrations"}  # make demo, docs/rl.md
 
 
 def test_the_planner_of_the_documentation() -> None:

@@ -2,15 +2,17 @@
 
 import errno
 import os
+import re
 import subprocess
 import sys
 from pathlib import Path
+from threading import Event, Thread
 
 import numpy as np
 import pytest
 
 from asp_env.errors import AspEnvError
-from asp_env.files import STALE_S, atomic_file, atomic_folder, leftovers, remove_stale
+from asp_env.files import atomic_file, atomic_folder, is_vacant, remove_abandoned
 
 
 def everything(folder: Path) -> list[str]:
@@ -193,18 +195,104 @@ def test_two_processes_write_one_file(tmp_path):
     assert everything(tmp_path) == ["file"]
 
 
-def test_stale_files_are_removed(tmp_path):
-    """Only temporary files of that name, and only old ones."""
-    path = tmp_path / "file[0]"
-    with atomic_file(path) as old, atomic_file(path) as young, atomic_file(tmp_path / "b") as other:
-        for partial in (old, young, other):
-            partial.write_text("words")
-        assert leftovers(path) == sorted([old, young])
-        path.write_text("words")
-        before = path.stat().st_mtime - STALE_S - 1
-        for partial in (old, other):
-            os.utime(partial, (before, before))
-        remove_stale(path)
-        assert leftovers(path) == [young]
-        assert other.exists()
-        old.write_text("words")
+HOLDER = """
+import sys
+from pathlib import Path
+from asp_env.files import atomic_file, atomic_folder
+
+out = Path(sys.argv[1])
+with atomic_folder(out / "folder") as folder, atomic_file(out / "file") as file:
+    (folder / "inner").write_text("words")
+    file.write_text("words")
+    print("ready", flush=True)
+    sys.stdin.read()
+"""
+
+
+@pytest.fixture
+def holder(tmp_path):
+    """A process that is writing the file `file` and the folder `folder` in `tmp_path`."""
+    process = subprocess.Popen(
+        [sys.executable, "-c", HOLDER, str(tmp_path)],
+        stdin=subprocess.PIPE,
+        stdout=subprocess.PIPE,
+        text=True,
+    )
+    assert process.stdout is not None
+    assert process.stdout.readline() == "ready\n"
+    yield process
+    process.kill()
+    process.communicate()
+
+
+def test_what_killed_processes_left_is_removed(tmp_path, holder):
+    """By the next one that writes into the same folder; not while the process runs."""
+    for name in (".own.partial", ".own.0123.partial", "own"):
+        (tmp_path / name).write_text("not of this module")
+    before = everything(tmp_path)
+    assert len(before) == 6
+    remove_abandoned(tmp_path)
+    assert everything(tmp_path) == before
+    assert is_vacant(tmp_path / "folder")
+
+    holder.kill()
+    holder.wait()
+    assert everything(tmp_path) == before
+    write_file(tmp_path / "another", "words")
+    assert everything(tmp_path) == [".own.0123.partial", ".own.partial", "another", "own"]
+
+
+def test_a_folder_of_leftovers_alone_is_vacant(tmp_path, holder):
+    """It is taken like an empty one once their process has ended."""
+    holder.kill()
+    holder.wait()
+    assert is_vacant(tmp_path)
+    assert not is_vacant(next(tmp_path.glob(".folder.*")))
+    write_folder(tmp_path)
+    assert everything(tmp_path) == ["file"]
+
+
+def test_a_link_with_the_name_of_a_leftover_is_not_followed(tmp_path):
+    (tmp_path / "precious").mkdir()
+    (tmp_path / "precious" / "file").write_text("words")
+    (tmp_path / ".out.0123456789ab.partial").symlink_to(tmp_path / "precious")
+    remove_abandoned(tmp_path)
+    assert (tmp_path / "precious" / "file").read_text() == "words"
+
+
+def test_two_threads_take_and_remove_at_the_same_time(tmp_path):
+    """A file that is being written is never taken for a leftover."""
+    stop = Event()
+
+    def remove():
+        while not stop.is_set():
+            remove_abandoned(tmp_path)
+
+    thread = Thread(target=remove)
+    thread.start()
+    try:
+        for number in range(300):
+            write_file(tmp_path / str(number), "words")
+            write_folder(tmp_path / f"folder{number}")
+    finally:
+        stop.set()
+        thread.join()
+    assert len(everything(tmp_path)) == 900
+
+
+def test_an_error_that_names_no_file_names_the_target(tmp_path):
+    """As on a full disk; in a folder the file within it."""
+    full = OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+    with pytest.raises(OSError, match="No space left") as caught:
+        write_file(tmp_path / "file", "words", error=full)
+    assert caught.value.filename == str(tmp_path / "file")
+
+    def write_within():
+        with atomic_folder(tmp_path / "out") as folder:
+            write_file(folder / "within", "words", error=full)
+
+    expected = re.escape(f"{tmp_path}/out/within cannot be written (No space left on device); free")
+    full.filename = None
+    with pytest.raises(AspEnvError, match=expected):
+        write_within()
+    assert everything(tmp_path) == []

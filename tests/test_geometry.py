@@ -132,6 +132,15 @@ def test_boxes_overlap_by_hand() -> None:
         assert boxes_overlap(other, square).tolist() == [expected]
 
 
+@pytest.mark.parametrize("place", [(1.0, 0.0), (-1.0, 0.0), (0.0, 1.0), (0.0, -1.0), (1.0, 1.0)])
+def test_boxes_that_touch_do_not_overlap(place: tuple[float, float]) -> None:
+    """Unit squares side by side have a common edge or corner; 1 mm nearer they overlap."""
+    square = np.array([[0.0, 0.0, 0.0, 1.0, 1.0]])
+    other = np.array([[*place, 0.0, 1.0, 1.0]])
+    assert boxes_overlap(square, other).tolist() == [False]
+    assert boxes_overlap(square, other * [0.999, 0.999, 1, 1, 1]).tolist() == [True]
+
+
 def test_boxes_overlap_as_their_corners_do() -> None:
     """Boxes overlap unless an edge's direction separates the corners of one from the other's."""
     rng = np.random.default_rng(0)
@@ -197,8 +206,25 @@ def test_route_along() -> None:
 
 
 def test_route_of_a_standing_agent_goes_straight_ahead() -> None:
-    states = np.tile(np.array([5.0, 5.0, math.pi / 2, 0.0]), (4, 1))
-    np.testing.assert_allclose(route_along(states, beyond_m=2.0), [(5, 5), (5, 6), (5, 7)])
+    states = np.tile(np.array([5.0, 7.0, math.pi / 2, 0.0]), (4, 1))
+    np.testing.assert_allclose(route_along(states, beyond_m=2.0), [(5, 7), (5, 8), (5, 9)])
+
+
+def test_a_route_has_positions_from_half_a_metre_on() -> None:
+    """0.5 m up and 3 m ahead; without the position at 0.5 m it would be a diagonal."""
+    states = np.array([(0, 0, 0, 0), (0, 0.5, 0, 0), (3.5, 0.5, 0, 0)], dtype=np.float64)
+    expected = [(0, 0), *((x + 0.5, 0.5) for x in range(5))]
+    np.testing.assert_allclose(route_along(states, beyond_m=1.0), expected)
+
+
+def test_lengths_of_long_lines_are_sums_in_double_precision() -> None:
+    """10,000 steps of 0.1 m to and fro are 1000 m; sums in single precision would be 999.9 m."""
+    points = np.zeros((10_001, 2), dtype=np.float32)
+    points[1::2, 0] = 0.1
+    exact = 10_000 * float(np.float32(0.1))
+    assert path_length(points) == pytest.approx(exact, rel=1e-12)
+    assert arc_lengths(points)[-1] == pytest.approx(exact, rel=1e-12)
+    assert len(resample(points, 1.0)) == 1001
 
 
 @given(radius=st.floats(5, 50), beyond_m=st.floats(1, 40))
@@ -211,6 +237,24 @@ def test_routes_have_equal_steps(radius: float, beyond_m: float) -> None:
     steps = np.hypot(*np.diff(route_along(states, beyond_m=beyond_m), axis=0).T)
     assert (steps < 1 + 1e-9).all()
     assert (steps > 0.99).all()
+
+
+@pytest.mark.parametrize("near_m", [5.0, 5.9])
+@pytest.mark.parametrize(("x", "arc_m"), [(2.5, 3.0), (3.5, 3.5), (7.5, 7.5), (8.5, 8.0)])
+def test_project_searches_whole_segments_within_reach(
+    near_m: float, x: float, arc_m: float
+) -> None:
+    """Within 2 m of 5 or 5.9 m along the route are the five segments from 3 to 8 m."""
+    route = np.arange(21.0)[:, None] * np.array([1.0, 0.0])
+    assert project(route, len(route), x, 0.0, near_m, 2.0)[0] == pytest.approx(arc_m)
+
+
+def test_points_beside_segments_that_are_shorter_than_1_m() -> None:
+    """Half of a segment of 0.5 m is 0.25 m; 2 m to the left are 2 m. Of length 0 it is a point."""
+    route = np.array([(0.0, 0.0), (0.5, 0.0), (0.5, 0.5), (0.5, 0.5)])
+    assert point_on_route(route, 2, 0.5, 2.0) == pytest.approx((0.25, 2.0, 0.5, 0.0))
+    assert point_on_route(route, 3, 1.5, 2.0) == pytest.approx((-1.5, 0.25, 0.0, 0.5))
+    assert point_on_route(route, 4, 2.5, 2.0) == pytest.approx((0.5, 0.5, 0.0, 0.0))
 
 
 @given(arc_m=st.floats(-10, 40), left_m=st.floats(-4, 4))

@@ -12,6 +12,7 @@ from asp_env.errors import (
     CheckpointError,
     DataError,
     MissingExtraError,
+    StaleInstallError,
     unknown_name,
 )
 
@@ -152,3 +153,15 @@ def test_plug_that_cannot_be_imported(
         "planner 'far' cannot be imported from its entry point broken_planner:Far"
     )
     assert reason in line
+
+
+def test_metadata_without_a_name_of_this_version_are_stale(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """As after an update of a checkout that is not installed again; the remedy is a command."""
+    plugs = {name: point for name, point in registry._plugs("readers").items() if name != "sind"}
+    monkeypatch.setattr(registry, "_plugs", lambda _: plugs)
+    with pytest.raises(StaleInstallError, match=r"reader 'sind' .* run python -m pip install -e"):
+        registry.find("readers", "sind")
+    with pytest.raises(AspEnvError, match=r"unknown reader 'sinf': known are"):
+        registry.find("readers", "sinf")

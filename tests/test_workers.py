@@ -185,15 +185,21 @@ def test_output_environment_and_cost_of_a_process(tmp_path: Path) -> None:
 
 
 SCRIPT = """
-import operator, os, signal, sys, time
+import operator, os, signal, subprocess, sys, time
 from functools import partial
 from asp_env.workers import WorkerPool
 
-pool = WorkerPool(operator.call, 2)
+pool = WorkerPool(operator.call, 3)
 pool.submit(os.getpid).result()
-if sys.argv[1] == "killed":
+if sys.argv[1] != "ended":
     pool.submit(partial(time.sleep, 3600.0))
-    os.kill(os.getpid(), signal.SIGKILL)
+    pool.submit(partial(subprocess.run, ["sh", "-c", "touch started; exec sleep 3600"]))
+    while not os.path.exists("started"):
+        time.sleep(0.01)
+    if sys.argv[1] == "killed":
+        os.kill(os.getpid(), signal.SIGKILL)
+    pool.terminate()
+    sys.exit(5)
 with pool:
     print(list(pool.map([partial(pow, 2, 3)])))
 """
@@ -205,13 +211,16 @@ def run_script(folder: Path, argument: str) -> tuple[int, bytes]:
     script.write_text(SCRIPT)
     env = {**os.environ, "PYTHONPATH": os.pathsep.join(path for path in sys.path if path)}
     command = [sys.executable, str(script), argument]
-    done = subprocess.run(command, stdout=subprocess.PIPE, env=env, timeout=120, check=False)
+    done = subprocess.run(
+        command, cwd=folder, stdout=subprocess.PIPE, env=env, timeout=120, check=False
+    )
     return done.returncode, done.stdout
 
 
-def test_processes_end_when_their_parent_is_killed(tmp_path: Path) -> None:
-    """One of them idle, one at a task of an hour."""
-    assert run_script(tmp_path, "killed") == (-signal.SIGKILL, b"")
+@pytest.mark.parametrize(("how", "status"), [("killed", -signal.SIGKILL), ("terminated", 5)])
+def test_processes_end_with_their_parent(tmp_path: Path, how: str, status: int) -> None:
+    """One of them idle, one at a task of an hour, and one with a program that takes an hour."""
+    assert run_script(tmp_path, how) == (status, b"")
 
 
 def test_a_script_needs_no_main_guard(tmp_path: Path) -> None:

@@ -8,6 +8,7 @@ may fill the cache at the same time; a file that is damaged or has another stamp
 
 import hashlib
 import json
+import logging
 import os
 import zlib
 from collections.abc import Callable, Iterable, Mapping, Sequence
@@ -17,10 +18,14 @@ from typing import Any
 import numpy as np
 
 from asp_env.errors import AspEnvError, DataError
-from asp_env.files import atomic_file, atomic_folder, remove_stale
+from asp_env.files import atomic_file, atomic_folder
 
-FORMAT = 8
+FORMAT = 9
 """Version of the readers. Raise it whenever a reader gives other results for the same files."""
+
+_logger = logging.getLogger("asp_env")
+_noted: set[str] = set()
+"""Reasons that have been logged."""
 
 _MAGIC = b"asp-env1"
 _CHECKED = len(_MAGIC) + 4
@@ -28,6 +33,8 @@ _CHECKED = len(_MAGIC) + 4
 _HEAD = _CHECKED + 4
 _ALIGNMENT = 64
 _BLOCK = 1 << 20
+_SHOWN = 40
+"""Characters of the source's name in that of its file: names of files have at most 255 bytes."""
 
 
 def cache_folder() -> Path:
@@ -38,9 +45,7 @@ def cache_folder() -> Path:
     Raises:
         DataError: the folder cannot be created or written to.
     """
-    named = os.environ.get("ASP_ENV_CACHE")
-    base = os.environ.get("XDG_CACHE_HOME") or os.path.expanduser("~/.cache")
-    folder = Path(named) if named else Path(base) / "asp-env"
+    folder, _ = cache_location()
     reason = "no permission to write"
     try:
         folder.mkdir(parents=True, exist_ok=True)
@@ -51,6 +56,28 @@ def cache_folder() -> Path:
     raise DataError(
         f"cache folder {folder}: {reason}; set ASP_ENV_CACHE to a folder that can be written to"
     )
+
+
+def note_uncached(error: DataError | OSError, path: Path | None = None) -> None:
+    """Logs in one line, once per process and reason, that results are not cached.
+
+    Args:
+        error: why not.
+        path: the file that cannot be written, if the error does not name it.
+    """
+    reason = str(error) if isinstance(error, DataError) else error.strerror or str(error)
+    if reason not in _noted:
+        _noted.add(reason)
+        where = "" if path is None else f"{path}: "
+        _logger.warning("asp-env: results are not cached: %s%s", where, reason)
+
+
+def cache_location() -> tuple[Path, str]:
+    """The folder of derived data, which may not exist, and what its place follows from."""
+    for variable, below in (("ASP_ENV_CACHE", ""), ("XDG_CACHE_HOME", "asp-env")):
+        if base := os.environ.get(variable):
+            return Path(base) / below, f"${variable}"
+    return Path(os.path.expanduser("~/.cache")) / "asp-env", "the default"
 
 
 def get_or_create(group: str, name: str, make: Callable[[Path], None]) -> Path:
@@ -82,7 +109,7 @@ def get_or_create(group: str, name: str, make: Callable[[Path], None]) -> Path:
 def entry_path(folder: Path, source: Path, *salt: object) -> Path:
     """The cache file for data read from `source`; `salt` distinguishes several of one source."""
     key = hashlib.sha256(repr((str(source.resolve()), salt)).encode()).hexdigest()[:20]
-    return folder / f"{source.name.split('.')[0]}-{key}.bin"
+    return folder / f"{source.name.split('.')[0][:_SHOWN]}-{key}.bin"
 
 
 def stamp(files: Iterable[Path]) -> list[list[Any]]:
@@ -167,7 +194,6 @@ def save(
             checksum = zlib.crc32(block, checksum)
         file.seek(len(_MAGIC))
         file.write(checksum.to_bytes(4, "little"))
-    remove_stale(path)
 
 
 def digest(path: Path) -> str:

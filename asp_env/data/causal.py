@@ -22,7 +22,6 @@ called from Python.
 import dataclasses
 import hashlib
 import math
-import warnings
 from collections.abc import Iterator, Sequence
 from typing import Any, NamedTuple, SupportsIndex, no_type_check, overload
 
@@ -201,14 +200,14 @@ def _measure(
 def _cached_states(recording: Recording) -> Float[np.ndarray, "rows 4"]:
     """The causal states, read-only, from the cache if they are there.
 
-    If the cache cannot be written, there is a warning, and the tracks are filtered every time.
+    If the cache cannot be written, one line is logged, and the tracks are filtered every time.
     """
     content = _digest(recording)
     stamp = [["causal", VERSION, content]]
     try:
         path = cache.cache_folder() / f"causal-{content[:20]}.bin"
     except DataError as error:
-        warnings.warn(f"results are not cached: {error}", stacklevel=2)
+        cache.note_uncached(error)
         return causal_states(recording)
     if (found := cache.load(path, stamp)) is not None:
         return found[1]["states"]
@@ -216,7 +215,7 @@ def _cached_states(recording: Recording) -> Float[np.ndarray, "rows 4"]:
     try:
         cache.save(path, stamp, {}, {"states": states})
     except OSError as error:
-        warnings.warn(f"results are not cached: {path}: {error.strerror}", stacklevel=2)
+        cache.note_uncached(error, path)
     found = cache.load(path, stamp)
     return states if found is None else found[1]["states"]
 

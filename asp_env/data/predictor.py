@@ -11,11 +11,15 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 
 from asp_env import registry
+from asp_env.arguments import positive_number, text, whole_number
 from asp_env.compiled import njit
 from asp_env.data.scene import Scene
 from asp_env.data.snippets import Future
 from asp_env.data.split import TrainedOn
 from asp_env.geometry import wrap_angle
+
+MAX_HORIZON = 2**20
+"""Longest horizon in ticks. Chosen by hand: beyond all recordings."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -213,11 +217,17 @@ def load_predictor(name: str, *, horizon: int, dt_s: float) -> Predictor:
     Raises:
         AspEnvError: the name is unknown, or the predictor cannot be made for these values.
     """
+    text("predictor", name)
+    whole_number("horizon", horizon, least=1, most=MAX_HORIZON)
+    positive_number("time step", dt_s, "s")
     kind, _, argument = name.partition(":")
-    plug: PredictorPlug = registry.find("predictors", kind)
-    predictor = plug.from_name(argument, horizon=horizon, dt_s=dt_s)
-    _accept_about(predictor)
-    return predictor
+
+    def made_by(plug: PredictorPlug) -> Any:
+        predictor = plug.from_name(argument, horizon=horizon, dt_s=dt_s)
+        _accept_about(predictor)
+        return predictor
+
+    return registry.make("predictors", kind, made_by, Predictor)
 
 
 def make_forecast(

@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
+from asp_env.arguments import positive_number
 from asp_env.data.classes import is_predicted
 from asp_env.data.road_map import RoadMap
 from asp_env.data.signals import Signals
@@ -21,6 +22,9 @@ DEFAULT_DT_S = 0.2
 LEAST_FRAMES_PER_TICK = 0.75
 """Recordings with fewer frames per tick are refused: most of their ticks would be interpolated.
 Chosen by hand."""
+
+MAX_DURATION_S = 3600.0
+"""Longest history, horizon and tick. Chosen by hand: beyond all recordings."""
 
 SUGGESTIONS = 5
 """Number of time steps that an error message lists."""
@@ -42,10 +46,8 @@ def fits_ticks(frame_rate_hz: float, dt_s: float) -> bool:
     Raises:
         AspEnvError: a value is not a positive number.
     """
-    if not (math.isfinite(frame_rate_hz) and frame_rate_hz > 0):
-        raise AspEnvError(f"frame rate {frame_rate_hz} Hz: expected a positive number")
-    if not (math.isfinite(dt_s) and dt_s > 0):
-        raise AspEnvError(f"time step {dt_s} s: expected a positive number")
+    positive_number("frame rate", frame_rate_hz, "Hz")
+    positive_number("time step", dt_s, "s")
     frames = dt_s * frame_rate_hz
     return frames > 0.5 and abs(frames - round(frames)) <= 1e-4 * frames
 
@@ -102,6 +104,16 @@ def _near(steps_s: Sequence[float], dt_s: float) -> str:
     return ", ".join(f"{step:g}" for step in sorted(nearest))
 
 
+def check_duration(what: str, value_s: Any) -> None:
+    """Checks a time step, a history or a horizon.
+
+    Raises:
+        AspEnvError: the duration is no positive number of seconds, or longer than an hour.
+    """
+    if positive_number(what, value_s, "s") > MAX_DURATION_S:
+        raise AspEnvError(f"{what} {value_s:g} s: expected at most {MAX_DURATION_S:g} s")
+
+
 def ticks(duration_s: float, dt_s: float) -> int:
     """Number of ticks of a duration.
 
@@ -110,8 +122,7 @@ def ticks(duration_s: float, dt_s: float) -> int:
             time steps, or near durations if no usual time step divides the duration.
     """
     for what, value_s in (("time step", dt_s), ("duration", duration_s)):
-        if not (math.isfinite(value_s) and value_s > 0):
-            raise AspEnvError(f"{what} {value_s} s: expected a positive number")
+        check_duration(what, value_s)
     count = round(duration_s / dt_s)
     if count < 1 or abs(count * dt_s - duration_s) > 1e-6:
         if any(math.isclose(dt_s, step) for step in _TIME_STEPS_S):

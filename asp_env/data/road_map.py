@@ -1,10 +1,9 @@
 """Road maps: boundaries, drivable area and lanes, in the metric frame of a recording."""
 
-from collections import OrderedDict
-from collections.abc import Callable
-from dataclasses import dataclass, field
+import hashlib
+from dataclasses import dataclass, field, fields
 from enum import IntEnum
-from typing import Any, Generic, TypeVar, final
+from typing import Any
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
@@ -79,6 +78,7 @@ class RoadMap:
     it is the whole map. Lanes and lines that reach out of the region are complete."""
     repairs: tuple[str, ...] = ()
     """Repairs made by the reader, one line for each kind."""
+    _geometry_hash: bytes = field(default=b"", init=False, repr=False, compare=False)
 
     def __post_init__(self) -> None:
         """Checks that the numbers of lines, lanes and their properties agree.
@@ -109,6 +109,22 @@ class RoadMap:
         return self
 
     @property
+    def geometry_hash(self) -> bytes:
+        """Hash of everything except name and repairs, computed once."""
+        if not self._geometry_hash:
+            seen = hashlib.blake2b(repr(self.region_m).encode(), digest_size=16)
+            for each in fields(self):
+                value = getattr(self, each.name)
+                for array in (
+                    (value.points, value.starts) if isinstance(value, Ragged) else (value,)
+                ):
+                    if isinstance(array, np.ndarray):
+                        seen.update(f"{each.name}{array.dtype}{array.shape}".encode())
+                        seen.update(np.ascontiguousarray(array).data)
+            object.__setattr__(self, "_geometry_hash", seen.digest())
+        return self._geometry_hash
+
+    @property
     def extent_m(self) -> tuple[float, float, float, float]:
         """Smallest x and y, largest x and y of lines and drivable area in the region, metres."""
         points = np.concatenate([self.lines.points, self.drivable.points])
@@ -118,33 +134,3 @@ class RoadMap:
         if self.region_m is not None:
             low, high = np.maximum(low, self.region_m[:2]), np.minimum(high, self.region_m[2:])
         return (float(low[0]), float(low[1]), float(high[0]), float(high[1]))
-
-
-Value = TypeVar("Value")
-
-
-@final
-class MapCache(Generic[Value]):
-    """Caches the latest results of a function of a road map, by the identity of the map."""
-
-    def __init__(self, make: Callable[[RoadMap], Value], size: int = 512) -> None:
-        """Creates an empty cache.
-
-        Args:
-            make: the function.
-            size: number of maps; the least recently used one is removed first.
-        """
-        self._make = make
-        self._size = size
-        self._entries: OrderedDict[int, tuple[RoadMap, Value]] = OrderedDict()
-
-    def __call__(self, road_map: RoadMap) -> Value:
-        """The value of `make(road_map)`."""
-        key = id(road_map)
-        # The entry refers to its map, so that no other map can get its id.
-        if key not in self._entries:
-            self._entries[key] = (road_map, self._make(road_map))
-            while len(self._entries) > self._size:
-                self._entries.popitem(last=False)
-        self._entries.move_to_end(key)
-        return self._entries[key][1]

@@ -2,9 +2,6 @@
 
 import dataclasses
 import json
-import math
-import zipfile
-import zlib
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -13,19 +10,21 @@ from typing import Any
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
+from asp_env import arguments
 from asp_env.data.classes import AgentClass
 from asp_env.data.scenarios.scenario import Scenario
 from asp_env.errors import DataError
 from asp_env.files import atomic_file
+from asp_env.stored import brief, check_fields, parse_json, read_arrays
 
 FORMAT = 1
 """Version of the file format."""
 
-_READ_ERRORS = (
-    *(OSError, EOFError, ValueError, KeyError, TypeError),
-    *(zipfile.BadZipFile, zlib.error),
-    RuntimeError,  # an encrypted archive, or an unknown compression method
-)
+MAX_POSITION_M = 1e7
+"""Largest coordinate; UTM coordinates are below 10,000 km."""
+
+LONGEST_TICK_S = 60.0
+"""Largest time step. Chosen by hand."""
 
 _AXES = (
     ("states", "ticks a 4", "f"),
@@ -82,7 +81,7 @@ class Rollout:
     """Which events of `event_names` occur at each tick."""
     event_names: tuple[str, ...]
 
-    def save(self, path: Path) -> None:
+    def save(self, path: str | Path) -> None:
         """Writes one compressed `.npz`, atomically."""
         header = {
             "format": FORMAT,
@@ -96,36 +95,53 @@ class Rollout:
             if isinstance(value := getattr(self, field.name), np.ndarray)
         }
         text = np.frombuffer(json.dumps(header).encode(), dtype=np.uint8)
-        with atomic_file(path) as partial, partial.open("wb") as file:
+        with atomic_file(arguments.path("rollout", path)) as partial, partial.open("wb") as file:
             np.savez_compressed(file, header=text, **arrays)
 
     @classmethod
-    def load(cls, path: Path) -> "Rollout":
+    def load(cls, path: str | Path) -> "Rollout":
         """Reads a file written by `save`.
 
         Raises:
             DataError: the file is missing, damaged, or of another format version.
         """
+        path = arguments.path("rollout", path)
         try:
-            with path.open("rb") as raw, np.load(raw, allow_pickle=False) as file:
-                arrays = {name: file[name] for name in file.files}
-            header = json.loads(arrays.pop("header").tobytes())
+            arrays = read_arrays(path)
+            header = parse_json(arrays.pop("header").tobytes())
             if header["format"] != FORMAT:
                 raise DataError(f"rollout format {header['format']}, expected {FORMAT}")
+            _check_header(header)
             _check(arrays, header)
-            scenario = header["scenario"]
-            scenario["tags"] = tuple(scenario["tags"])
+            _check_values(arrays)
+            scenario = {**header["scenario"], "tags": tuple(header["scenario"]["tags"])}
             return cls(
                 scenario=Scenario(**scenario),
-                dt_s=header["dt_s"],
+                dt_s=float(header["dt_s"]),
                 event_names=tuple(header["event_names"]),
-                **arrays,
+                **{name: arrays[name] for name, _, _ in _AXES},
             )
         except DataError as error:
             raise DataError(f"{path}: {error}") from error
-        except _READ_ERRORS as error:
-            reason = str(error) or type(error).__name__
-            raise DataError(f"{path}: not a readable rollout ({reason})") from error
+        except (OSError, ValueError, KeyError, TypeError) as error:
+            raise DataError(f"{path}: not a readable rollout ({brief(error)})") from error
+
+
+def _check_header(header: Mapping[str, Any]) -> None:
+    """Checks the types and ranges of what is not an array.
+
+    Raises:
+        DataError: a value is damaged.
+    """
+    check_fields(Rollout, {name: header[name] for name in ("dt_s", "event_names")})
+    if not 0 < header["dt_s"] <= LONGEST_TICK_S:
+        raise DataError(
+            f"time step {header['dt_s']} s: expected a positive number up to {LONGEST_TICK_S:g}"
+        )
+    check_fields(Scenario, header["scenario"])
+    for name in ("recording", "start_tick", "length"):
+        if header["scenario"][name] < 0:
+            raise DataError(f"{name} is {header['scenario'][name]}, expected 0 or more")
 
 
 def _check(arrays: Mapping[str, np.ndarray], header: Mapping[str, Any]) -> None:
@@ -149,5 +165,23 @@ def _check(arrays: Mapping[str, np.ndarray], header: Mapping[str, Any]) -> None:
     for name, end in (ends | {"classes": len(AgentClass)}).items():
         if not ((arrays[name] >= 0) & (arrays[name] < end)).all():
             raise DataError(f"{name}: expected numbers from 0 to {end - 1}")
-    if not 0 < header["dt_s"] < math.inf:
-        raise DataError(f"time step {header['dt_s']} s: expected a positive number")
+
+
+def _check_values(arrays: Mapping[str, np.ndarray]) -> None:
+    """Checks that all numbers are plausible that a mask does not leave out.
+
+    Raises:
+        DataError: a number is not finite, or too large.
+    """
+    shown = {
+        "states": arrays["states"][arrays["valid"]],
+        "log_states": arrays["log_states"][arrays["log_valid"]],
+        **{name: arrays[name] for name in ("sizes", "route", "plans", "forecast_states")},
+    }
+    for name, values in shown.items():
+        if not (np.abs(values) <= MAX_POSITION_M).all():
+            raise DataError(f"{name}: expected numbers up to {MAX_POSITION_M:,.0f}")
+    if not (arrays["sizes"] >= 0).all():
+        raise DataError("sizes: expected no negative number")
+    if not (arrays["forecast_log_probs"] <= 1e-3).all():
+        raise DataError("forecast_log_probs: expected logarithms of probabilities")

@@ -12,14 +12,25 @@ from pathlib import Path
 from typing import Any, SupportsIndex, overload
 
 from asp_env import registry
+from asp_env.arguments import shown
 from asp_env.data.readers.layout import ARCHIVE, archive_hint, shorten
 from asp_env.data.readers.levelx import LevelxFiles
 from asp_env.data.readers.opening import ReaderState, RecordingFiles, content_hash, open_recording
-from asp_env.data.recording import DEFAULT_DT_S, Recording
-from asp_env.errors import AspEnvError, DataError, LeftOutWarning, unknown_name
+from asp_env.data.recording import DEFAULT_DT_S, Recording, check_duration
+from asp_env.errors import (
+    AspEnvError,
+    DataError,
+    LeftOutWarning,
+    RepairWarning,
+    StaleInstallError,
+    unknown_name,
+)
 
 _FIRST = ("levelx", "interaction")
 """Readers whose recordings stand before those of others."""
+
+SHOWN_REPAIRS = 3
+"""Number of repairs that a warning names."""
 
 _SCHEME = re.compile(r"^([a-z][a-z0-9-]+):(.*)$", re.DOTALL)
 
@@ -41,6 +52,7 @@ class Recordings(Sequence[Any]):  # not of Recording: run-time checks of its ite
         *,
         dt_s: float = DEFAULT_DT_S,
         opened: ReaderState | None = None,
+        quiet: bool = False,
     ) -> None:
         """Creates the sequence without reading any recording.
 
@@ -50,12 +62,14 @@ class Recordings(Sequence[Any]):  # not of Recording: run-time checks of its ite
             dt_s: seconds per tick. Recordings of which it is no whole number of frames are
                 resampled.
             opened: the recordings that are already open, for the same `dt_s`.
+            quiet: whether repairs of maps are not warned of when a recording is opened, because
+                the caller reports them.
         """
         self.source = source
         self.names = tuple(each.name for each in files)
         self.files = tuple(files)
         self.dt_s = dt_s
-        self._opened = ReaderState(dt_s=dt_s) if opened is None else opened
+        self._opened = ReaderState(dt_s=dt_s, quiet=quiet) if opened is None else opened
 
     def __deepcopy__(self, memo: dict[int, Any]) -> "Recordings":
         """Returns the same object, since recordings are immutable."""
@@ -64,7 +78,8 @@ class Recordings(Sequence[Any]):  # not of Recording: run-time checks of its ite
 
     def __reduce__(self) -> tuple[Any, ...]:
         """A copy in another process opens its files again, mapped from the same cache."""
-        return partial(Recordings, dt_s=self.dt_s), (self.source, self.files)
+        options = {"dt_s": self.dt_s, "quiet": self._opened.quiet}
+        return partial(Recordings, **options), (self.source, self.files)
 
     def __len__(self) -> int:
         """Number of recordings."""
@@ -80,10 +95,22 @@ class Recordings(Sequence[Any]):  # not of Recording: run-time checks of its ite
         Raises:
             DataError: the recording's files are damaged.
             AspEnvError: its frames are too far apart for the tick.
+            IndexError: there is no such recording.
+            TypeError: the index is neither a number nor a slice.
         """
         if isinstance(index, slice):
             return self.subset(range(len(self))[index])
-        return open_recording(self.files[index], self._opened)
+        try:
+            files = self.files[index]
+        except IndexError:
+            raise IndexError(
+                f"recording {shown(index)}: expected 0 to {len(self) - 1}, or -{len(self)} to -1"
+            ) from None
+        except TypeError:
+            raise TypeError(
+                f"recording {shown(index)}: expected a whole number or a slice"
+            ) from None
+        return open_recording(files, self._opened)
 
     def __iter__(self) -> Iterator[Recording]:
         """Opens one recording after the other."""
@@ -93,6 +120,11 @@ class Recordings(Sequence[Any]):  # not of Recording: run-time checks of its ite
         """The recordings at some indices, sharing those that are open."""
         files = [self.files[index] for index in indices]
         return Recordings(self.source, files, dt_s=self.dt_s, opened=self._opened)
+
+    @property
+    def quiet(self) -> bool:
+        """Whether repairs of maps are not warned of, because they have been reported."""
+        return self._opened.quiet
 
     def tracks_path(self, index: SupportsIndex) -> Path:
         """The file with the tracks of one recording; worlds may store more files beside it."""
@@ -147,7 +179,12 @@ def open_data(data: str | Path, *, dt_s: float = DEFAULT_DT_S) -> Recordings:
         AspEnvError: the source is unknown.
         DataError: the folder does not exist, or has no recordings.
     """
+    if not isinstance(data, str | Path) or not str(data):
+        raise AspEnvError(
+            f"data {shown(data)}: expected a folder with recordings, or a text scheme:argument"
+        )
     source = str(data)
+    check_duration("time step", dt_s)
     folder = source_folder(source)
     if not folder.is_dir():
         what = "is a file" if folder.exists() else "does not exist"
@@ -176,6 +213,8 @@ def open_readable(
 ) -> Recordings:
     """Finds recordings, reads all, and leaves out those that cannot be read, with one warning.
 
+    Another warning states how many repairs the files needed.
+
     Args:
         data: as `open_data` takes it.
         dt_s: seconds per tick; recordings whose frames are too far apart for it are left out, too.
@@ -189,7 +228,8 @@ def open_readable(
         LeftOutWarning: a recording cannot be read and this warning is an error, as by the option
             `--strict` of commands.
     """
-    recordings = open_data(data, dt_s=dt_s)
+    found = open_data(data, dt_s=dt_s)
+    recordings = Recordings(found.source, found.files, dt_s=dt_s, quiet=True)
     faults: dict[int, AspEnvError] = {}
     for number in range(len(recordings)):
         try:
@@ -197,6 +237,7 @@ def open_readable(
         except AspEnvError as error:
             faults[number] = error
     if not faults:
+        _warn_of_repairs(recordings)
         return recordings
     first = next(iter(faults.values()))
     names = shorten([recordings.names[number] for number in faults])
@@ -209,7 +250,27 @@ def open_readable(
     if strict or len(faults) == len(recordings):
         raise DataError(message)
     warnings.warn(LeftOutWarning(f"{message}; left out"), stacklevel=2)
-    return recordings.subset(n for n in range(len(recordings)) if n not in faults)
+    readable = recordings.subset(n for n in range(len(recordings)) if n not in faults)
+    _warn_of_repairs(readable)
+    return readable
+
+
+def _warn_of_repairs(recordings: Recordings) -> None:
+    """Warns once of all repairs of recordings and maps, with their number."""
+    tables = list(recordings)
+    maps = {id(each.road_map): each.road_map for each in tables}
+    of_tracks = [f"recording {each.name}: {line}" for each in tables for line in each.repairs]
+    of_maps = [f"map {each.name}: {line}" for each in maps.values() for line in each.repairs]
+    lines = [*of_tracks, *of_maps]
+    if lines:
+        repaired = sum(bool(each.repairs) for each in tables)
+        warnings.warn(
+            f"data {recordings.source!r}: {len(of_tracks)} repairs of {repaired} of {len(tables)} "
+            f"recordings and {len(of_maps)} of maps: {shorten(lines, SHOWN_REPAIRS)} "
+            "(asp-env inspect lists all repairs)",
+            RepairWarning,
+            stacklevel=3,
+        )
 
 
 def join_data(parts: Sequence[Recordings]) -> Recordings:
@@ -237,7 +298,9 @@ def join_data(parts: Sequence[Recordings]) -> Recordings:
                 )
             found[content] = part.source
             files.append(replace(each, name=f"{number}-{each.name}"))
-    return Recordings(", ".join(part.source for part in parts), files, dt_s=parts[0].dt_s)
+    source = ", ".join(part.source for part in parts)
+    quiet = all(part.quiet for part in parts)
+    return Recordings(source, files, dt_s=parts[0].dt_s, quiet=quiet)
 
 
 def load(path: str | Path) -> Recordings:
@@ -278,27 +341,60 @@ def source_folder(source: str) -> Path:
     return Path(registry.find("sources", scheme)(argument))
 
 
-def _find(folder: Path) -> tuple[RecordingFiles, ...]:
-    """The recordings that all registered readers find in a folder, this package's layouts first."""
+def find_by_reader(folder: Path) -> dict[str, list[RecordingFiles] | AspEnvError]:
+    """What each registered reader finds in a folder, this package's first layouts first.
+
+    Args:
+        folder: an existing folder.
+
+    Returns:
+        The recordings of each reader, or why it fails. A reader of another package may fail in any
+        way; an `OSError` of any reader is a `DataError`.
+    """
     names = [*_FIRST, *(name for name in registry.names("readers") if name not in _FIRST)]
-    found: list[RecordingFiles] = []
+    found: dict[str, list[RecordingFiles] | AspEnvError] = {}
     for name in names:
         try:
-            found += registry.find("readers", name)(folder)
+            found[name] = list(registry.find("readers", name)(folder))
+        except StaleInstallError:
+            raise
         except OSError as error:
-            raise DataError(f"{error.filename or folder}: {error.strerror or error}") from error
+            found[name] = DataError(f"{error.filename or folder}: {error.strerror or error}")
         except Exception as error:  # a reader of another package may raise anything
             reason = " ".join(f"{type(error).__name__}: {error}".split())
-            warnings.warn(f"reader {name!r} is left out: {reason}", stacklevel=3)
-    taken = {path for each in found if not isinstance(each, LevelxFiles) for path in each.tables}
-    return tuple(
-        each
-        for each in found
-        if not (
-            isinstance(each, LevelxFiles)  # whose names others have, too: Veh_smoothed_tracks.csv
-            and {path for path in each.tables if path.is_file()} <= taken
-        )
+            plug = registry.described("readers", name)
+            found[name] = AspEnvError(f"{plug} is left out: {reason}")
+    lists = [each for each in found.values() if isinstance(each, list)]
+    taken = {
+        path
+        for each in lists
+        for files in each
+        if not isinstance(files, LevelxFiles)
+        for path in files.tables
+    }
+    for each in lists:
+        each[:] = [files for files in each if not _is_taken(files, taken)]
+    return found
+
+
+def _is_taken(files: RecordingFiles, taken: set[Path]) -> bool:
+    """Whether files with the names of inD are those of another layout: Veh_smoothed_tracks.csv."""
+    return isinstance(files, LevelxFiles) and (
+        {path for path in files.tables if path.is_file()} <= taken
     )
+
+
+def _find(folder: Path) -> tuple[RecordingFiles, ...]:
+    """The recordings that all readers find in a folder; a reader that fails is left out."""
+    found: list[RecordingFiles] = []
+    for each in find_by_reader(folder).values():
+        if isinstance(each, DataError):
+            raise each
+        if isinstance(each, AspEnvError):
+            warnings.warn(str(each), stacklevel=3)
+        else:
+            found += each
+    return tuple(found)
 
 
 def _sample(site: str) -> Path:

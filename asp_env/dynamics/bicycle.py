@@ -13,6 +13,8 @@ from typing import Any, Literal
 import numpy as np
 from jaxtyping import Float
 
+from asp_env.arguments import shown
+from asp_env.errors import AspEnvError
 from asp_env.geometry import namespace, wrap_angle
 
 MAX_ACCELERATION_MPS2 = 5.0
@@ -226,6 +228,7 @@ def normalize_actions(actions: Float[Any, "*batch 2"]) -> Float[Any, "*batch 2"]
             environments do that.
     """
     if namespace(actions) is np:
+        actions = _action_array(actions)
         return (actions / np.array(_ACTION_LIMITS)).astype(actions.dtype)
     return actions / actions.new_tensor(_ACTION_LIMITS)
 
@@ -237,5 +240,24 @@ def denormalize_actions(actions: Float[Any, "*batch 2"]) -> Float[Any, "*batch 2
         actions: in the action space [-1, 1] of the environments.
     """
     if namespace(actions) is np:
+        actions = _action_array(actions)
         return actions * np.array(_ACTION_LIMITS, dtype=actions.dtype)
     return actions * actions.new_tensor(_ACTION_LIMITS)
+
+
+def _action_array(actions: Any) -> Float[np.ndarray, "*batch 2"]:
+    """The actions as an array of floats, which they mostly are already.
+
+    Raises:
+        AspEnvError: they are no numbers, or not two along the last axis.
+    """
+    is_array = isinstance(actions, np.ndarray) and actions.dtype.kind == "f"
+    try:
+        array = actions if is_array else np.asarray(actions, dtype=np.float64)
+    except (TypeError, ValueError):
+        array = np.zeros(0)
+    if array.shape[-1:] != (2,):
+        raise AspEnvError(
+            f"actions {shown(actions)}: expected numbers (…, 2), acceleration and steering"
+        )
+    return array

@@ -15,9 +15,18 @@ import numpy as np
 from gymnasium import spaces
 from jaxtyping import Bool, Float, Int
 
+from asp_env.arguments import shown, table, whole_number
 from asp_env.data.predictor import Predictor
 from asp_env.data.recording import ticks
-from asp_env.data.scenarios.scenario import Scenario, ScenarioFilter, ScenarioSet
+from asp_env.data.scenarios.scenario import (
+    MIN_DISTANCE_M,
+    MIN_LENGTH_S,
+    SHORT_LENGTH_S,
+    Scenario,
+    ScenarioFilter,
+    ScenarioSet,
+    short_history,
+)
 from asp_env.data.scenarios.selection import choose_scenarios, scenario_of
 from asp_env.data.scenarios.tags import TAGS
 from asp_env.data.scene import EGO, Scene, infer_actions
@@ -83,8 +92,9 @@ class ScenarioSampler:
         chosen = choose_scenarios(recordings, str(scenarios), dt_s=dt_s, history=history)
         if not len(chosen):
             raise AspEnvError(
-                f"{recordings.source}: no vehicle covers 10 m in 4 s after 3 s of history; "
-                "use other recordings"
+                f"{recordings.source}: no vehicle covers {MIN_DISTANCE_M:g} m in "
+                f"{MIN_LENGTH_S:g} s after {history * dt_s:g} s of history, or in "
+                f"{SHORT_LENGTH_S:g} s of short recordings; use other recordings"
             )
         return cls(recordings=recordings, scenarios=chosen)
 
@@ -126,8 +136,8 @@ class ScenarioSampler:
             self.recordings,
             source=self.scenarios.source,
             recording=scenario.recording,
-            ego_id=scenario.ego_id if ego is None else _whole_number("ego", ego),
-            start_tick=None if start_tick is None else _whole_number("start_tick", start_tick),
+            ego_id=scenario.ego_id if ego is None else whole_number("ego", ego),
+            start_tick=None if start_tick is None else whole_number("start_tick", start_tick),
             dt_s=self.scenarios.dt_s,
             history=self.scenarios.history,
         )
@@ -138,10 +148,36 @@ class ScenarioSampler:
         is_whole = isinstance(key, int | np.integer) and not isinstance(key, bool)
         if not (is_whole and 0 <= key < len(self.scenarios)):
             raise AspEnvError(
-                f"scenario {key}: expected 0 to {len(self.scenarios) - 1} for this data, or a "
-                "scenario's name"
+                f"scenario {shown(key)}: expected 0 to {len(self.scenarios) - 1} for this data, or "
+                "a scenario's name"
             )
         return self.scenarios[int(key)]
+
+
+def reset_options(options: Any) -> dict[str, Any]:
+    """Checks the options of a reset.
+
+    Args:
+        options: a mapping, or None for none.
+
+    Returns:
+        The options, in a dictionary of their own.
+
+    Raises:
+        AspEnvError: the options are no mapping.
+    """
+    if options is None:
+        return {}
+    return dict(table("options", options, f"some of {', '.join(RESET_OPTIONS)}"))
+
+
+def checked_seed(seed: Any) -> int | None:
+    """Checks the seed of a reset, which Gymnasium expects to be a number of Python.
+
+    Raises:
+        AspEnvError: the seed is neither None nor a whole number of at least 0.
+    """
+    return None if seed is None else whole_number("seed", seed, least=0)
 
 
 def _check_set(
@@ -155,17 +191,12 @@ def _check_set(
             f"scenarios of {scenarios.source}: expected some of {recordings.source}, whose "
             f"recordings are {', '.join(names)}"
         )
-    if abs(scenarios.dt_s - dt_s) > 1e-9 or scenarios.history != history:
+    histories = (history, short_history(history, dt_s))
+    if abs(scenarios.dt_s - dt_s) > 1e-9 or scenarios.history not in histories:
         raise AspEnvError(
             f"scenarios for {scenarios.history} past ticks of {scenarios.dt_s:g} s: expected "
             f"{history} of {dt_s:g} s"
         )
-
-
-def _whole_number(name: str, value: Any) -> int:
-    if not isinstance(value, int | np.integer) or isinstance(value, bool):
-        raise AspEnvError(f"{name} {value!r}: expected a whole number")
-    return int(value)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -209,10 +240,9 @@ class ReplayEpisodes:
             history=history,
             world_class=kind,
         )
+        self._traffic = _name_of_traffic(options.traffic, kind.traffic)
         check_action_type(options.action_type)
         self._action_type = options.action_type
-        if options.action_repeat < 1:
-            raise AspEnvError(f"action_repeat {options.action_repeat}: expected at least 1")
         self._action_repeat = options.action_repeat
         self._weights = weights_from(options.reward_weights or {})
         self._forecasts = forecast_observers(options.predictor, options.forecast, options.dt_s)
@@ -253,7 +283,15 @@ class ReplayEpisodes:
         self._allocate(num_episodes)
 
     def draw_from(self, scenarios: ScenarioSet) -> None:
-        """Replaces the scenarios to draw from; episodes under way go on."""
+        """Replaces the scenarios to draw from; episodes under way go on.
+
+        Raises:
+            AspEnvError: the argument is no set of scenarios, or the set is of other data.
+        """
+        if not isinstance(scenarios, ScenarioSet):
+            raise AspEnvError(f"scenarios {shown(scenarios)}: expected a ScenarioSet")
+        world = self.simulation.world
+        _check_set(scenarios, self.recordings, dt_s=world.dt_s, history=world.history)
         self.scenarios = scenarios
         self._sampler = dataclasses.replace(self._sampler, scenarios=scenarios)
 
@@ -439,7 +477,13 @@ class ReplayEpisodes:
             scene: a present scene.
             horizon: number of ticks.
             rows: numbers of the episodes that are its situations; all by default.
+
+        Raises:
+            AspEnvError: an argument is no scene or no number of ticks.
         """
+        if not isinstance(scene, Scene):
+            raise AspEnvError(f"scene {shown(scene)}: expected a Scene, such as that of scene()")
+        whole_number("horizon", horizon, least=1)
         return recorded_future(self.simulation.world, scene, horizon, rows)
 
     @property
@@ -489,31 +533,38 @@ class ReplayEpisodes:
         forecasts = [each.snapshot() for each in self._forecasts]
         statistics = self._return.copy(), self._num_steps.copy(), dict(self._terms)
         state = self.simulation.snapshot(), self._seeds.copy(), forecasts, statistics
-        return self._origin, state
+        return state
 
     @cached_property
-    def _origin(self) -> dict[str, Any]:
-        """What a snapshot must agree with to be restored here."""
+    def origin(self) -> dict[str, Any]:
+        """What a snapshot must have in common with these episodes to be restored here."""
         world = self.simulation.world
         return {
             "data": f"of content {self.recordings.data_hash()[:12]}",
             "time step": f"{world.dt_s:g} s",
-            "episodes": len(self._rows),
+            "number of episodes": len(self._rows),
+            "traffic": self._traffic,
+            "action_type": self._action_type,
+            "action_repeat": self._action_repeat,
+            "predictors": ", ".join(each.name for each in self.predictors) or "none",
         }
 
-    def restore(self, snapshot: Any) -> None:
-        """Restores the state of a snapshot, bit for bit.
+    def check_origin(self, origin: Mapping[str, Any]) -> None:
+        """Checks what a snapshot comes from.
 
         Raises:
-            AspEnvError: the snapshot is of other data or of another number of episodes.
+            AspEnvError: it is of other data, of another time step, number of episodes or action.
         """
-        origin, (simulation, seeds, forecasts, (returns, num_steps, terms)) = snapshot
-        for name, given in origin.items():
-            if given != self._origin[name]:
+        for name, expected in self.origin.items():
+            if origin.get(name) != expected:
                 raise AspEnvError(
-                    f"the snapshot is of an environment with {name} {given}, expected "
-                    f"{self._origin[name]}; restore it in an environment with the same arguments"
+                    f"the snapshot is of an environment with {name} {origin.get(name)}, expected "
+                    f"{expected}; restore it in an environment with the same arguments"
                 )
+
+    def restore(self, snapshot: Any) -> None:
+        """Restores the state of a snapshot of these episodes, see `check_origin`, bit for bit."""
+        simulation, seeds, forecasts, (returns, num_steps, terms) = snapshot
         self.simulation.restore(simulation)
         self._return, self._num_steps = returns.copy(), num_steps.copy()
         self._terms = dict(terms)
@@ -530,6 +581,14 @@ class ReplayEpisodes:
         """Gives episodes serial numbers, so that forecasts of earlier ones are not shown."""
         self._serials[rows] = self._num_begun + np.arange(len(rows))
         self._num_begun += len(rows)
+
+
+def _name_of_traffic(spec: Any, default: str) -> str:
+    """The traffic in words, to compare environments: drivers by name, or by class."""
+    if isinstance(spec, Mapping):
+        names = (f"{key}={_name_of_traffic(each, default)}" for key, each in spec.items())
+        return ",".join(sorted(names))
+    return spec if isinstance(spec, str) else default if spec is None else type(spec).__name__
 
 
 def _seed_from(rng: np.random.Generator) -> int:
@@ -591,7 +650,7 @@ def valid_actions(
         expected += f" for each environment, {shape}"
     try:
         values = np.asarray(actions, dtype=np.float64)
-    except (TypeError, ValueError):
+    except (TypeError, ValueError, OverflowError):
         raise AspEnvError(f"action {type(actions).__name__}: expected {expected}") from None
     if values.shape != shape:
         raise AspEnvError(f"action of shape {values.shape}: expected {expected}")

@@ -7,6 +7,7 @@ import numpy as np
 from gymnasium import spaces
 from jaxtyping import Shaped
 
+from asp_env.arguments import shown
 from asp_env.errors import AspEnvError
 
 Flatten = bool | Literal["parts"]
@@ -27,8 +28,8 @@ def flat_space(space: spaces.Space[Any], flatten: Flatten) -> spaces.Space[Any]:
     Raises:
         AspEnvError: `flatten` has another value, or the space is no Dict.
     """
-    if flatten not in (False, True, "parts"):
-        raise AspEnvError(f"flatten {flatten!r}: expected False, True or 'parts'")
+    if flatten != "parts" and not isinstance(flatten, bool):
+        raise AspEnvError(f"flatten {shown(flatten)}: expected False, True or 'parts'")
     if not isinstance(space, spaces.Dict):
         raise AspEnvError(f"observation space {space}: expected a Dict")
     if flatten == "parts":

@@ -15,6 +15,7 @@ import numpy as np
 from gymnasium import spaces
 from jaxtyping import Bool, Float, Int
 
+from asp_env.arguments import flag, positive_number, shown, text, whole_number
 from asp_env.compiled import njit
 from asp_env.data.predictor import (
     Predictor,
@@ -40,6 +41,8 @@ FORECAST_TIMES_S = (1.0, 2.0, 3.0)
 
 MAX_FEATURE = 100.0
 """Features are clipped to this size. Chosen by hand: normalised features stay below 30."""
+
+_PARTS_OF_PREDICTORS = ("name", "privileged", "dt_s", "horizon", "predict")
 
 NO_AGENT = -1
 """Slot and id where there is no agent."""
@@ -75,23 +78,30 @@ class ForecastOptions:
     """Text before the names of the entries, with an underscore: `cv` gives `cv_forecast`."""
 
     def __post_init__(self) -> None:
-        """Checks the numbers.
+        """Checks the options.
 
         Raises:
-            AspEnvError: an option is out of range.
+            AspEnvError: an option is of another type, or out of range.
         """
         counts = (
             ("agents", self.agents, 1),
             ("modes", self.modes, 1),
-            ("at_s: times", len(self.at_s), 1),
             ("every_ticks", self.every_ticks, 1),
             ("latency_ticks", self.latency_ticks, 0),
         )
         for name, count, least in counts:
-            if count < least:
-                raise AspEnvError(f"{name} {count}: expected at least {least}")
-        if self.features not in (True, False, "latent"):
-            raise AspEnvError(f"features {self.features!r}: expected True, False or 'latent'")
+            whole_number(name, count, least=least)
+        is_sequence = isinstance(self.at_s, Sequence | np.ndarray) and not isinstance(
+            self.at_s, str
+        )
+        if not is_sequence or not len(self.at_s):
+            raise AspEnvError(f"at_s {shown(self.at_s)}: expected at least one time")
+        for time_s in self.at_s:
+            positive_number("at_s: time", time_s, "s")
+        flag("privileged", self.privileged)
+        if self.features != "latent" and not isinstance(self.features, bool):
+            raise AspEnvError(f"features {shown(self.features)}: expected True, False or 'latent'")
+        text("prefix", self.prefix)
 
     @property
     def max_age_ticks(self) -> int:
@@ -229,6 +239,12 @@ since the scene of each agent's forecast |
             predictor = load_predictor(predictor, horizon=horizon, dt_s=dt_s)
         elif isinstance(predictor, Shared):
             predictor = predictor.value
+        missing = [name for name in _PARTS_OF_PREDICTORS if not hasattr(predictor, name)]
+        if missing:
+            raise AspEnvError(
+                f"predictor {shown(predictor)}: expected a name such as 'constant-velocity', or a "
+                f"Predictor; it has no {', '.join(missing)}"
+            )
         _check_predictor(predictor, wanted, dt_s, options)
         self._predictor = Shared(predictor)
         self._reads_past = reads_past(predictor)
@@ -468,6 +484,7 @@ def forecast_observers(
         raise unknown_name("predictor in forecast", unknown[0], sorted(predictor))
     observers = []
     for prefix, each in predictor.items():
+        text("prefix of a predictor", prefix)
         options = _options_of(forecast if own is None else own.get(prefix))
         full = "_".join(part for part in (options.prefix, prefix) if part)
         observers.append(ForecastObserver(each, dataclasses.replace(options, prefix=full), dt_s))
@@ -664,7 +681,8 @@ def _options_of(forecast: ForecastSpec | None) -> ForecastOptions:
     known = [field.name for field in dataclasses.fields(ForecastOptions)]
     if not isinstance(forecast, Mapping | None):
         raise AspEnvError(
-            f"forecast {forecast!r}: expected ForecastOptions or a mapping of {', '.join(known)}"
+            f"forecast {shown(forecast)}: expected ForecastOptions or a mapping of "
+            f"{', '.join(known)}"
         )
     for name in forecast or {}:
         if name not in known:

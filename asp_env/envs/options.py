@@ -7,8 +7,7 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, TypeVar, cast
 
-import numpy as np
-
+from asp_env.arguments import positive_number, shown, table, text, whole_number
 from asp_env.data.recording import DEFAULT_DT_S
 from asp_env.data.scenarios.scenario import ScenarioFilter, ScenarioSet
 from asp_env.envs.forecasts import ForecastSpec, PredictorSpec
@@ -16,6 +15,9 @@ from asp_env.errors import AspEnvError
 from asp_env.sim.traffic.assignment import TrafficSpec
 
 Function = TypeVar("Function", bound=Callable[..., Any])
+
+MAX_RASTER_PX = 4096
+"""Largest height and width of a raster. Chosen by hand: 200 MB for each observation."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -54,6 +56,28 @@ class ReplayOptions:
     """`ForecastOptions` or a mapping of its fields; for several predictors also a mapping from
     their prefixes to either."""
 
+    def __post_init__(self) -> None:
+        """Checks the types of options that are not checked where they are used.
+
+        Raises:
+            AspEnvError: an option is of another type, or out of range.
+        """
+        if isinstance(self.observations, str) or not isinstance(self.observations, Sequence):
+            raise AspEnvError(
+                f"observations {shown(self.observations)}: expected a sequence of names such as "
+                "('state', 'route')"
+            )
+        text("view", self.view)
+        positive_number("time step", self.dt_s, "s")
+        whole_number("action_repeat", self.action_repeat, least=1)
+        if self.reward_weights is not None:
+            table("reward_weights", self.reward_weights, "numbers by name of the term")
+        if not isinstance(self.scenarios, ScenarioSet | ScenarioFilter | str):
+            raise AspEnvError(
+                f"scenarios {shown(self.scenarios)}: expected a ScenarioSet, a ScenarioFilter or a "
+                "text such as 'left,length>=8'"
+            )
+
 
 def raster_size(raster_px: int | Sequence[int] | None) -> tuple[int, int] | None:
     """Returns the height and the width of rasters in pixels.
@@ -62,18 +86,21 @@ def raster_size(raster_px: int | Sequence[int] | None) -> tuple[int, int] | None
         raster_px: both, one number for both, or None for those of the view.
 
     Raises:
-        AspEnvError: it is neither one nor two whole numbers.
+        AspEnvError: it is neither one nor two whole numbers, or a raster would be too large.
     """
     if raster_px is None:
         return None
-    sizes: list[Any] = [raster_px] * 2 if isinstance(raster_px, int) else list(raster_px)
-    whole = [isinstance(size, int | np.integer) and not isinstance(size, bool) for size in sizes]
-    if len(sizes) != 2 or not all(whole):
+    sizes: list[Any] = [raster_px] * 2
+    if isinstance(raster_px, Sequence) and not isinstance(raster_px, str):
+        sizes = list(raster_px)
+    try:
+        height, width = (whole_number("", size, least=1, most=MAX_RASTER_PX) for size in sizes)
+    except (AspEnvError, ValueError):
         raise AspEnvError(
-            f"raster_px {raster_px!r}: expected height and width in pixels such as (90, 60), or "
-            "one number for a square raster"
-        )
-    return int(sizes[0]), int(sizes[1])
+            f"raster_px {shown(raster_px)}: expected height and width in pixels such as (90, 60), "
+            f"or one number for a square raster, from 1 to {MAX_RASTER_PX}"
+        ) from None
+    return height, width
 
 
 class UnknownOptionError(AspEnvError, TypeError):

@@ -17,11 +17,19 @@ from gymnasium.utils import seeding
 from jaxtyping import Bool, Float, Int
 from pettingzoo import ParallelEnv
 
+from asp_env.arguments import flag, shown, table, whole_number
 from asp_env.data.classes import PREDICTED, AgentClass
 from asp_env.data.recording import DEFAULT_DT_S, Recording, frames_per_tick
 from asp_env.data.scenarios.scenario import Scenario, ScenarioFilter, ScenarioSet
 from asp_env.data.scene import EGO, Scene
-from asp_env.envs.episodes import RESET_OPTIONS, ReplayEpisodes, info_of, valid_actions
+from asp_env.envs.episodes import (
+    RESET_OPTIONS,
+    ReplayEpisodes,
+    checked_seed,
+    info_of,
+    reset_options,
+    valid_actions,
+)
 from asp_env.envs.flat import Flatten, flat_space, flatten_observations
 from asp_env.envs.forecasts import ForecastSpec, PredictorSpec, extended_space
 from asp_env.envs.options import ReplayOptions, suggest_options
@@ -48,17 +56,22 @@ class AgentSelection:
         """Checks the selection.
 
         Raises:
-            AspEnvError: a class is unknown, or a sequence is empty.
+            AspEnvError: a class is unknown, an id is no whole number, or a sequence is empty.
         """
         known = sorted(kind.name.lower() for kind in PREDICTED)
         for field, values in (("classes", self.classes), ("ids", self.ids)):
-            if values is not None and (isinstance(values, str) or not len(values)):
+            if values is None:
+                continue
+            is_sequence = isinstance(values, Sequence | np.ndarray) and not isinstance(values, str)
+            if not is_sequence or not len(values):
                 raise AspEnvError(
-                    f"{field} {values!r}: expected a sequence with at least one entry"
+                    f"{field} {shown(values)}: expected a sequence with at least one entry"
                 )
         for name in self.classes or ():
             if name not in known:
                 raise unknown_name("class of agents", name, known)
+        for number in self.ids if self.ids is not None else ():
+            whole_number("id of an agent", number)
 
     def mask(self, recording: Recording) -> Bool[np.ndarray, " tracks"]:
         """Returns the mask of a recording's tracks that may be agents."""
@@ -291,8 +304,10 @@ entry is a vector, images stay images |
         """
         if render_mode not in (None, "rgb_array"):
             raise AspEnvError(f"render mode {render_mode!r}: expected rgb_array or None")
-        if max_agents is not None and max_agents < 1:
-            raise AspEnvError(f"max_agents {max_agents}: expected at least 1")
+        if max_agents is not None:
+            whole_number("max_agents", max_agents, least=1)
+        flag("pad_absent", pad_absent)
+        flag("numeric_infos", numeric_infos)
         options = ReplayOptions(
             observations=observations,
             view=view,
@@ -352,11 +367,13 @@ entry is a vector, images stay images |
             options: those of `ReplayEnv.reset`; others are ignored.
 
         Raises:
-            AspEnvError: there is no such scenario.
+            AspEnvError: the seed or the options are invalid, or there is no such scenario.
         """
+        chosen = reset_options(options)
+        seed = checked_seed(seed)
         if seed is not None or self._np_random is None:
             self._np_random, _ = seeding.np_random(seed)
-        known = {name: value for name, value in (options or {}).items() if name in RESET_OPTIONS}
+        known = {name: value for name, value in chosen.items() if name in RESET_OPTIONS}
         scenario, rng = self._episodes.draw(self._np_random, known)
         world = self._episodes.simulation.world
         views = agent_scenarios(
@@ -364,7 +381,7 @@ entry is a vector, images stay images |
             self._selected[scenario.recording],
             scenario,
             dt_s=world.dt_s,
-            history=world.history,
+            history=self.scenarios.history,
             max_agents=self._max_agents,
         )
         reset_mask = np.arange(self._max_agents) < len(views)
@@ -399,6 +416,7 @@ entry is a vector, images stay images |
                 has begun.
             AspEnvError: an agent's action is missing, has another shape or is not finite.
         """
+        table("actions", actions, "an action by agent")
         if not self._present:
             if actions or not self._in_episode:
                 raise gymnasium.error.ResetNeeded("no agent is left: call reset before step")
@@ -443,10 +461,8 @@ entry is a vector, images stay images |
             gymnasium.error.ResetNeeded: no episode has begun.
             AspEnvError: there is no such agent, or the episode began without it.
         """
-        if agent not in self.possible_agents:
-            raise unknown_name("agent", agent, self.possible_agents)
-        if not self._in_episode:
-            raise gymnasium.error.ResetNeeded("no episode has begun: call reset first")
+        self._check_agent(agent)
+        self._check_begun()
         if agent not in self._in_episode:
             raise AspEnvError(
                 f"{agent} is absent from this episode: expected one of "
@@ -460,7 +476,11 @@ entry is a vector, images stay images |
         Returns:
             [x m, y m, heading rad, speed m/s, length m, width m, 1] of each agent; zeros for absent
             ones.
+
+        Raises:
+            gymnasium.error.ResetNeeded: no episode has begun.
         """
+        self._check_begun()
         world = self._episodes.simulation.world
         state = np.zeros(self.state_space.shape or (), dtype=np.float32)
         rows = [self._rows[name] for name in self._present]
@@ -470,11 +490,21 @@ entry is a vector, images stay images |
         return state
 
     def observation_space(self, agent: str) -> spaces.Space[Any]:
-        """Returns the observation space, which all agents share."""
+        """Returns the observation space, which all agents share.
+
+        Raises:
+            AspEnvError: there is no such agent.
+        """
+        self._check_agent(agent)
         return self.observation_spaces[agent]
 
     def action_space(self, agent: str) -> spaces.Space[Any]:
-        """Returns the action space of an agent, which has its own seed."""
+        """Returns the action space of an agent, which has its own seed.
+
+        Raises:
+            AspEnvError: there is no such agent.
+        """
+        self._check_agent(agent)
         return self.action_spaces[agent]
 
     def render(self) -> Any:
@@ -498,7 +528,7 @@ entry is a vector, images stay images |
             selected = self._selected[scenario.recording]
             if selected[recording.track_ids == scenario.ego_id].any():
                 present = present_tracks(
-                    recording, scenario, dt_s=world.dt_s, history=world.history
+                    recording, scenario, dt_s=world.dt_s, history=scenarios.history
                 )
                 num_agents = max(num_agents, int((present & selected).sum()))
                 drivable[row] = True
@@ -507,6 +537,14 @@ entry is a vector, images stay images |
                 f"{data}: the ego of no scenario has one of the given classes and ids"
             )
         return scenarios.select(drivable), num_agents
+
+    def _check_agent(self, agent: str) -> None:
+        if agent not in self.possible_agents:
+            raise unknown_name("agent", agent, self.possible_agents)
+
+    def _check_begun(self) -> None:
+        if not self._in_episode:
+            raise gymnasium.error.ResetNeeded("no episode has begun: call reset first")
 
     def _present_mask(self) -> Bool[np.ndarray, " agents"]:
         """Returns the mask of the present agents among the possible ones."""

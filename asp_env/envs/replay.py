@@ -9,19 +9,28 @@ import gymnasium
 import numpy as np
 from jaxtyping import Float, Shaped
 
+from asp_env.arguments import shown
 from asp_env.data.predictor import Forecast, Predictor
 from asp_env.data.recording import DEFAULT_DT_S, Background
 from asp_env.data.scenarios.scenario import Scenario, ScenarioFilter, ScenarioSet
 from asp_env.data.scene import Scene
 from asp_env.data.snippets import Future
 from asp_env.data.source import Recordings
-from asp_env.envs.episodes import ReplayEpisodes, StepResult, info_of, valid_actions
+from asp_env.envs.episodes import (
+    ReplayEpisodes,
+    StepResult,
+    checked_seed,
+    info_of,
+    reset_options,
+    valid_actions,
+)
 from asp_env.envs.flat import Flatten, flat_space, flatten_observations
 from asp_env.envs.forecasts import ForecastSpec, PredictorSpec
 from asp_env.envs.hints import hint_at_large_observations
 from asp_env.envs.keyboard import keyboard_actions
 from asp_env.envs.options import ReplayOptions, suggest_options
 from asp_env.envs.shared_in_spec import SharedInSpec
+from asp_env.errors import AspEnvError
 from asp_env.render.live import MODES, LiveRenderer, render_fps
 from asp_env.sim.traffic.assignment import TrafficSpec
 from asp_env.sim.world import World
@@ -38,6 +47,8 @@ class EnvSnapshot:
     arguments restores it by stepping through the actions again.
     """
 
+    origin: Mapping[str, Any]
+    """What an environment must have in common with this one to restore the snapshot."""
     scenario: Scenario
     rng: Mapping[str, Any]
     """State of the episode's generator at its start."""
@@ -303,10 +314,11 @@ name; several in a mapping with their prefixes |
                 recording of the scenario; `start_tick`, the tick of the first observation.
 
         Raises:
-            AspEnvError: an option is unknown, or there is no such scenario.
+            AspEnvError: the seed or an option is invalid, or there is no such scenario.
         """
-        super().reset(seed=seed)
-        self._begin(*self._episodes.draw(self.np_random, options or {}))
+        chosen = reset_options(options)
+        super().reset(seed=checked_seed(seed))
+        self._begin(*self._episodes.draw(self.np_random, chosen))
         self._running = True
         self._live.clear_overlay()
         self._update_window()
@@ -382,6 +394,7 @@ name; several in a mapping with their prefixes |
         if self._start is None:
             raise gymnasium.error.ResetNeeded(NOT_BEGUN)
         return EnvSnapshot(
+            origin=self._episodes.origin,
             scenario=self._start[0],
             rng=self._start[1],
             actions=np.array(self._actions, dtype=np.float32).reshape(-1, 2),
@@ -399,6 +412,11 @@ name; several in a mapping with their prefixes |
         Raises:
             AspEnvError: the snapshot is of an environment with other arguments.
         """
+        if not isinstance(snapshot, EnvSnapshot):
+            raise AspEnvError(
+                f"snapshot {shown(snapshot)}: expected what snapshot() of a ReplayEnv returns"
+            )
+        self._episodes.check_origin(snapshot.origin)
         if snapshot.arrays is None:
             rng = np.random.default_rng()
             rng.bit_generator.state = snapshot.rng

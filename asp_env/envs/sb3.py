@@ -1,7 +1,7 @@
 """Vector environments for stable-baselines3. Importing this module imports stable-baselines3."""
 
 import warnings
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import gymnasium
@@ -10,7 +10,9 @@ from gymnasium.vector import AutoresetMode, VectorEnv
 from stable_baselines3.common.vec_env import VecEnv
 from stable_baselines3.common.vec_env.base_vec_env import VecEnvIndices, VecEnvStepReturn
 
+from asp_env.arguments import shown
 from asp_env.data.scene import Scene
+from asp_env.envs.episodes import checked_seed
 from asp_env.envs.flat import observation_of
 from asp_env.errors import AspEnvError
 
@@ -57,7 +59,17 @@ class ReplayVecEnv(VecEnv):
         }
 
     def reset(self) -> Observations:
-        """Starts all episodes with the seeds and options that were set, and clears these."""
+        """Starts all episodes with the seeds and options that were set, and clears these.
+
+        Raises:
+            AspEnvError: the options are neither a mapping nor one for each environment.
+        """
+        is_one_each = isinstance(self._options, Sequence) and len(self._options) == self.num_envs
+        if not is_one_each or not all(isinstance(each, Mapping) for each in self._options):
+            raise AspEnvError(
+                f"options {shown(self._options)}: expected one mapping, or a list with one for "
+                f"each of the {self.num_envs} environments"
+            )
         names = {name for options in self._options for name in options}
         options = {name: [each.get(name) for each in self._options] for name in names}
         observations, infos = self.envs.reset(seed=self._seeds, options=options)  # pyright: ignore[reportArgumentType]
@@ -65,6 +77,14 @@ class ReplayVecEnv(VecEnv):
         self._reset_seeds()
         self._reset_options()
         return observations
+
+    def seed(self, seed: int | None = None) -> Sequence[int | None]:
+        """Sets the seeds of the next reset, as of all environments of stable-baselines3.
+
+        Raises:
+            AspEnvError: the seed is no whole number of at least 0.
+        """
+        return super().seed(checked_seed(seed))
 
     def step_async(self, actions: np.ndarray) -> None:
         """Stores the actions for `step_wait`."""

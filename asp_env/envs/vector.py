@@ -12,13 +12,21 @@ from gymnasium.vector import AutoresetMode, VectorEnv
 from gymnasium.vector.utils import batch_space
 from jaxtyping import Bool, Float, Shaped
 
+from asp_env.arguments import shown, whole_number
 from asp_env.data.predictor import Predictor
 from asp_env.data.recording import DEFAULT_DT_S
 from asp_env.data.scenarios.scenario import ScenarioFilter, ScenarioSet
 from asp_env.data.scene import Scene
 from asp_env.data.snippets import Future
 from asp_env.data.source import Recordings
-from asp_env.envs.episodes import ObservationBuffers, ReplayEpisodes, StepResult, valid_actions
+from asp_env.envs.episodes import (
+    ObservationBuffers,
+    ReplayEpisodes,
+    StepResult,
+    checked_seed,
+    reset_options,
+    valid_actions,
+)
 from asp_env.envs.flat import Flatten, flat_space, flatten_observations, observation_of
 from asp_env.envs.forecasts import ForecastSpec, PredictorSpec
 from asp_env.envs.hints import hint_at_large_observations
@@ -32,11 +40,16 @@ from asp_env.sim.traffic.assignment import TrafficSpec
 
 Infos = dict[str, Any]
 
+MAX_ENVS = 2**20
+"""Largest number of environments. Chosen by hand: a million have 20 GB of states."""
+
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class VectorSnapshot:
     """The whole state of a vector environment; a pickle holds no recordings and no rasters."""
 
+    origin: Mapping[str, Any]
+    """What an environment must have in common with this one to restore the snapshot."""
     episodes: Any
     generators: tuple[Mapping[str, Any], ...]
     """States of `np_random`."""
@@ -116,10 +129,9 @@ class ReplayVectorEnv(SharedInSpec, VectorEnv[Any, Any, np.ndarray]):  # pyright
         Raises:
             AspEnvError: an argument is invalid, or the data hold no scenario.
         """
-        if num_envs < 1:
-            raise AspEnvError(f"num_envs {num_envs}: expected at least 1")
-        if max_episode_steps is not None and max_episode_steps < 1:
-            raise AspEnvError(f"max_episode_steps {max_episode_steps}: expected at least 1")
+        num_envs = whole_number("num_envs", num_envs, least=1, most=MAX_ENVS)
+        if max_episode_steps is not None:
+            whole_number("max_episode_steps", max_episode_steps, least=1)
         if render_mode not in (None, "rgb_array"):
             raise AspEnvError(f"render mode {render_mode!r}: expected rgb_array or None")
         options = ReplayOptions(
@@ -175,9 +187,10 @@ class ReplayVectorEnv(SharedInSpec, VectorEnv[Any, Any, np.ndarray]):  # pyright
             AspEnvError: a seed, the mask or an option is invalid.
             gymnasium.error.ResetNeeded: the mask leaves out an episode that has not begun.
         """
-        options = dict(options or {})
+        options = reset_options(options)
+        seeds = self._seeds_of(seed)
         reset_mask = self._parse_mask(options.pop("reset_mask", None))
-        for b, env_seed in enumerate(self._seeds_of(seed)):
+        for b, env_seed in enumerate(seeds):
             if reset_mask[b] and env_seed is not None:
                 self._generators[b], self._seeds[b] = seeding.np_random(env_seed)
         self._begin(reset_mask, [_options_of(options, b, self.num_envs) for b in self._rows])
@@ -300,6 +313,7 @@ class ReplayVectorEnv(SharedInSpec, VectorEnv[Any, Any, np.ndarray]):  # pyright
         """
         self._check_begun()
         return VectorSnapshot(
+            origin=self._episodes.origin,
             episodes=self._episodes.snapshot(),
             generators=tuple(each.bit_generator.state for each in self.np_random),
             seeds=tuple(self._seeds),
@@ -312,6 +326,11 @@ class ReplayVectorEnv(SharedInSpec, VectorEnv[Any, Any, np.ndarray]):  # pyright
         Raises:
             AspEnvError: the snapshot is of an environment with other arguments.
         """
+        if not isinstance(snapshot, VectorSnapshot):
+            raise AspEnvError(
+                f"snapshot {shown(snapshot)}: expected what snapshot() of a ReplayVectorEnv returns"
+            )
+        self._episodes.check_origin(snapshot.origin)
         self._episodes.restore(snapshot.episodes)
         for generator, state in zip(self.np_random, snapshot.generators, strict=True):
             generator.bit_generator.state = state
@@ -393,11 +412,12 @@ class ReplayVectorEnv(SharedInSpec, VectorEnv[Any, Any, np.ndarray]):  # pyright
     def _seeds_of(self, seed: int | Sequence[int | None] | None) -> list[int | None]:
         if seed is None:
             return [None] * self.num_envs
-        if isinstance(seed, int | np.integer):
-            return [int(seed) + b for b in self._rows]
+        if isinstance(seed, str) or not isinstance(seed, Sequence | np.ndarray):
+            first = whole_number("seed", seed, least=0)
+            return [first + b for b in self._rows]
         if len(seed) != self.num_envs:
             raise AspEnvError(f"{len(seed)} seeds: expected {self.num_envs}, one per environment")
-        return list(seed)
+        return [checked_seed(each) for each in seed]
 
     def _parse_mask(self, mask: Any) -> Bool[np.ndarray, " n"]:
         if mask is None:

@@ -39,12 +39,13 @@ class FlatParts(
 
         Args:
             env: an environment whose observation space is a Dict of boxes.
+
+        Raises:
+            AspEnvError: the observation space is no Dict.
         """
         RecordConstructorArgs.__init__(self)
         super().__init__(env)
-        space = env.observation_space
-        assert isinstance(space, spaces.Dict)
-        self.observation_space = flat_space(space, "parts")
+        self.observation_space = flat_space(env.observation_space, "parts")
 
     def observation(self, observation: dict[str, Any]) -> dict[str, Any]:
         """Returns the observation in the shapes of this wrapper's space."""
@@ -107,6 +108,7 @@ since the scene of the forecast |
 
         Raises:
             AspEnvError: the environment, the predictor or an argument is invalid.
+            TypeError: `env` is no environment.
         """
         options = ForecastOptions(
             agents=agents,
@@ -166,8 +168,10 @@ class VectorPredictionFeatures(VectorObservationWrapper):
 
         Raises:
             AspEnvError: the environment, the predictor or an argument is invalid.
+            TypeError: `env` is no environment.
         """
-        if env.metadata.get("autoreset_mode") is AutoresetMode.SAME_STEP:
+        metadata = env.metadata if isinstance(env, VectorEnv) else {}
+        if metadata.get("autoreset_mode") is AutoresetMode.SAME_STEP:
             raise AspEnvError(
                 "VectorPredictionFeatures: autoreset_mode 'SameStep' needs the forecasts of ended "
                 "episodes; make the environment itself with predictor=…, or with 'NextStep'"

@@ -13,6 +13,7 @@ from typing import Any
 from rich.console import Console
 
 from asp_env import registry
+from asp_env.data.scenarios.selection import save_scenarios
 from asp_env.errors import AspEnvError
 from asp_env.evaluation.closed_loop.drive import ClosedLoopResult, Drive, drive, save_rollouts
 from asp_env.evaluation.closed_loop.scenario_table import write_scenario_table
@@ -20,7 +21,7 @@ from asp_env.evaluation.open_loop.evaluate import Evaluate, OpenLoopResult, eval
 from asp_env.evaluation.report import check_report_possible, write_report
 from asp_env.evaluation.results import write_manifest, write_metrics
 from asp_env.evaluation.tables import driving_tables, headlines, open_loop_tables, regret_tables
-from asp_env.files import atomic_folder
+from asp_env.files import atomic_folder, is_vacant, write_text
 from asp_env.metrics.driving.rules import DEFAULT_RULES, RULES
 
 TRAFFIC = {"site": "intersection", "traffic": "dense"}
@@ -154,7 +155,8 @@ def _show(
             **dict(zip(("open_loop", "closed_loop"), manifests, strict=False)),
         )
         if closed_loop is not None:
-            write_scenario_table(folder, closed_loop.scenarios, closed_loop.methods)
+            save_scenarios(folder / "scenarios.json", closed_loop.scenarios, closed_loop.recordings)
+            write_scenario_table(folder, [closed_loop.driven])
             save_rollouts(folder, closed_loop)
         write_report(
             folder,
@@ -184,7 +186,7 @@ def _run_command(name: str, **options: Any) -> None:
 def _claim(out: Path) -> None:
     """Creates the folder, or checks that it was created by the same demo."""
     path = out / "plan.json"
-    if out.exists() and (not out.is_dir() or any(out.iterdir())):
+    if not is_vacant(out):
         try:
             same = json.loads(path.read_text()) == PLAN
         except (OSError, ValueError):
@@ -195,7 +197,7 @@ def _claim(out: Path) -> None:
             )
         return
     out.mkdir(parents=True, exist_ok=True)
-    path.write_text(json.dumps(PLAN, indent=2) + "\n")
+    write_text(path, json.dumps(PLAN, indent=2) + "\n")
 
 
 @contextmanager

@@ -135,7 +135,7 @@ def scenario_regrets(
             )
             key = hashlib.sha256(repr(identity).encode()).hexdigest()[:20]
             folder = get_or_create("regrets", key, make)
-            largest[rows, column] = np.load(folder / _FILE)
+            largest[rows, column] = np.load(folder / _FILE, allow_pickle=False)
     return largest
 
 

@@ -22,7 +22,7 @@ from asp_env.data.source import Recordings, open_data
 from asp_env.dynamics import inverse, rollout
 from asp_env.dynamics.bicycle import Integrator
 from asp_env.errors import AspEnvError, DataError, RepairWarning
-from asp_env.metrics.drivable import CELL_M, drivable_field
+from asp_env.metrics.drivable import drivable_field
 from asp_env.metrics.forecast.errors import moving
 
 HORIZONS_S = (3.0, 6.0)
@@ -144,7 +144,7 @@ class Inspect:
     def _examine(
         self, recordings: Recordings, console: Console
     ) -> tuple[list[RecordingSummary], dict[str, str]]:
-        summaries: list[RecordingSummary] = []
+        opened: list[Recording] = []
         faults: dict[str, str] = {}
         numbers = track(
             range(len(recordings)),
@@ -167,19 +167,19 @@ class Inspect:
                     raise
                 faults[name] = f"recording {name}: {error}"
                 continue
-            summaries.append(
-                RecordingSummary(
-                    recording=recording,
-                    on_road=_on_road(recording),
-                    drifts=_drifts(recording, self.dt),
-                    scenarios=find_scenarios(
-                        [recording],
-                        source=self.data,
-                        dt_s=self.dt,
-                        history=ticks(HISTORY_S, self.dt),
-                    ),
-                )
+            opened.append(recording)
+        scenarios = find_scenarios(
+            opened, source=self.data, dt_s=self.dt, history=ticks(HISTORY_S, self.dt)
+        )
+        summaries = [
+            RecordingSummary(
+                recording=recording,
+                on_road=_on_road(recording),
+                drifts=_drifts(recording, self.dt),
+                scenarios=scenarios.select(scenarios.recording == number),
             )
+            for number, recording in enumerate(opened)
+        ]
         return summaries, faults
 
 
@@ -293,7 +293,7 @@ def _map_table(maps: list[RoadMap]) -> Table:
     for name in ("lanes", "successors", "lines", "drivable m²", "repairs"):
         table.add_column(name, justify="right")
     for road_map in maps:
-        area_m2 = float((drivable_field(road_map).outside_m <= 0).sum()) * CELL_M**2
+        area_m2 = drivable_field(road_map).drivable_m2()
         table.add_row(
             road_map.name,
             str(len(road_map.lanes)),

@@ -27,6 +27,13 @@ HEADROOM = "headroom"
 FALLBACK = "fallback"
 """Metric: share of the forecasts of targets that a guard has blended to constant velocity."""
 
+FAULTY = "faulty"
+"""Metric: share of the scenarios in which the predictor or the planner had a fault that was filled
+in by constant velocity."""
+
+ANSWER = "question"
+"""Subset of the rows that answer a question of a study, of all its scenarios."""
+
 _DIFFERENCE = " - "
 
 

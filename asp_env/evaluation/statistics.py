@@ -27,10 +27,11 @@ two-sided test at 5 % finds with a probability of 80 %, since 1.96 + 0.84 = 2.8.
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from functools import lru_cache
 
 import numpy as np
 from jaxtyping import Float, Shaped
+
+from asp_env.data.bounded_cache import BoundedCache
 
 RESAMPLES = 2000
 """Number of bootstrap resamples. Chosen by hand."""
@@ -55,6 +56,12 @@ class Estimate:
     n: int
     """Number of samples."""
 
+    def __format__(self, form: str) -> str:
+        """The value and its interval as text, each formatted by `form`."""
+        if self.low is None or self.high is None:
+            return format(self.value, form)
+        return f"{self.value:{form}} [{self.low:{form}}, {self.high:{form}}]"
+
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Difference:
@@ -66,6 +73,14 @@ class Difference:
     p: float | None
     """Two-sided p value of `value / standard error` under the standard normal distribution; None
     without an interval."""
+
+    def __format__(self, form: str) -> str:
+        """The difference and its interval as text, and the MDE if it is not resolved."""
+        estimate, mde = self.estimate, self.mde
+        if is_resolved(estimate.value, estimate.low, estimate.high, mde):
+            return format(estimate, form)
+        seen = "" if mde is None else f" (smallest that could be seen {mde:{form.lstrip('+')}})"
+        return f"{estimate:{form}}, not resolved{seen}"
 
 
 def mean(values: Shaped[np.ndarray, " n"], groups: Shaped[np.ndarray, " n"]) -> Estimate:
@@ -153,6 +168,20 @@ def resampled_sums(
         resamples and the shape is `(1, *sums)`.
     """
     return average_runs(run_sums(parts, groups), stream=stream)
+
+
+def resampled_means(
+    values: Shaped[np.ndarray, "runs n"], groups: Shaped[np.ndarray, " n"], *, stream: int = 0
+) -> Float[np.ndarray, " draws"]:
+    """Means over samples and runs: of the samples as they are, then of every resample.
+
+    Args:
+        values: values of each run for each of n > 0 samples.
+        groups: recording that each sample is from, as numbers or names.
+        stream: number of the sequence of random numbers, as for `resampled_sums`.
+    """
+    sums = resampled_sums(np.stack([values, np.ones_like(values)], axis=-1), groups, stream=stream)
+    return sums[:, 0] / sums[:, 1]
 
 
 def run_sums(
@@ -299,20 +328,30 @@ def samples_needed(value: float, mde: float, n: int) -> int | None:
     return None if value == 0.0 else math.ceil(n * (mde / value) ** 2)
 
 
-@lru_cache(maxsize=64)
+_resamples = BoundedCache[np.ndarray](64 * 2**20)
+"""Chosen by hand: comparisons have many subsets of different numbers of recordings; those of 40
+recordings have 0.6 MB."""
+
+
 def _resample_counts(groups: int) -> Float[np.ndarray, "resamples groups"]:
     """How often each resample contains each group; the same for every call."""
-    rng = np.random.default_rng(0)
-    counts = rng.multinomial(groups, np.full(groups, 1 / groups), RESAMPLES).astype(float)
-    counts.flags.writeable = False
-    return counts
+
+    def make() -> np.ndarray:
+        rng = np.random.default_rng(0)
+        counts = rng.multinomial(groups, np.full(groups, 1 / groups), RESAMPLES).astype(float)
+        counts.flags.writeable = False
+        return counts
+
+    return _resamples.get(groups, make)
 
 
-@lru_cache(maxsize=64)
 def _run_shares(runs: int, stream: int) -> Float[np.ndarray, "resamples runs"]:
     """Share of each of R > 1 runs among the R - 1 runs of each resample."""
-    rng = np.random.default_rng((1, stream))
-    counts = rng.multinomial(runs - 1, np.full(runs, 1 / runs), RESAMPLES)
-    shares = counts / (runs - 1)
-    shares.flags.writeable = False
-    return shares
+
+    def make() -> np.ndarray:
+        rng = np.random.default_rng((1, stream))
+        shares = rng.multinomial(runs - 1, np.full(runs, 1 / runs), RESAMPLES) / (runs - 1)
+        shares.flags.writeable = False
+        return shares
+
+    return _resamples.get((runs, stream), make)

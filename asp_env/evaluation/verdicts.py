@@ -60,6 +60,20 @@ def share_text(share: Statistic) -> str:
     return f"{text} [{100 * share.low:.0f}, {100 * share.high:.0f}]"
 
 
+def oracle_phrase(share: Statistic | None) -> tuple[str, str]:
+    """An oracle share in words, such as `like a 40 % oracle`, and its interval, `[25, 55]`.
+
+    Args:
+        share: an oracle share between 0 and 1; without one, both texts are empty.
+    """
+    if share is None or share.value is None:
+        return "", ""
+    percent, _, bounds = share_text(share).partition(" % ")
+    percent = percent.removesuffix(" %")
+    article = "an" if percent.startswith("8") or percent in ("11", "18") else "a"
+    return f"like {article} {percent} % oracle", bounds
+
+
 def headline(
     name: str, reference: str, gain: str, difference: Statistic, share: Statistic | None
 ) -> str:
@@ -72,11 +86,8 @@ def headline(
         difference: difference of the score to that of the reference.
         share: oracle share of the method; None where there is no ladder.
     """
-    drives = ""
-    if share is not None and share.value is not None:
-        percent, _, bounds = share_text(share).partition(" % ")
-        article = "an" if percent.startswith("8") or percent in ("11", "18") else "a"
-        drives = f" drives like {article} {percent.removesuffix(' %')} % oracle {bounds}".rstrip()
+    phrase, bounds = oracle_phrase(share)
+    drives = f" drives {phrase} {bounds}".rstrip() if phrase else ""
     return f"{name}{drives}: score {gain} against {reference}, {verdict_text(difference)}."
 
 

@@ -6,10 +6,11 @@ from typing import no_type_check
 
 import cv2
 import numpy as np
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, Int
 
 from asp_env.compiled import njit
-from asp_env.data.road_map import MapCache, RoadMap
+from asp_env.data.map_cache import MapCache
+from asp_env.data.road_map import RoadMap
 from asp_env.errors import DataError
 from asp_env.geometry import route_coordinates
 
@@ -29,20 +30,47 @@ hand."""
 LOG_BESIDE_ROUTE_M = 2.0
 """It is allowed up to this far beside its route. Chosen by hand."""
 
+TILE_CELLS = 16
+"""Rows and columns of a tile, a power of two. Chosen by hand, by the memory of fields."""
+
+FIELDS_BYTES = 384 * 2**20
+"""Memory of the cached fields. Those of a roundabout have 2.6 MiB and take 30 ms; episodes side by
+side on more maps than fit make fields anew at every tick. Chosen by hand: about 140 roundabouts."""
+
+SIGNED_FIELDS_BYTES = 128 * 2**20
+"""Memory of the cached signed fields, which only measures of realism use. Chosen by hand: about 30
+roundabouts."""
+
 _SUBPIXEL_BITS = 8
+_TILE_BITS = TILE_CELLS.bit_length() - 1
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class DrivableField:
     """Distance to the drivable area on a grid, `MARGIN_M` outside the grid.
 
-    The grid covers the drivable area, or the part of it in the map's region.
+    The grid covers the drivable area, or the part of it in the map's region. It consists of square
+    tiles; all tiles of one and the same value, far outside or inside, are stored once.
     """
 
-    outside_m: Float[np.ndarray, "rows columns"]
-    """0 inside the drivable area, at most `MARGIN_M`; negative inside for a signed field."""
+    tiles: Float[np.ndarray, "tiles cells cells"]
+    """Metres: 0 inside the drivable area, at most `MARGIN_M`; negative inside for a signed
+    field."""
+    tile_of: Int[np.ndarray, "tile_rows tile_columns"]
+    """Index into `tiles` of each square of the grid."""
     origin_m: tuple[float, float]
     """Centre of cell (0, 0); rows increase along +y, columns along +x."""
+
+    @property
+    def shape(self) -> tuple[int, int]:
+        """Rows and columns of the grid."""
+        rows, columns = self.tile_of.shape
+        return (rows * TILE_CELLS, columns * TILE_CELLS)
+
+    def drivable_m2(self) -> float:
+        """The drivable area in the grid, square metres."""
+        inside = (self.tiles <= 0).sum(axis=(1, 2))
+        return float(inside[self.tile_of].sum()) * CELL_M**2
 
     def distance_m(self, points: Float[np.ndarray, "*batch 2"]) -> Float[np.ndarray, "*batch"]:
         """Distance of points to the drivable area, metres, accurate to about one cell.
@@ -52,7 +80,7 @@ class DrivableField:
         """
         flat = np.ascontiguousarray(points.reshape(-1, 2))
         out = np.empty(len(flat), dtype=np.float32)
-        _look_up(self.outside_m, self.origin_m[0], self.origin_m[1], flat, out)
+        _look_up(self.tiles, self.tile_of, self.origin_m[0], self.origin_m[1], flat, out)
         return out.reshape(points.shape[:-1])
 
     def corners_m(
@@ -70,9 +98,8 @@ class DrivableField:
             chosen: boxes whose distance is written; others are left unchanged.
             out: written.
         """
-        _write_outermost(
-            self.outside_m, self.origin_m[0], self.origin_m[1], states, sizes, chosen, out
-        )
+        x_m, y_m = self.origin_m
+        _write_outermost(self.tiles, self.tile_of, x_m, y_m, states, sizes, chosen, out)
 
 
 def drivable_field(road_map: RoadMap) -> DrivableField:
@@ -200,54 +227,72 @@ def _draw_area(road_map: RoadMap) -> tuple[np.ndarray, tuple[float, float]]:
 
 def _make_field(road_map: RoadMap) -> DrivableField:
     image, origin_m = _draw_area(road_map)
-    outside = cv2.distanceTransform(image, cv2.DIST_L2, cv2.DIST_MASK_PRECISE) * CELL_M
-    return DrivableField(
-        outside_m=np.minimum(outside, MARGIN_M).astype(np.float32), origin_m=origin_m
-    )
+    return _tiled(_outside_m(image), origin_m)
 
 
 def _make_signed_field(road_map: RoadMap) -> DrivableField:
     image, origin_m = _draw_area(road_map)
     inside = cv2.distanceTransform(255 - image, cv2.DIST_L2, cv2.DIST_MASK_PRECISE) * CELL_M
-    outside = drivable_field(road_map).outside_m
-    return DrivableField(outside_m=(outside - inside).astype(np.float32), origin_m=origin_m)
+    return _tiled((_outside_m(image) - inside).astype(np.float32), origin_m)
 
 
-_MAX_FIELDS = 128
-"""Largest number of cached fields. Those of a roundabout have 12 MB and take 30 ms; episodes side
-by side on more maps than this make fields anew at every tick. Chosen by hand: it covers the 72
-places of a suite."""
+def _outside_m(image: np.ndarray) -> np.ndarray:
+    """Distance (rows, columns) to the drivable area that `_draw_area` drew, metres."""
+    outside = cv2.distanceTransform(image, cv2.DIST_L2, cv2.DIST_MASK_PRECISE) * CELL_M
+    return np.minimum(outside, MARGIN_M).astype(np.float32)
 
-_fields = MapCache(_make_field, _MAX_FIELDS)
-_signed_fields = MapCache(_make_signed_field, 32)
+
+def _tiled(grid: np.ndarray, origin_m: tuple[float, float]) -> DrivableField:
+    """The field of a grid (rows, columns) float32 of distances."""
+    rows, columns = (-(-count // TILE_CELLS) for count in grid.shape)
+    whole = np.full((rows * TILE_CELLS, columns * TILE_CELLS), MARGIN_M, dtype=np.float32)
+    whole[: grid.shape[0], : grid.shape[1]] = grid
+    squares = whole.reshape(rows, TILE_CELLS, columns, TILE_CELLS).swapaxes(1, 2)
+    low, high = squares.min(axis=(2, 3)), squares.max(axis=(2, 3))
+    values, tile_of = np.unique(low, return_inverse=True)
+    mixed = low != high
+    tile_of = np.where(mixed, len(values) - 1 + np.cumsum(mixed).reshape(mixed.shape), tile_of)
+    stored = [np.full((TILE_CELLS, TILE_CELLS), value, dtype=np.float32) for value in values]
+    return DrivableField(
+        tiles=np.concatenate([np.stack(stored), squares[mixed]]),
+        tile_of=tile_of.astype(np.int32),
+        origin_m=origin_m,
+    )
+
+
+_fields = MapCache(_make_field, FIELDS_BYTES)
+_signed_fields = MapCache(_make_signed_field, SIGNED_FIELDS_BYTES)
 
 
 @njit(cache=True, inline="always")
 @no_type_check
-def _distance_at(grid, x_0, y_0, x, y):
-    """The value of the cell (x, y), metres, of a grid whose first cell is centred at x_0, y_0."""
+def _distance_at(tiles, tile_of, x_0, y_0, x, y):
+    """The value of the cell at (x, y), metres; the first cell is centred at x_0, y_0."""
     column = math.floor((x - x_0) / CELL_M + 0.5)
     row = math.floor((y - y_0) / CELL_M + 0.5)
-    if 0 <= row < grid.shape[0] and 0 <= column < grid.shape[1]:
-        return grid[row, column]
+    tile_row, tile_column = row >> _TILE_BITS, column >> _TILE_BITS
+    if 0 <= tile_row < tile_of.shape[0] and 0 <= tile_column < tile_of.shape[1]:
+        tile = tile_of[tile_row, tile_column]
+        return tiles[tile, row & (TILE_CELLS - 1), column & (TILE_CELLS - 1)]
     return np.float32(MARGIN_M)
 
 
 @njit(cache=True)
 @no_type_check
-def _look_up(grid, x_0, y_0, points, out):
+def _look_up(tiles, tile_of, x_0, y_0, points, out):
     """Writes the distance of points (n, 2) to `out` (n,)."""
     for i in range(len(points)):
-        out[i] = _distance_at(grid, x_0, y_0, points[i, 0], points[i, 1])
+        out[i] = _distance_at(tiles, tile_of, x_0, y_0, points[i, 0], points[i, 1])
 
 
 @njit(cache=True)
 @no_type_check
-def _write_outermost(grid, x_0, y_0, states, sizes, chosen, out):
+def _write_outermost(tiles, tile_of, x_0, y_0, states, sizes, chosen, out):
     """Writes the distance of the outermost corner of each chosen box.
 
     Args:
-        grid: (rows, columns) float32, metres.
+        tiles: (tiles, cells, cells) float32, metres.
+        tile_of: (tile rows, tile columns), indices into `tiles`.
         x_0: centre of the first cell, metres.
         y_0: centre of the first cell, metres.
         states: (n, 4).
@@ -263,11 +308,11 @@ def _write_outermost(grid, x_0, y_0, states, sizes, chosen, out):
         ahead_x, ahead_y = cos * sizes[i, 0], sin * sizes[i, 0]
         left_x, left_y = -sin * sizes[i, 1], cos * sizes[i, 1]
         front = max(
-            _distance_at(grid, x_0, y_0, x + ahead_x + left_x, y + ahead_y + left_y),
-            _distance_at(grid, x_0, y_0, x + ahead_x - left_x, y + ahead_y - left_y),
+            _distance_at(tiles, tile_of, x_0, y_0, x + ahead_x + left_x, y + ahead_y + left_y),
+            _distance_at(tiles, tile_of, x_0, y_0, x + ahead_x - left_x, y + ahead_y - left_y),
         )
         rear = max(
-            _distance_at(grid, x_0, y_0, x - ahead_x + left_x, y - ahead_y + left_y),
-            _distance_at(grid, x_0, y_0, x - ahead_x - left_x, y - ahead_y - left_y),
+            _distance_at(tiles, tile_of, x_0, y_0, x - ahead_x + left_x, y - ahead_y + left_y),
+            _distance_at(tiles, tile_of, x_0, y_0, x - ahead_x - left_x, y - ahead_y - left_y),
         )
         out[i] = max(front, rear)

@@ -1,12 +1,13 @@
 """The socket for planners, and `expert`: the recorded ego, the reference for every planner."""
 
 from dataclasses import dataclass
-from typing import NoReturn, Protocol, TypeVar, runtime_checkable
+from typing import Any, NoReturn, Protocol, TypeVar, runtime_checkable
 
 import numpy as np
 from jaxtyping import Float
 
 from asp_env import registry
+from asp_env.arguments import text
 from asp_env.data.predictor import Forecast, Predictor
 from asp_env.data.scene import Scene
 from asp_env.errors import AspEnvError
@@ -125,16 +126,19 @@ def load_planner(name: str) -> Planner:
     Raises:
         AspEnvError: the name is unknown, or the planner rejects the argument.
     """
-    kind, colon, argument = name.partition(":")
-    factory = registry.find("planners", kind)
-    from_name = getattr(factory, "from_name", None)
-    if from_name is not None:
-        if not argument:
-            raise AspEnvError(f"planner {kind}: name a run as well, such as {kind}:RUN")
-        return from_name(argument)
-    if colon:
-        raise AspEnvError(f"planner {name}: {kind} takes no argument; write {kind}")
-    return factory()
+    kind, colon, argument = text("planner", name).partition(":")
+
+    def made_by(factory: Any) -> Any:
+        from_name = getattr(factory, "from_name", None)
+        if from_name is not None:
+            if not argument:
+                raise AspEnvError(f"planner {kind}: name a run as well, such as {kind}:RUN")
+            return from_name(argument)
+        if colon:
+            raise AspEnvError(f"planner {name}: {kind} takes no argument; write {kind}")
+        return factory()
+
+    return registry.make("planners", kind, made_by, Planner)
 
 
 class Expert:

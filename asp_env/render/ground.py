@@ -169,9 +169,14 @@ def _coverage(rings: Ragged, viewport: Viewport) -> UInt8[np.ndarray, "h w"]:
 def _draw_photo(
     background: Background, viewport: Viewport, image: UInt8[np.ndarray, "h w 3"]
 ) -> None:
-    photo = cv2.imread(str(background.path), cv2.IMREAD_COLOR)
+    try:
+        photo = cv2.imread(str(background.path), cv2.IMREAD_COLOR)
+    except cv2.error:  # a header that claims more pixels than OpenCV reads
+        photo = None
     if photo is None:
-        raise DataError(f"{background.path}: not an image that can be read")
+        raise DataError(
+            f"{background.path}: not an image that can be read; copy it again or remove it"
+        )
     photo = cv2.cvtColor(photo, cv2.COLOR_BGR2RGB)
     dark = (1 - PHOTO_STRENGTH) * np.array(GROUND_COLOUR)
     photo = np.rint(PHOTO_STRENGTH * photo + dark).astype(np.uint8)

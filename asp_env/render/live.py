@@ -1,8 +1,11 @@
 """Rendering of an environment's episode while it runs."""
 
-import numpy as np
-from jaxtyping import Shaped, UInt8
+from typing import Any
 
+import numpy as np
+from jaxtyping import Float, Shaped, UInt8
+
+from asp_env.arguments import shown
 from asp_env.data.predictor import Forecast
 from asp_env.data.recording import Background
 from asp_env.data.scene import Scene
@@ -68,16 +71,16 @@ class LiveRenderer:
                 is not finite.
         """
         if forecast is not None:
+            if not isinstance(forecast, Forecast):
+                raise AspEnvError(f"forecast {shown(forecast)}: expected a Forecast")
             index = (forecast.targets[:, 0], forecast.targets[:, 1])
             inside = (index[0] == 0) & (index[1] < scene.ids.shape[1])
             if not (inside.all() and (scene.ids[index] == forecast.ids).all()):
                 raise AspEnvError("forecast: expected one of this environment's scene()")
             if not np.isfinite(forecast.states).all():
                 raise AspEnvError("forecast: expected finite states")
-        if plan is not None and not (
-            plan.ndim == 2 and plan.shape[1] >= 2 and np.isfinite(plan[:, :2]).all()
-        ):
-            raise AspEnvError(f"plan of shape {plan.shape}: expected finite (steps, 2 or more)")
+        if plan is not None:
+            plan = _checked_plan(plan)
         self._forecast, self._plan, self._overlay_tick = forecast, plan, int(scene.tick[0])
 
     def update(self, scene: Scene, background: Background | None) -> None:
@@ -112,3 +115,14 @@ class LiveRenderer:
         """Closes the window, if there is one."""
         if self._window is not None:
             self._window.close()
+
+
+def _checked_plan(plan: Any) -> Float[np.ndarray, "steps n"]:
+    """The plan as an array of its positions and what else it has."""
+    try:
+        points = np.asarray(plan, dtype=np.float64)
+    except (TypeError, ValueError):
+        raise AspEnvError(f"plan {shown(plan)}: expected numbers (steps, 2 or more)") from None
+    if points.ndim != 2 or points.shape[1] < 2 or not np.isfinite(points[:, :2]).all():
+        raise AspEnvError(f"plan of shape {points.shape}: expected finite (steps, 2 or more)")
+    return points

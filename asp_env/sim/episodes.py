@@ -16,9 +16,8 @@ from jaxtyping import Bool, Float, Int
 
 from asp_env.compiled import njit
 from asp_env.data.recording import Recording, frames_per_tick
-from asp_env.data.scenarios.scenario import Scenario
+from asp_env.data.scenarios.scenario import Scenario, short_history
 from asp_env.data.scene import EGO
-from asp_env.data.snippets import HISTORY_S
 from asp_env.errors import AspEnvError
 from asp_env.geometry import route_along, route_coordinates
 from asp_env.metrics.boxes import ego_contacts, touching_trailers
@@ -174,8 +173,8 @@ def initialize(
 ) -> EpisodeInit:
     """Looks up what an episode starts from: all agents seen in the scenario or its history.
 
-    The ego must be present in the scenario and throughout the history, of which only the last 3 s
-    count, so that a longer history suits the same scenarios.
+    The ego must be present in the scenario and in the last 0.6 s of the history, so that a longer
+    history suits the same scenarios, and short recordings can be driven.
 
     Args:
         recording: the scenario's recording.
@@ -194,7 +193,7 @@ def initialize(
         )
     ego = int(matches[0])
     first_tick = scenario.start_tick - history
-    needed_tick = scenario.start_tick - min(history, round(HISTORY_S / dt_s))
+    needed_tick = scenario.start_tick - short_history(history, dt_s)
     last_tick = scenario.start_tick + scenario.length
     if (
         scenario.length < 1

@@ -8,6 +8,7 @@ from typing import no_type_check
 import numpy as np
 from jaxtyping import Bool, Float
 
+from asp_env.arguments import is_finite_number, shown
 from asp_env.compiled import njit
 from asp_env.dynamics import MAX_ACCELERATION_MPS2
 from asp_env.errors import AspEnvError, unknown_name
@@ -61,8 +62,8 @@ def weights_from(given: Mapping[str, float]) -> RewardWeights:
     for name, value in given.items():
         if name not in REWARD_TERMS:
             raise unknown_name("reward weight", name, REWARD_TERMS)
-        if not (isinstance(value, int | float) and math.isfinite(value)):
-            raise AspEnvError(f"reward weight {name} {value}: expected a finite number")
+        if not is_finite_number(value):
+            raise AspEnvError(f"reward weight {name} {shown(value)}: expected a finite number")
     return RewardWeights(**{name: float(value) for name, value in given.items()})
 
 

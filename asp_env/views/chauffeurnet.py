@@ -37,8 +37,9 @@ from typing import Any, ClassVar, final
 import numpy as np
 from jaxtyping import UInt8
 
-from asp_env.data.road_map import MapCache
+from asp_env.data.map_cache import MapCache
 from asp_env.errors import AspEnvError
+from asp_env.stored import check_fields
 from asp_env.views.draw import draw_agents, draw_boundaries
 from asp_env.views.map_layers import BOUNDARY_WIDTH_M, line_segments
 from asp_env.views.raster import Viewport, place_targets, raster_memory
@@ -56,6 +57,9 @@ def snapshot_ticks(history: int) -> tuple[int, ...]:
     """Ticks of a history at which the other agents are drawn; the last one is the present."""
     return tuple(np.rint(np.linspace(0, history, len(SNAPSHOT_TICKS))).astype(int).tolist())
 
+
+MAX_HISTORY = 1_000
+"""Largest number of past ticks. Chosen by hand."""
 
 NAME_BY_EGO_TRAIL = {True: "chauffeurnet", False: "chauffeurnet-no-trail"}
 """Name of the view with and without the ego trail."""
@@ -93,8 +97,11 @@ class ChauffeurNet:
         Raises:
             AspEnvError: it is not positive.
         """
-        if self.history < 1:
-            raise AspEnvError(f"view {self.name!r}: history is {self.history}, expected 1 or more")
+        if not 1 <= self.history <= MAX_HISTORY:
+            raise AspEnvError(
+                f"view {self.name!r}: history is {self.history}, expected 1 or more and at most "
+                f"{MAX_HISTORY:,}"
+            )
 
     def __reduce__(self) -> tuple[Any, ...]:
         """Copies and pickles contain the configuration, not the cached maps."""
@@ -148,6 +155,7 @@ class ChauffeurNet:
                 f"configuration of the view {name!r} with ego_trail {ego_trail!r}: "
                 f"expected {name == NAME_BY_EGO_TRAIL[True]}"
             )
+        check_fields(cls, {"history": history})
         return cls(Viewport.from_config(fields), name == NAME_BY_EGO_TRAIL[True], history)
 
     def render(

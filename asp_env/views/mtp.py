@@ -39,8 +39,10 @@ from jaxtyping import Int64, UInt8, UInt32
 
 from asp_env.compiled import njit
 from asp_env.data.classes import VULNERABLE, AgentClass
-from asp_env.data.road_map import LineType, MapCache, RoadMap
+from asp_env.data.map_cache import MapCache
+from asp_env.data.road_map import LineType, RoadMap
 from asp_env.errors import AspEnvError
+from asp_env.stored import check_fields
 from asp_env.views.draw import draw_coloured_agents, draw_coloured_lines
 from asp_env.views.map_layers import (
     BOUNDARY_WIDTH_M,
@@ -211,6 +213,7 @@ class MTP:
         name, history = fields.pop("name", None), fields.pop("history", FADE_TICKS)
         if name != cls.name:
             raise AspEnvError(f"configuration of the view {name!r}, expected {cls.name!r}")
+        check_fields(cls, {"history": history})
         return cls(Viewport.from_config(fields), min(history, FADE_TICKS))
 
     def render(

@@ -9,7 +9,15 @@ import numpy as np
 from jaxtyping import Bool, Float, Float32, Int64, Shaped, UInt8
 
 from asp_env.errors import AspEnvError
+from asp_env.stored import check_fields
 from asp_env.views.view import RenderInput
+
+MIN_METRES_PER_PIXEL = 1e-3
+"""Smallest scale; its inverse is the largest one. Chosen by hand: lines stay within single
+precision."""
+
+MAX_SIDE_PX = 4_096
+"""Largest height and width, which bounds the memory. Chosen by hand."""
 
 MIN_LINE_WIDTH_PX = 1.5
 """Narrower lines would have gaps at some angles."""
@@ -38,13 +46,15 @@ class Viewport:
         Raises:
             AspEnvError: a value is not possible.
         """
-        if self.height_px < 1 or self.width_px < 1:
+        if not (1 <= self.height_px <= MAX_SIDE_PX and 1 <= self.width_px <= MAX_SIDE_PX):
             raise AspEnvError(
-                f"a view of {self.height_px}x{self.width_px} pixels: both must be at least 1"
+                f"a view of {self.height_px}x{self.width_px} pixels: both must be at least 1 and "
+                f"at most {MAX_SIDE_PX:,}"
             )
-        if not (math.isfinite(self.metres_per_pixel) and self.metres_per_pixel > 0):
+        if not MIN_METRES_PER_PIXEL <= self.metres_per_pixel <= 1 / MIN_METRES_PER_PIXEL:
             raise AspEnvError(
-                f"a view of {self.metres_per_pixel} m per pixel: give a positive number"
+                f"a view of {self.metres_per_pixel} m per pixel: give a positive number from "
+                f"{MIN_METRES_PER_PIXEL:g} to {1 / MIN_METRES_PER_PIXEL:g}"
             )
         inside = 0 <= self.anchor_row_px <= self.height_px
         if not (inside and 0 <= self.anchor_column_px <= self.width_px):
@@ -120,6 +130,7 @@ class Viewport:
             raise AspEnvError(
                 f"view configuration without {', '.join(missing)}: give all of {', '.join(known)}"
             )
+        check_fields(cls, config)
         return cls(**config)
 
     def config(self) -> dict[str, Any]:

@@ -30,9 +30,11 @@ from jaxtyping import Bool, Float, Float32, Int, Int64
 
 from asp_env.compiled import njit
 from asp_env.data.classes import AgentClass
-from asp_env.data.road_map import LineType, MapCache, RoadMap
+from asp_env.data.map_cache import MapCache
+from asp_env.data.road_map import LineType, RoadMap
 from asp_env.errors import AspEnvError
 from asp_env.geometry import arc_lengths, points_at
+from asp_env.stored import check_fields
 from asp_env.views.view import RenderInput
 
 KINDS = ("lane", "curb", "solid", "dashed")
@@ -173,6 +175,11 @@ def _cut(
 
 _OPTIONS = ("agents", "lines", "own_past", "history")
 
+MAX_AGENTS = 1_000
+MAX_LINES = 10_000
+MAX_HISTORY = 1_000
+"""Largest numbers of agents, pieces and past ticks, which bound the memory. Chosen by hand."""
+
 
 @final
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -199,13 +206,19 @@ class VectorView:
         """Checks the numbers.
 
         Raises:
-            AspEnvError: there would be no target, or a number is negative.
+            AspEnvError: there would be no target, or a number is negative or too large.
         """
         if self.agents < 1 or self.lines < 0 or self.history < 1:
             raise AspEnvError(
                 f"view {self.name!r} with {self.agents} agents, {self.lines} lines and "
                 f"{self.history} past ticks: give at least 1 agent, which is the target itself, no "
                 "fewer than 0 lines and at least 1 past tick"
+            )
+        if self.agents > MAX_AGENTS or self.lines > MAX_LINES or self.history > MAX_HISTORY:
+            raise AspEnvError(
+                f"view {self.name!r} with {self.agents} agents, {self.lines} lines and "
+                f"{self.history} past ticks: give at most {MAX_AGENTS:,}, {MAX_LINES:,} and "
+                f"{MAX_HISTORY:,}"
             )
 
     def __reduce__(self) -> tuple[Any, ...]:
@@ -265,6 +278,7 @@ class VectorView:
             raise AspEnvError(
                 f"view configuration with {', '.join(unknown)}: known are {', '.join(_OPTIONS)}"
             )
+        check_fields(cls, fields)
         view = cls(**fields)
         if name != view.name:
             raise AspEnvError(f"configuration of the view {name!r}, expected {view.name!r}")

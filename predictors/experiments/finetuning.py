@@ -47,7 +47,13 @@ from asp_env.evaluation import statistics
 from asp_env.evaluation.open_loop.scoring import score_forecasts
 from asp_env.evaluation.results import Row, difference_name, write_manifest, write_metrics
 from predictors.inference.checkpoint import CONFIG, PredictorSpec, folder_and_chaining
-from predictors.training.data import DatasetSplit, TrainingData, choose_snippets, snippets_of
+from predictors.training.data import (
+    DatasetSplit,
+    TrainingData,
+    choose_snippets,
+    moving_snippets,
+    snippets_of,
+)
 from predictors.training.fine_tuning import FineTuning, config_from, fine_tune_on
 from predictors.training.fitting import train_on
 from predictors.training.recipes import TrainingConfig, recipe
@@ -58,6 +64,9 @@ ZERO_SHOT, TUNED, SCRATCH = "zero-shot", "fine-tuned", "from scratch"
 VALIDATION_SHARE = 0.25
 """Share of the taken snippets that select the epoch. Chosen by hand: with an eighth, a share of
 10 % of a small data set leaves a single vehicle."""
+
+SHARES_TRIED = (0.05, 0.1, 0.15, 0.2, 0.25, 0.3, 0.4, 0.5, 0.6, 0.7, 0.8, 0.9, 1.0)
+"""Shares that a message about a too small one is chosen from."""
 
 METRICS = ("FDE", "ADE")
 SELECTIONS = ("most-probable", "best-of-3")
@@ -85,6 +94,8 @@ class Finetuning:
     """Number of folds; 0 holds out one recording at a time."""
     by: Literal["recordings", "blocks"] = "recordings"
     """What a fold consists of."""
+    scratch: bool = True
+    """Whether runs are trained from scratch, too."""
     mix: Annotated[tuple[str, ...], tyro.conf.arg(metavar="DATA …")] = ()
     """Other data that are mixed in."""
     epochs: int | None = None
@@ -102,6 +113,7 @@ class Finetuning:
                 "expected 1 or more, 0 or more, and shares within [0, 1]"
             )
         study = Study.open(self)
+        study.check_shares()
         rows = study.rows()
         write_metrics(self.out, rows)
         write_manifest(
@@ -166,6 +178,44 @@ class Study:
         """Ticks of the forecasts."""
         return self.index.horizon_ticks
 
+    def check_shares(self) -> None:
+        """Checks that every fold can be trained with every share, before any is trained.
+
+        Raises:
+            AspEnvError: A share is too small, with the smallest of `SHARES_TRIED` that is not.
+        """
+        for share in sorted(set(self.options.shares) - {0.0}):
+            problem = self._problem(share)
+            if problem is None:
+                continue
+            larger = (each for each in SHARES_TRIED if each > share)
+            enough = next((each for each in larger if self._problem(each) is None), None)
+            remedy = (
+                "no share of these data is enough: give more of them, or fewer folds"
+                if enough is None
+                else f"give --shares of at least {enough:g}"
+            )
+            raise AspEnvError(f"share {share:g}: {problem}; {remedy}")
+
+    def _problem(self, share: float) -> str | None:
+        """Why a fold cannot be trained with a share, or None."""
+        for seed in range(self.options.seeds):
+            for fold in np.unique(self.fold[self.fold >= 0]).tolist():
+                taken = self._taken(share, seed, fold)
+                training, validation = select_by_time(self.index, taken)
+                if not (len(training) and len(validation)):
+                    found = f"{len(training)} snippets to train and {len(validation)} to validate"
+                    return f"with fold {fold} held out and seed {seed}, {found} on"
+                moving = moving_snippets(self.recordings, self.index.select(training))
+                if self.config.standing_share < 1 and not moving.any():
+                    found = f"none of the {len(training)} snippets to train on moves"
+                    return f"with fold {fold} held out and seed {seed}, {found}"
+        return None
+
+    def _taken(self, share: float, seed: int, fold: int) -> Int[np.ndarray, " taken"]:
+        usable = np.flatnonzero(clear_of(self.index, self.fold, fold))
+        return take_share(self.index, usable, share, seed=seed)
+
     def rows(self) -> list[Row]:
         """Trains and evaluates everything; the rows of the table."""
         rows = np.flatnonzero(self.fold >= 0)
@@ -176,7 +226,7 @@ class Study:
             (ZERO_SHOT, 0.0): [fixed[self.options.from_run]],
         }
         for share in sorted(set(self.options.shares) - {0.0}):
-            for method in (TUNED, SCRATCH):
+            for method in (TUNED, SCRATCH) if self.options.scratch else (TUNED,):
                 seeds = range(self.options.seeds)
                 methods[method, share] = [self._of_seed(method, share, s, rows) for s in seeds]
         return make_rows(
@@ -217,14 +267,8 @@ class Study:
 
     def _data(self, share: float, seed: int, fold: int, config: TrainingConfig) -> TrainingData:
         """Training and validation snippets of a share of the other folds."""
-        usable = np.flatnonzero(clear_of(self.index, self.fold, fold))
-        taken = take_share(self.index, usable, share, seed=seed)
+        taken = self._taken(share, seed, fold)
         training, validation = select_by_time(self.index, taken)
-        if not (len(training) and len(validation)):
-            raise AspEnvError(
-                f"a share of {share:g} of {len(usable)} snippets leaves {len(training)} to train "
-                f"and {len(validation)} to validate on: give a larger share or more data"
-            )
         chosen = choose_snippets(
             self.recordings,
             self.index.select(training),

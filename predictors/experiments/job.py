@@ -177,6 +177,10 @@ class Job:
                 options[name] = None if options.get(name) is None else Path(options[name])
             Train(**options).run()
             trained_s = time.process_time()
+        elif self.train is not None:
+            from predictors.training.fitting import remove_state
+
+            remove_state(Path(self.train["out"]))
         if self.evaluation is not None and not self.evaluation.done:
             self.evaluation.execute()
         return trained_s - start_s

@@ -28,8 +28,7 @@ from asp_env.evaluation.statistics import (
     Estimate,
     difference,
     interval,
-    is_resolved,
-    resampled_sums,
+    resampled_means,
 )
 from asp_env.metrics.forecast.errors import SELECTIONS
 from predictors.experiments.errors import (
@@ -118,9 +117,9 @@ def compared(methods: Mapping[str, list[Errors]]) -> list[Row]:
         draws[name] = {}
         for number, selection in enumerate(SELECTIONS):
             fde_m = np.stack([each.values[number, METRICS.index("FDE")] for each in runs])
-            parts = np.stack([fde_m[:, moving], np.ones((len(runs), count))], axis=-1)
-            sums = resampled_sums(parts, groups[moving], stream=stream)
-            draws[name][selection] = sums[:, 0] / sums[:, 1]
+            draws[name][selection] = resampled_means(
+                fde_m[:, moving], groups[moving], stream=stream
+            )
         reference = next(iter(draws))
         less = {
             selection: difference(values - draws[reference][selection], n=count)
@@ -161,28 +160,11 @@ def table(rows: list[Row]) -> Table:
     for row in rows:
         cells = [row.method, str(row.runs)]
         for selection in SELECTIONS:
-            cells.append(_estimate(row.fde_m[selection], "{:.2f}"))
-            cells.append(_difference(row.less_reference_m.get(selection)))
+            less = row.less_reference_m.get(selection)
+            cells += [f"{row.fde_m[selection]:.2f}", "" if less is None else f"{less:+.2f}"]
         cells.append(" / ".join(f"{row.violations[each]:.3f}" for each in VIOLATIONS))
         shown.add_row(*cells)
     return shown
-
-
-def _estimate(estimate: Estimate, form: str) -> str:
-    text = form.format(estimate.value)
-    if estimate.low is None or estimate.high is None:
-        return text
-    return f"{text} [{form.format(estimate.low)}, {form.format(estimate.high)}]"
-
-
-def _difference(given: Difference | None) -> str:
-    if given is None:
-        return ""
-    estimate = given.estimate
-    text = _estimate(estimate, "{:+.2f}")
-    if is_resolved(estimate.value, estimate.low, estimate.high, given.mde):
-        return text
-    return f"{text}, not resolved"
 
 
 if __name__ == "__main__":

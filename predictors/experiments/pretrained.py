@@ -24,6 +24,7 @@ from predictors.inference.checkpoint import (
     CARD,
     CONFIG,
     WEIGHTS,
+    hash_of,
     read_config,
     read_weights,
     save_weights,
@@ -175,9 +176,9 @@ def ship(run: Path, shipped: Path, *, made_in: Path) -> None:
         config = read_config(run)
         config["provenance"]["trained_on"]["source"] = SOURCE
         config = json.loads(json.dumps(config).replace(f"{made_in}/", "OUT/"))
-        write_json(config, folder / CONFIG)
         weights = read_weights(run / WEIGHTS)
         save_weights({n: each.to(torch.float16) for n, each in weights.items()}, folder / WEIGHTS)
+        write_json({**config, "weights_sha256": hash_of(folder / WEIGHTS)}, folder / CONFIG)
         card = (run / CARD).read_text().replace(f"{made_in}/", "OUT/")
         (folder / CARD).write_text(card.replace(weights_hash(run), weights_hash(folder)))
 

@@ -15,7 +15,7 @@ from rich.console import Console
 
 from asp_env.data.recording import DEFAULT_DT_S, ticks
 from asp_env.errors import AspEnvError, MissingExtraError, unknown_name
-from asp_env.files import atomic_file, leftovers
+from asp_env.files import atomic_file, is_temporary
 from asp_env.metrics.forecast.errors import MODE_RULES
 from asp_env.views import view_names
 from asp_env.workers import WorkerPool
@@ -378,9 +378,11 @@ def _claimed(out: Path, fixed: dict[str, Any], *, exclusive: bool) -> Iterator[N
         AspEnvError: it contains something else, or another command has locked it.
     """
     path = out / PLAN
-    # A killed command may have left only these.
-    begun = {LOCK, *(each.name for each in leftovers(path))}
-    foreign = out.exists() and (not out.is_dir() or {each.name for each in out.iterdir()} - begun)
+    # A killed command may have left only the lock and temporary files.
+    foreign = out.exists() and (
+        not out.is_dir()
+        or any(each.name != LOCK and not is_temporary(each) for each in out.iterdir())
+    )
     if foreign and not path.exists():
         raise AspEnvError(f"{out}: contains something that is no table; choose another --out")
     out.mkdir(parents=True, exist_ok=True)

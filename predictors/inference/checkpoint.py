@@ -20,7 +20,8 @@ from asp_env.data.predictor import Predictor
 from asp_env.data.split import TrainedOn
 from asp_env.dynamics.bicycle import Integrator
 from asp_env.errors import AspEnvError, CheckpointError, unknown_name
-from asp_env.files import atomic_file, remove_stale
+from asp_env.files import atomic_file
+from asp_env.stored import check_fields, parse_json
 from asp_env.views import BinaryView, SceneView, view_from_config
 from predictors.guarded import Guarded
 from predictors.inference.feature_distance import FeatureDistance
@@ -35,6 +36,15 @@ WEIGHTS = "weights.safetensors"
 CARD = "README.md"
 FORMAT = 1
 """Version of the format of `config.json`."""
+
+MAX_TICKS = 1_000
+"""Largest history and horizon. Chosen by hand."""
+
+MAX_TEMPERATURE = 1e3
+"""Largest temperature; its inverse is the smallest one. Chosen by hand."""
+
+MAX_WEIGHTS = 1 << 29
+"""Largest number of weights, 2 GiB in single precision. Chosen by hand."""
 
 HASH_DIGITS = 16
 """Hexadecimal digits of the weights' SHA-256 in tables."""
@@ -132,6 +142,7 @@ def save_trained(
         "provenance": provenance,
     }
     save_weights(weights, folder / WEIGHTS)
+    config["weights_sha256"] = hash_of(folder / WEIGHTS)
     config = json.loads(json.dumps(config))  # tuples become lists, as in the file
     card = model_card(config, spec.network, weights=weights_hash(folder))
     write_file(card.encode(), folder / CARD)
@@ -165,7 +176,7 @@ def load_trained(
         )
     try:
         view, network, trained_on = _build(spec, config)
-        temperature = _positive("temperature", config["temperature"])
+        temperature = _positive("temperature", config["temperature"], most=MAX_TEMPERATURE)
         training = config["provenance"].get("config", {})
         _check_training(training, network.shape, view)
         metadata = {
@@ -197,6 +208,7 @@ def load_trained(
             f"nothing to chain: name it without @{chaining}, as {spec.name}:{folder}"
         )
     _load_weights(network, folder / WEIGHTS)
+    _check_hash(folder / WEIGHTS, config.get("weights_sha256"))
     return TrainedPredictor(
         name=spec.name,
         network=network,
@@ -240,7 +252,12 @@ def _shipped(spec: PredictorSpec) -> str:
 
 def weights_hash(folder: Path) -> str:
     """The first digits of the hash of a run's weights."""
-    return hashlib.sha256((folder / WEIGHTS).read_bytes()).hexdigest()[:HASH_DIGITS]
+    return hash_of(folder / WEIGHTS)[:HASH_DIGITS]
+
+
+def hash_of(path: Path) -> str:
+    """The SHA-256 of a file's content."""
+    return hashlib.sha256(path.read_bytes()).hexdigest()
 
 
 def read_config(folder: Path) -> dict[str, Any]:
@@ -251,7 +268,7 @@ def read_config(folder: Path) -> dict[str, Any]:
     """
     path = folder / CONFIG
     try:
-        config = json.loads(path.read_text())
+        config = parse_json(path.read_bytes())
     except FileNotFoundError:
         raise CheckpointError(
             f"{folder} holds no trained predictor ({CONFIG} is missing): "
@@ -286,14 +303,21 @@ def _build(
     )
     shape = shape_for(
         view,
-        history=int(_positive("history", config["history"])),
-        horizon=int(_positive("horizon", config["horizon"])),
+        history=_count("history", config["history"]),
+        horizon=_count("horizon", config["horizon"]),
         dt_s=_positive("dt_s", config["dt_s"]),
         action_range=(acceleration, steering),
     )
+    check_fields(TrainedOn, config["provenance"]["trained_on"])
     trained_on = TrainedOn(**config["provenance"]["trained_on"])
+    check_fields(spec.config, config["network"])
+    network_config = spec.config(**config["network"])
+    with torch.device("meta"):  # shapes alone: the numbers may stand for any size
+        shapes = spec.network(network_config, shape).state_dict()
+    if (size := sum(map(torch.numel, shapes.values()))) > MAX_WEIGHTS:
+        raise ValueError(f"a network of {size:,} weights, expected at most {MAX_WEIGHTS:,}")
     with torch.random.fork_rng(devices=[]):  # for initial weights, which are replaced
-        network = spec.network(spec.config(**config["network"]), shape)
+        network = spec.network(network_config, shape)
     return view, network, trained_on
 
 
@@ -302,11 +326,29 @@ def _integrator(predictor: TrainedPredictor) -> Integrator:
     return getattr(predictor.network.config, "integrator", "heun")
 
 
-def _positive(field: str, given: Any) -> float:
+def _positive(field: str, given: Any, *, most: float = math.inf) -> float:
     value = float(given)
     if not (math.isfinite(value) and value > 0):
         raise ValueError(f"{field} is {value:g}, expected a positive number")
+    if not 1 / most <= value <= most:
+        raise ValueError(f"{field} is {value:g}, expected {1 / most:g} to {most:g}")
     return value
+
+
+def _count(field: str, given: Any) -> int:
+    value = _positive(field, given)
+    if value != math.floor(value) or value > MAX_TICKS:
+        raise ValueError(f"{field} is {value:g}, expected a whole number up to {MAX_TICKS:,}")
+    return int(value)
+
+
+def _check_hash(path: Path, expected: Any) -> None:
+    """Compares weights with the hash in the configuration, which older runs lack."""
+    if expected is not None and hash_of(path) != expected:
+        raise CheckpointError(
+            f"{path} is damaged or of another run: its SHA-256 is not that in {CONFIG}; copy the "
+            "run again"
+        )
 
 
 def _check_training(training: dict[str, Any], shape: NetworkShape, view: SceneView) -> None:
@@ -354,10 +396,9 @@ def write_json(content: dict[str, Any], path: Path) -> None:
 
 
 def write_file(content: bytes, path: Path) -> None:
-    """Writes a file atomically, and removes what killed processes left beside it."""
+    """Writes a file atomically."""
     with atomic_file(path) as partial:
         partial.write_bytes(content)
-    remove_stale(path)
 
 
 def _brief(error: BaseException) -> str:

@@ -14,6 +14,8 @@ other half. The stored mean and covariance are those of all of them.
 A run stores the arrays in `features.safetensors`.
 """
 
+import zlib
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -21,7 +23,7 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from asp_env.errors import CheckpointError
-from asp_env.files import atomic_file, remove_stale
+from asp_env.files import atomic_file
 
 FEATURES = "features.safetensors"
 """File of the statistics within the folder of a run."""
@@ -76,10 +78,10 @@ class FeatureDistance:
                 ("mean", self.mean), ("whitening", self.whitening), ("threshold", threshold),
             )
         }  # fmt: skip
+        arrays["checksum"] = _checksum(arrays)
         path = folder / FEATURES
         with atomic_file(path) as partial:
             partial.write_bytes(save(arrays))
-        remove_stale(path)
 
     @classmethod
     def load(cls, folder: Path, *, name: str, features: int) -> "FeatureDistance":
@@ -105,6 +107,8 @@ class FeatureDistance:
             )
         try:
             arrays = load_file(path)
+            if "checksum" in arrays and arrays["checksum"] != _checksum(arrays):  # not in old files
+                raise ValueError("its checksum differs")
             found = cls(
                 mean=arrays["mean"].astype(np.float64),
                 whitening=arrays["whitening"].astype(np.float64),
@@ -145,6 +149,12 @@ def fit_feature_distance(
         distances[measured] = half.score(z[measured])
     threshold = max(float(np.quantile(distances, QUANTILE)), 1e-6)
     return FeatureDistance(**_moments(z), threshold=threshold)
+
+
+def _checksum(arrays: Mapping[str, np.ndarray]) -> np.ndarray:
+    """The CRC-32 of the statistics, as a file holds them."""
+    content = b"".join(arrays[name].tobytes() for name in ("mean", "whitening", "threshold"))
+    return np.array([zlib.crc32(content)], dtype=np.uint32)
 
 
 def _moments(z: Float[np.ndarray, "n z"]) -> dict[str, np.ndarray]:

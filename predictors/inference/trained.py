@@ -13,7 +13,7 @@ from asp_env.data.predictor import Forecast, make_forecast
 from asp_env.data.scene import Scene
 from asp_env.data.snippets import Future
 from asp_env.data.split import TrainedOn
-from asp_env.errors import AspEnvError
+from asp_env.errors import AspEnvError, CheckpointError
 from asp_env.views import RasterView, SceneView
 from predictors.models.batch import Batch, make_batch, make_labels
 from predictors.models.chaining import Chaining
@@ -92,6 +92,7 @@ class TrainedPredictor:
         Raises:
             AspEnvError: The scene has another time step or a shorter history, or the chaining
                 `oracle` gets no future.
+            CheckpointError: A forecast is not finite, because weights are damaged.
         """
         scene.check_dt(self.dt_s, self.name)
         valid = predictable_targets(scene, self.history)
@@ -103,6 +104,12 @@ class TrainedPredictor:
             for part in [slice(first, first + self._chunk)]
         ]
         log_probs = _scatter([chunk.log_probs for chunk in chunks], valid)
+        states = _scatter([chunk.states for chunk in chunks], valid)
+        if not (np.isfinite(states).all() and np.isfinite(log_probs).all()):
+            raise CheckpointError(
+                f"{self.name}: a forecast is not finite, so its weights "
+                f"({self._metadata.get('weights', 'of an unknown run')}) are damaged: train again"
+            )
         log_probs[~valid] = -np.log(log_probs.shape[1])
         actions = features = None
         if chunks[0].actions_valid.all():
@@ -112,7 +119,7 @@ class TrainedPredictor:
             features = _scatter(encoded, valid)
         return make_forecast(
             scene,
-            states=_scatter([chunk.states for chunk in chunks], valid),
+            states=states,
             actions=actions,
             log_probs=log_probs,
             valid=valid,

@@ -29,6 +29,7 @@ from typing import NamedTuple
 from asp_env.data.snippets import HISTORY_S
 from asp_env.errors import AspEnvError
 from asp_env.files import atomic_file
+from asp_env.stored import parse_json
 from predictors.training.recipes import SEGMENT_S, SHORT_SEGMENT_SHARE, TrainingConfig
 
 COSTS = "epoch_costs.json"
@@ -74,7 +75,7 @@ class EpochCosts:
         if not path.exists():
             return cls(reference=reference)
         try:
-            content = json.loads(path.read_text())
+            content = parse_json(path.read_bytes())
             costs = cls(
                 reference=str(content["reference"]),
                 epochs={key: EpochCost(**cost) for key, cost in content["epochs"].items()},

@@ -6,7 +6,6 @@ busy machine only ever adds time.
 """
 
 import dataclasses
-import tempfile
 import time
 from collections.abc import Sequence
 from pathlib import Path
@@ -106,12 +105,12 @@ def _measure(config: TrainingConfig, data: TrainingData) -> tuple[float, float]:
     validation = validation.reordered(np.arange(measured))
     module = TrainingModule(network, config=short, training=training, validation=validation)
     clock = _Clock()
-    with tempfile.TemporaryDirectory() as folder:
-        trainer = make_trainer(
-            short, Hardware(), out=Path(folder), started="costs", callbacks=[clock], shown=False
-        )
-        with quiet(), threads(config.threads):
-            trainer.fit(module)
+    # Without logs nothing is written.
+    trainer = make_trainer(
+        short, Hardware(), out=Path(), started="costs", callbacks=[clock], shown=False
+    )
+    with quiet(), threads(config.threads):
+        trainer.fit(module)
     per_epoch = min(config.snippets_per_epoch or len(snippets), len(snippets))
     steps = -(-per_epoch // config.batch_size)
     validating_s = clock.validation_s[-1] * count / measured

@@ -19,6 +19,8 @@ from asp_env import registry
 from asp_env.data.recording import ticks
 from asp_env.data.source import join_data
 from asp_env.errors import AspEnvError
+from asp_env.files import is_temporary
+from asp_env.stored import parse_json
 from asp_env.views import make_view, with_history
 from predictors.inference.calibration import calibrate
 from predictors.inference.checkpoint import (
@@ -51,6 +53,9 @@ RUN = "run.json"
 
 STATE = "unfinished"
 """Folder of an unfinished run's state."""
+
+FINISHED = "finished"
+"""Folder within that of the state, for the files of the result until all of them are written."""
 
 ONE_PROCESS = Hardware()
 
@@ -176,8 +181,10 @@ def train_on(
         network.load_state_dict(load_file(best.best_path))
         with torch.compiler.set_stance("force_eager") if hardware.compiled else nullcontext():
             temperature = calibrate(network, batches[1])
+    finished = state / FINISHED
+    finished.mkdir(exist_ok=True)
     save_trained(
-        out,
+        finished,
         spec=spec,
         network_config=config.network,
         shape=shape,
@@ -200,10 +207,22 @@ def train_on(
             "versions": versions(),
         },
     )
-    add_features(spec, out, chosen.validation, config)
-    shutil.rmtree(state)
+    add_features(spec, finished, chosen.validation, config)
+    _move_finished(finished, out)
+    remove_state(out)
     trainer.strategy.barrier()
     return out
+
+
+def _move_finished(finished: Path, out: Path) -> None:
+    """Moves the files of a result into the run's folder; the configuration, which ends it, last."""
+    for path in sorted(finished.iterdir(), key=lambda each: each.name == CONFIG):
+        path.replace(out / path.name)
+
+
+def remove_state(out: Path) -> None:
+    """Removes the state of a finished run; one that was killed after its last file still has it."""
+    shutil.rmtree(out / STATE, ignore_errors=True)
 
 
 def add_features(
@@ -293,12 +312,16 @@ def check_folder(out: Path, *, first_stage: Path | None) -> None:
         AspEnvError: It holds a finished run, or something that is no run.
     """
     if (out / CONFIG).exists():
+        remove_state(out)
         raise AspEnvError(f"{out} holds a finished run: give another --out, or delete it")
     if (out / STATE / RUN).exists():
         return
     # An interruption right after the folder was made leaves it without `run.json`.
     allowed = {out / COSTS, out / STATE, first_stage}
-    if out.exists() and (not out.is_dir() or any(each not in allowed for each in out.iterdir())):
+    if out.exists() and (
+        not out.is_dir()
+        or any(each not in allowed and not is_temporary(each) for each in out.iterdir())
+    ):
         raise AspEnvError(f"{out} holds something that is no run: give another --out")
 
 
@@ -307,7 +330,7 @@ def _resumes(out: Path, run: dict[str, Any], *, first_stage: Path | None) -> boo
     check_folder(out, first_stage=first_stage)
     if (out / STATE / RUN).exists():
         try:
-            stored = json.loads((out / STATE / RUN).read_text())
+            stored = parse_json((out / STATE / RUN).read_bytes())
         except ValueError:
             stored = None
         if stored != json.loads(json.dumps(run)):

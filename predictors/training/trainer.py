@@ -32,6 +32,7 @@ from safetensors.torch import save
 from torch import distributed, nn
 
 from asp_env.errors import AspEnvError, CheckpointError
+from asp_env.stored import parse_json
 from predictors.inference.checkpoint import write_file
 from predictors.training.recipes import TrainingConfig
 
@@ -258,7 +259,7 @@ class SafetensorsIO(CheckpointIO):
             with safe_open(str(path), framework="pt") as file:
                 names = file.keys()
                 tensors = {name: file.get_tensor(name) for name in names}
-                return _decode(json.loads(file.metadata()["tree"]), tensors)
+                return _decode(parse_json(file.metadata()["tree"]), tensors)
         except (OSError, KeyError, TypeError, ValueError, SafetensorError) as error:
             raise CheckpointError(
                 f"{path} cannot be read: delete its folder to start the run again"

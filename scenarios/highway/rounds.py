@@ -4,8 +4,6 @@ The internal state is what highway-env's vehicles hold besides their motion. Wit
 restored exactly: the same vehicles in the same order continue in the same way.
 """
 
-import zipfile
-import zlib
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -15,12 +13,14 @@ from jaxtyping import Float, Int, Shaped
 
 from asp_env.data.recording import Recording
 from asp_env.errors import DataError
+from asp_env.stored import read_arrays
 from scenarios.highway.road_map import mirror_states
 from scenarios.highway.sites import (
     SITES,
     STEP_S,
     STEPS_PER_S,
     Site,
+    network,
     populated_road,
     remove_exited,
     spawn_vehicle,
@@ -66,10 +66,11 @@ Rows = Shaped[np.ndarray, " _"]
 FOLDER = "hidden"
 """Folder beside `data` and `maps`."""
 
-WANTED = "made by `asp-env synthesize OUT --site highway:…`"
+FARTHEST = {"x": 1e4, "y": 1e4, "heading": 1e3, "speed": 100.0, "target_speed": 100.0}
+"""Largest absolute values of fields of `HIDDEN`; others up to 1e6. Chosen by hand: far above those
+of the sites."""
 
-_DAMAGE = (OSError, ValueError, KeyError, EOFError, TypeError, zipfile.BadZipFile, zlib.error)
-"""Exceptions that NumPy raises for damaged or foreign files."""
+WANTED = "made by `asp-env synthesize OUT --site highway:…`"
 
 ROUND_S = 20
 """Length of a round. highway-env's own episodes last 11 s and 13 s; by 20 s its roundabout is
@@ -202,16 +203,43 @@ def load_history(path: Path) -> HiddenHistory:
         DataError: the file is missing, damaged, or of another version.
     """
     try:
-        with path.open("rb") as file, np.load(file, allow_pickle=False) as found:
-            site, rows = str(found["site"]), found["rows"]
-            starts, steps = found["starts"], found["steps"]
+        found = read_arrays(path)
+        site, rows = str(found["site"]), found["rows"]
+        starts, steps = found["starts"], found["steps"]
     except FileNotFoundError:
         raise DataError(f"{path} is missing: expected a folder {WANTED}") from None
-    except _DAMAGE as error:
+    except (ValueError, KeyError) as error:
         raise DataError(f"{path} is damaged ({error}): expected a folder {WANTED}") from error
     if site not in SITES or rows.dtype != HIDDEN or not _whole(rows, starts, steps):
         raise DataError(f"{path}: of another version; expected a folder {WANTED} of this version")
+    if not _possible(rows, network(site)):
+        raise DataError(
+            f"{path} is damaged (its vehicles cannot be on the roads of {site}): expected a folder "
+            f"{WANTED}"
+        )
     return HiddenHistory(site=SITES[site], rows=rows, starts=starts, steps=steps)
+
+
+def _possible(rows: Rows, roads: Network) -> bool:
+    """Whether all numbers are in range and all lanes and roads exist."""
+    for name in rows.dtype.names or ():
+        if (
+            rows[name].dtype.kind == "f"
+            and not (np.abs(rows[name]) <= FARTHEST.get(name, 1e6)).all()
+        ):
+            return False
+    lanes_of = np.bincount([roads.roads.index(index[:2]) for index in roads.indices])
+    road, lane = rows["route"][..., 0], rows["route"][..., 1]
+    used = np.arange(LONGEST_ROUTE) < rows["route_length"][:, None]
+    known = used & (road >= 0) & (road < len(lanes_of))
+    exists = known & (lane >= ANY_LANE) & (lane < lanes_of[np.where(known, road, 0)])
+    lengths, targets = rows["route_length"], rows["target_lane"]
+    return bool(
+        (exists == used).all()
+        and ((lengths >= 0) & (lengths <= LONGEST_ROUTE)).all()
+        and ((targets >= 0) & (targets < len(roads.indices))).all()
+        and (rows["delta"] > 0).all()
+    )
 
 
 def _whole(rows: np.ndarray, starts: np.ndarray, steps: np.ndarray) -> bool:

@@ -12,6 +12,7 @@ from pathlib import Path
 from asp_env.data.cache import get_or_create
 from asp_env.data.source import open_data
 from asp_env.errors import AspEnvError, MissingExtraError, unknown_name
+from asp_env.stored import check_fields, parse_json
 from scenarios.sumo.dataset import synthesize
 
 PLACES = 72
@@ -52,6 +53,14 @@ class Suite:
     def frozen(self) -> Path:
         """The frozen list of scenarios, which names the content of each recording."""
         return Path(__file__).parent / f"{self.name}.json"
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class _Made:
+    """The content of `suite.json`."""
+
+    data_hash: str
+    versions: Mapping[str, str]
 
 
 def _write_sumo(folder: Path, *, name: str, site: str) -> None:
@@ -157,14 +166,16 @@ def frozen_facts(suite: Suite) -> Mapping[str, object]:
 def _difference(suite: Suite, folder: Path) -> str:
     """States how the traffic in a folder differs from the frozen one."""
     try:
-        made = json.loads((folder / MADE).read_text())
-    except (OSError, ValueError) as error:
+        made = parse_json((folder / MADE).read_bytes())
+        check_fields(_Made, made)
+        made = _Made(**made)
+    except (OSError, AttributeError, TypeError, ValueError) as error:
         raise AspEnvError(f"{folder / MADE}: cannot be read; delete {folder}") from error
     frozen = frozen_facts(suite)
-    here, there = (str(each["data_hash"])[:HASH_DIGITS] for each in (made, frozen))
+    here, there = made.data_hash[:HASH_DIGITS], str(frozen["data_hash"])[:HASH_DIGITS]
     return (
         f"suite:{suite.name}: the traffic made here has the content hash {here} "
-        f"({_text(made['versions'])}), the frozen traffic {there} ({_text(frozen['versions'])}): "
+        f"({_text(made.versions)}), the frozen traffic {there} ({_text(frozen['versions'])}): "
         "rows are not comparable with those of others. Install the versions of the frozen traffic "
         f"and delete {folder}"
     )

@@ -299,7 +299,8 @@ class _Content:
 
     def write_location(self, location: int) -> None:
         """Writes the map of a location and its recordings."""
-        with tempfile.TemporaryDirectory() as scratch:
+        # Within the folder, which is removed as a whole if this process is killed.
+        with tempfile.TemporaryDirectory(prefix=".", dir=self.folder) as scratch:
             place = self._place(location, Path(scratch))
             mine = [
                 recording

@@ -331,7 +331,9 @@ def test_recordings_are_opened_and_filtered_on_access() -> None:
     assert opened == [1]
 
 
-def test_without_a_cache_there_is_a_warning(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_without_a_cache_one_line_is_logged(
+    monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
     """The states are the same."""
 
     def refuse() -> None:
@@ -339,6 +341,9 @@ def test_without_a_cache_there_is_a_warning(monkeypatch: pytest.MonkeyPatch) -> 
 
     recording = make_recording()
     monkeypatch.setattr(cache, "cache_folder", refuse)
-    with pytest.warns(UserWarning, match="results are not cached: cache folder x"):
-        states = causal_histories([recording])[0].states
+    monkeypatch.setattr(cache, "_noted", set[str]())
+    states = causal_histories([recording])[0].states
+    assert caplog.messages == [
+        "asp-env: results are not cached: cache folder x: no permission to write"
+    ]
     assert states.tobytes() == causal_states(recording).tobytes()

@@ -176,8 +176,13 @@ def test_other_files_are_rejected(tmp_path: Path, write: Callable[[Path], None])
         ({"forecast_ticks": np.array([0, 1, -1])}, "forecast_ticks: expected numbers from 0 to 2"),
         ({"classes": np.array([0, 99])}, "classes: expected numbers from 0 to 10"),
         ({"events": np.zeros((3, 3), dtype=bool)}, "events: 3 along 'kinds', expected 2"),
-        ({"dt_s": float("nan")}, "time step nan"),
+        ({"dt_s": float("nan")}, "dt_s is nan"),
         ({"dt_s": 0.0}, "time step 0.0"),
+        ({"dt_s": 1e9}, "time step 1000000000.0"),
+        ({"states": np.full((3, 2, 4), np.nan, dtype=np.float32)}, "states: expected numbers"),
+        ({"sizes": np.full((2, 2), -1.0, dtype=np.float32)}, "sizes: expected no negative"),
+        ({"route": np.full((5, 2), 1e30, dtype=np.float32)}, "route: expected numbers up to"),
+        ({"forecast_log_probs": np.full((3, 3), np.nan)}, "forecast_log_probs: expected"),
     ],
     ids=lambda value: next(iter(value)) if isinstance(value, dict) else None,
 )
@@ -190,6 +195,24 @@ def test_inconsistent_arrays_are_rejected(
         object.__setattr__(rollout, name, value)
     rollout.save(path)
     assert message in error_of(path)
+
+
+@pytest.mark.parametrize(
+    ("field", "value", "message"),
+    [
+        ("start_tick", 8.5, "start_tick is 8.5, expected a whole number"),
+        ("start_tick", -1, "start_tick is -1, expected 0 or more"),
+        ("length", True, "length is True, expected a whole number"),
+        ("tags", "left", "tags is 'left', expected a list"),
+        ("recording_name", 3, "recording_name is 3, expected a text"),
+    ],
+)
+def test_scenarios_of_other_types_are_rejected(
+    field: str, value: object, message: str, tmp_path: Path
+) -> None:
+    scenario = {**dataclasses.asdict(make_rollout().scenario), field: value}
+    _header(scenario=scenario)(tmp_path / "0.npz")
+    assert message in error_of(tmp_path / "0.npz")
 
 
 def test_missing_file(tmp_path: Path) -> None:

@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 
 from asp_env import registry
+from asp_env.data import cache
 from asp_env.data.readers import layout, opening
 from asp_env.data.recording import Recording
 from asp_env.data.source import Recordings, join_data, load, open_data
@@ -149,29 +150,40 @@ def test_damaged_cache_entries_are_replaced(
 
 
 def test_without_a_cache(
-    folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, reads: list[str]
+    folder: Path,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    reads: list[str],
+    caplog: pytest.LogCaptureFixture,
 ) -> None:
-    """If nothing can be cached, a warning is issued and recordings are read anyway."""
+    """If nothing can be cached, one line is logged and recordings are read anyway."""
+    monkeypatch.setattr(cache, "_noted", set[str]())
     before = open_data(folder)[0]
     (tmp_path / "file").write_text("")
     monkeypatch.setenv("ASP_ENV_CACHE", str(tmp_path / "file" / "below"))
     del reads[:]
-    with pytest.warns(UserWarning, match="results are not cached: cache folder"):
-        after = open_data(folder)[0]
+    after = open_data(folder)[0]
+    (line,) = caplog.messages
+    assert line.startswith("asp-env: results are not cached: cache folder")
+    assert line.endswith("set ASP_ENV_CACHE to a folder that can be written to")
     assert reads == ["00_tracks.csv", "location1.osm"]
     assert equal(before, after)
     assert not after.states.flags.writeable
 
 
-def test_full_disk(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_full_disk(
+    folder: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
     """A recording opens even if its cache entry cannot be written."""
 
     def refuse(*_: object) -> None:
         raise OSError(28, "No space left on device")
 
     monkeypatch.setattr(opening.cache, "save", refuse)
-    with pytest.warns(UserWarning, match="No space left on device"):
-        assert len(open_data(folder)[0]) == 3
+    monkeypatch.setattr(cache, "_noted", set[str]())
+    assert len(open_data(folder)[0]) == 3
+    (line,) = caplog.messages
+    assert line.endswith("No space left on device")
 
 
 def test_damaged_recording_does_not_affect_the_others(folder: Path) -> None:

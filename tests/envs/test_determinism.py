@@ -5,7 +5,6 @@ import sys
 
 import gymnasium
 import numpy as np
-import pytest
 from gymnasium.vector import AsyncVectorEnv
 
 from tests.envs.same import same
@@ -24,25 +23,27 @@ def test_two_instances_return_the_same_bits(crossing):
     assert trace(first, seed=6, steps=60) != trace(second, steps=60)
 
 
-@pytest.mark.parametrize("traffic", ["log", "idm"])
-def test_another_process_returns_the_same_bits(crossing, traffic):
-    """Over 500 steps of a single and a vector environment."""
+def test_another_process_returns_the_same_bits(crossing):
+    """Over 500 steps of a single and a vector environment, with replayed and reacting traffic."""
     script = (
-        "import sys; from tests.envs.traces import make, trace, trace_vector;"
-        "print(trace(make(sys.argv[1], traffic=sys.argv[2]), steps=500));"
-        "print(trace_vector(sys.argv[1], steps=500, traffic=sys.argv[2]))"
+        "import sys; from tests.envs.test_determinism import traces; print(*traces(sys.argv[1]))"
     )
     done = subprocess.run(
-        [sys.executable, "-c", script, crossing, traffic],
-        capture_output=True,
-        text=True,
-        check=True,
+        [sys.executable, "-c", script, crossing], capture_output=True, text=True, check=True
     )
-    expected = [
-        trace(make(crossing, traffic=traffic), steps=500),
-        trace_vector(crossing, steps=500, traffic=traffic),
+    assert done.stdout.split() == traces(crossing)
+
+
+def traces(data):
+    """Hashes of what the environments return."""
+    return [
+        found
+        for traffic in ("log", "idm")
+        for found in (
+            trace(make(data, traffic=traffic), steps=500),
+            trace_vector(data, steps=500, traffic=traffic),
+        )
     ]
-    assert done.stdout.split() == expected
 
 
 def test_async_vector_env_returns_the_same_bits(crossing):

@@ -407,7 +407,7 @@ def test_stable_baselines3_gets_the_forecasts_of_ended_episodes(crossing):
     [
         ({"forecast": {"agents": 3}}, "forecast without a predictor: name one"),
         ({"predictor": "blind", "forecast": {"agent": 3}}, "unknown forecast option 'agent'"),
-        ({"predictor": "blind", "forecast": {"every_ticks": 0}}, "every_ticks 0: expected at lea"),
+        ({"predictor": "blind", "forecast": {"every_ticks": 0}}, "every_ticks 0: expected a whole"),
         ({"predictor": "blind", "forecast": {"latency_ticks": -1}}, "latency_ticks -1: expected"),
         ({"predictor": "blind", "forecast": {"features": "latent"}}, "blind has no features"),
         ({"predictor": {}}, "expected a predictor or a mapping with at least one"),

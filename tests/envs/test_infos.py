@@ -171,5 +171,7 @@ def test_max_episode_steps_truncates_as_a_time_limit(crossing):
     envs.reset(seed=0)
     limits = [envs.step(np.zeros((2, 2)))[3].tolist() for _ in range(8)]
     assert limits == [[False] * 2, [False] * 2, [True] * 2, [False] * 2] * 2
-    with pytest.raises(asp_env.AspEnvError, match="max_episode_steps 0: expected at least 1"):
+    with pytest.raises(
+        asp_env.AspEnvError, match="max_episode_steps 0: expected a whole number of at least 1"
+    ):
         asp_env.ReplayVectorEnv(2, crossing, max_episode_steps=0, **OPTIONS)

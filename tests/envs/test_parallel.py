@@ -402,7 +402,7 @@ def test_invalid_input_is_rejected(crossing):
         ({"classes": "car"}, "classes 'car': expected a sequence"),
         ({"ids": ()}, r"ids \(\): expected a sequence"),
         ({"ids": (99,)}, "the ego of no scenario has one of the given classes and ids"),
-        ({"max_agents": 0}, "max_agents 0: expected at least 1"),
+        ({"max_agents": 0}, "max_agents 0: expected a whole number of at least 1"),
         ({"render_mode": "ansi"}, "render mode 'ansi'"),
         ({"colour": 1}, "unexpected keyword argument 'colour'"),
     ):

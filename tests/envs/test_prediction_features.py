@@ -263,9 +263,15 @@ def test_copy_and_spec_give_the_same_environment(crossing):
     ("arguments", "message"),
     [
         ({"predictor": "constant"}, "unknown predictor 'constant'"),
-        ({"predictor": "constant-velocity", "agents": 0}, "agents 0: expected at least 1"),
-        ({"predictor": "constant-velocity", "modes": 0}, "modes 0: expected at least 1"),
-        ({"predictor": "constant-velocity", "at_s": ()}, "at_s: times 0: expected at least 1"),
+        (
+            {"predictor": "constant-velocity", "agents": 0},
+            "agents 0: expected a whole number",
+        ),
+        (
+            {"predictor": "constant-velocity", "modes": 0},
+            "modes 0: expected a whole number",
+        ),
+        ({"predictor": "constant-velocity", "at_s": ()}, "at_s \\(\\): expected at least one time"),
         ({"predictor": "constant-velocity", "at_s": (0.3,)}, "0.3 s is no whole number of ticks"),
         ({"predictor": Fan((1.0,)), "at_s": (5.0,)}, "fan forecasts 4 s: at_s has times up to 5 s"),
     ],

@@ -4,6 +4,7 @@ import copy
 import pickle
 from typing import Any
 
+import gymnasium
 import numpy as np
 import pytest
 
@@ -11,6 +12,8 @@ from asp_env.data.recording import Recording
 from asp_env.data.road_map import RoadMap
 from asp_env.envs.replay import ReplayEnv
 from asp_env.envs.vector import ReplayVectorEnv
+from asp_env.errors import AspEnvError
+from tests.crossing_files import write_crossing
 from tests.envs.same import same
 
 ALL = ("raster", "vectors", "actions", "state", "route")
@@ -124,3 +127,32 @@ def test_snapshots_of_vector_environments(crossing, traffic):
     for snapshot in (start, pickle.loads(pickle.dumps(start))):
         envs.restore(snapshot)
         same([envs.step(each) for each in actions[30:]], expected)
+
+
+@pytest.mark.parametrize("pickled", [False, True], ids=["in-memory", "pickled"])
+def test_a_snapshot_of_another_environment_is_refused(crossing, tmp_path, pickled):
+    """Other data, time step, traffic, meaning or length of actions, or number of episodes."""
+    other_data = str(write_crossing(tmp_path / "other", seconds=16.0))
+    env = ReplayEnv(crossing, observations=("state",))
+    env.reset(seed=0)
+    snapshot = env.snapshot()
+    others = [
+        (crossing, {"dt_s": 0.1}, r"time step 0\.2 s, expected 0\.1 s"),
+        (crossing, {"traffic": "idm"}, "traffic log, expected idm"),
+        (crossing, {"action_repeat": 2}, "action_repeat 1, expected 2"),
+        (other_data, {}, "data of content"),
+    ]
+    for data, options, message in others:
+        other = ReplayEnv(data, observations=("state",), **options)
+        given = pickle.loads(pickle.dumps(snapshot)) if pickled else snapshot
+        with pytest.raises(AspEnvError, match=message) as caught:
+            other.restore(given)
+        assert "\n" not in str(caught.value)
+        with pytest.raises(gymnasium.error.ResetNeeded):
+            other.step(np.zeros(2))
+    envs = [ReplayVectorEnv(count, crossing, observations=("state",)) for count in (2, 3)]
+    envs[0].reset(seed=0)
+    with pytest.raises(AspEnvError, match="number of episodes 2, expected 3"):
+        envs[1].restore(envs[0].snapshot())
+    envs[1].reset(seed=0)
+    env.restore(snapshot)

@@ -177,7 +177,7 @@ def test_invalid_actions_are_rejected(crossing, actions, message):
 @pytest.mark.parametrize(
     ("options", "message"),
     [
-        ({"num_envs": 0}, "num_envs 0: expected at least 1"),
+        ({"num_envs": 0}, "num_envs 0: expected a whole number of at least 1"),
         ({"autoreset_mode": "Later"}, "autoreset_mode 'Later': expected one of NextStep"),
         ({"observation": ("state",)}, r"unexpected keyword argument 'observation'; did you mean"),
         ({"render_mode": "ansi"}, "render mode 'ansi'"),

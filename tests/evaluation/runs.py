@@ -205,9 +205,40 @@ def make_rollout(
     )
 
 
+def difference_rows() -> list[dict[str, object]]:
+    """Differences of the score to constant velocity, over all scenarios and by tag."""
+    gains = {"oracle": 0.2, "ffw-asp:runs/demo": 0.11, "blind": -0.5}
+    rows: list[dict[str, object]] = []
+    for predictor, gain in gains.items():
+        for subset, share in (("all", 1.0), ("left", 0.5)):
+            value = gain * share
+            row: dict[str, object] = dict.fromkeys(COLUMNS, "")
+            row |= {"data": "sample:intersection", "traffic": "idm", "latency_ticks": 0}
+            row |= {"planner": "sampling", "predictor": predictor, "subset": subset, "n": 240}
+            row |= {"metric": "score - constant-velocity", "value": value, "p_holm": 0.001}
+            rows.append(row | {"low": value - 0.05, "high": value + 0.05, "mde": 0.07})
+    return rows
+
+
+def write_scenario_values(out: Path, scores: dict[str, tuple[float, float]]) -> None:
+    """Writes `scenarios.csv` with the scores of `ffw-asp` and constant velocity by scenario."""
+    lines = ["scenario,recording,location,tags,planner,predictor,run,ending,score"]
+    for name, pair in scores.items():
+        for predictor, score in zip(("ffw-asp:runs/demo", "constant-velocity"), pair, strict=True):
+            place = name.partition("-")[0]
+            cells = (name, place, place, "left", "sampling", predictor, "", "GOAL", f"{score:g}")
+            lines.append(",".join(cells))
+    (out / "scenarios.csv").write_text("\n".join(lines) + "\n")
+
+
 def write_run(out: Path, recordings: Sequence[Recording]) -> None:
     """Writes a folder with tables and three rollouts of each of two methods."""
-    write_tables(out, metric_rows())
+    write_tables(out, [*metric_rows(), *difference_rows()])
+    manifest = json.loads((out / "manifest.json").read_text())
+    manifest |= {"planner": "sampling", "traffic": "idm", "horizon_s": 3.0, "dt_s": 0.2}
+    manifest |= {"metrics": {"preset": "pdms"}}
+    manifest["predictors"] = {"constant-velocity": {}, "ffw-asp:runs/demo": {}}
+    (out / "manifest.json").write_text(json.dumps(manifest))
     for method, lag in (("sampling + constant-velocity", 0.3), ("sampling + ffw-asp", 0.1)):
         folder = out / "rollouts" / method
         folder.mkdir(parents=True)
@@ -224,3 +255,6 @@ def write_run(out: Path, recordings: Sequence[Recording]) -> None:
                 recording, track=int(track), start_tick=start, length=length, lag=lag
             )
             rollout.save(folder / f"{rollout.scenario.name}.npz")
+    names = sorted(path.stem for path in folder.iterdir())
+    scores = zip(names, ((0.9, 0.4), (0.2, 0.7), (0.8, 0.8)), strict=True)
+    write_scenario_values(out, dict(scores))

@@ -7,6 +7,7 @@ from hypothesis import strategies as st
 
 from asp_env.evaluation.statistics import (
     RESAMPLES,
+    Difference,
     Estimate,
     average_runs,
     difference,
@@ -16,6 +17,8 @@ from asp_env.evaluation.statistics import (
     is_resolved,
     mean,
     ratio,
+    ratio_over_runs,
+    resampled_means,
     resampled_sums,
     samples_needed,
 )
@@ -117,6 +120,37 @@ def test_runs_and_recordings_are_both_resampled():
     assert (draws[1:] == 8.0).mean() == pytest.approx(1 / 8, abs=0.03)
 
 
+def test_a_ratio_over_runs_by_hand():
+    """Runs whose values are 0 and 8 everywhere: one of them is drawn, so 0 and 8 are the bounds."""
+    numerators = np.array([[0.0, 0.0], [8.0, 8.0]])
+    estimate = ratio_over_runs(numerators, np.ones(2), np.array([0, 1]))
+    assert estimate == Estimate(value=4.0, low=0.0, high=8.0, n=2)
+    twice = ratio_over_runs(numerators, np.full((2, 2), 2.0), np.array([0, 1]))
+    assert twice == Estimate(value=2.0, low=0.0, high=4.0, n=2)
+
+
+def test_resamples_without_a_value_are_left_out_of_a_ratio_over_runs():
+    """A quarter of the resamples has the recording without a value twice, 0 / 0."""
+    estimate = ratio_over_runs(np.array([[3.0, 0.0]]), np.array([[1.0, 0.0]]), np.array(["a", "b"]))
+    assert estimate == Estimate(value=3.0, low=3.0, high=3.0, n=2)
+
+
+def test_a_ratio_over_runs_has_the_resamples_of_its_stream():
+    """The interval is that of the quotients of `resampled_sums` with the same stream."""
+    rng = np.random.default_rng(3)
+    numerators, groups = rng.normal(size=(5, 12)), np.arange(12) % 6
+    found = [ratio_over_runs(numerators, np.ones(12), groups, stream=k) for k in range(3)]
+    for stream, estimate in enumerate(found):
+        sums = resampled_sums(numerators, groups, stream=stream)
+        draws = sums / resampled_sums(np.ones((1, 12)), groups)
+        expected = interval(draws, n=12)
+        assert (estimate.value, estimate.low, estimate.high) == pytest.approx(
+            (expected.value, expected.low, expected.high)
+        )
+    assert found[0] == ratio_over_runs(numerators, np.ones(12), groups)
+    assert len({estimate.low for estimate in found}) == 3
+
+
 def test_the_variance_over_runs_is_unbiased():
     """Runs of 1, 2 and 6 have a sample variance of 7: the squared error of their mean is 7 / 3."""
     values = np.tile([1.0, 2.0, 6.0], (1 + RESAMPLES, 1))
@@ -175,6 +209,29 @@ def test_resolved_needs_both_the_interval_and_the_effect():
     assert is_resolved(-0.03, -0.05, -0.01, 0.028)
     assert not is_resolved(0.03, 0.001, 0.06, 0.042)  # an interval above 0, less than the MDE
     assert not is_resolved(0.03, -0.001, 0.05, 0.028)  # the MDE, but 0 in the interval
+
+
+def test_text_of_estimates_and_differences():
+    estimate = Estimate(value=0.5, low=0.25, high=0.75, n=4)
+    assert f"{estimate:.2f}" == "0.50 [0.25, 0.75]"
+    assert f"{Estimate(value=0.5, low=None, high=None, n=4):+.1f}" == "+0.5"
+    resolved = Difference(estimate=estimate, mde=0.4, p=0.01)
+    assert f"{resolved:+.2f}" == "+0.50 [+0.25, +0.75]"
+    assert f"{Difference(estimate=estimate, mde=0.6, p=0.04):+.1f}" == (
+        "+0.5 [+0.2, +0.8], not resolved (smallest that could be seen 0.6)"
+    )
+    alone = Difference(estimate=Estimate(value=-1.0, low=None, high=None, n=1), mde=None, p=None)
+    assert f"{alone:+.1f}" == "-1.0, not resolved"
+
+
+def test_means_are_ratios_of_sums():
+    values, groups = np.array([[1.0, 2.0, 6.0], [3.0, 2.0, 4.0]]), np.array([0, 0, 1])
+    means = resampled_means(values, groups)
+    assert means[0] == 3.0
+    # Resamples draw both groups once, or one of the groups twice, with equal shares of the runs or
+    # one run alone: all lie between the least and the largest group mean of a run.
+    assert means.min() == 1.5
+    assert means.max() == 6.0
 
 
 def test_samples_needed_by_hand():

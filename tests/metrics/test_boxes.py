@@ -10,7 +10,7 @@ from hypothesis.strategies import SearchStrategy
 
 from asp_env.data.classes import AgentClass
 from asp_env.geometry import box_corners, from_frame, overlaps
-from asp_env.metrics.boxes import AT_FAULT, Contact, ego_contacts, touching_trailers
+from asp_env.metrics.boxes import AT_FAULT, Contact, ego_contacts, is_behind, touching_trailers
 
 CAR = (4.0, 2.0)
 State = tuple[float, float, float, float]
@@ -56,6 +56,9 @@ def contacts(
         (4.01, 0.0, CAR, Contact.NONE),
         (0.0, 2.01, CAR, Contact.NONE),
         (3.99, 2.01, CAR, Contact.NONE),
+        (3.4, 0.0, (3.0, 3.0), Contact.FRONT),  # 2 m and 1.5 m from centre to side
+        (3.4, 0.0, (2.0, 8.0), Contact.NONE),
+        (0.0, 4.9, (2.0, 8.0), Contact.SIDE),  # 1 m and 4 m
     ],
 )
 def test_contact(
@@ -63,6 +66,20 @@ def test_contact(
 ) -> None:
     """The ego's front is at 2 m, its sides at 1 m and its rear axle at -1.2 m, in any pose."""
     assert contacts((x, y, 0.0, 5.0), size=size, at=at) == [expected]
+
+
+@pytest.mark.parametrize(
+    ("x", "y", "behind"),
+    [
+        (-1.2, 0.0, False),  # the rear axle itself
+        (-1.3, 0.0, True),
+        (-2.2, 0.577, True),  # 150.02° off the heading, tan 30° = 0.5774
+        (-2.2, -0.578, False),  # 149.97°
+    ],
+)
+def test_behind_is_seen_from_the_rear_axle(x: float, y: float, behind: bool) -> None:
+    """It is 0.3 · 4 m behind the centre."""
+    assert is_behind(0.0, 0.0, 0.0, 4.0, x, y) == behind
 
 
 def test_boxes_that_only_touch_have_no_contact() -> None:

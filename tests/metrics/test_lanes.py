@@ -16,6 +16,7 @@ from asp_env.metrics.lanes import (
     at_crossing,
     covering_lanes,
     in_several_lanes,
+    lane_coordinates,
     lane_table,
     speed_limits,
 )
@@ -30,6 +31,7 @@ from tests.metrics.streets import (
     WEST,
     moved_map,
     street_map,
+    strip,
 )
 
 Pose = tuple[float, float, float]
@@ -65,6 +67,62 @@ def at(x: float, y: float, heading: float = 0.0, speed: float = 5.0) -> np.ndarr
 )
 def test_covering(x: float, y: float, lanes: set[int]) -> None:
     assert set(np.flatnonzero(covering_lanes(STREET, np.array([x, y])))) == lanes
+
+
+def map_of(*lanes: tuple[np.ndarray, np.ndarray]) -> RoadMap:
+    """A map of lanes (centre line, ring) without limits and successors."""
+    count = len(lanes)
+    return replace(
+        STREET,
+        lanes=Ragged.pack([line for line, _ in lanes]),
+        areas=Ragged.pack([ring for _, ring in lanes]),
+        successors=np.zeros((0, 2), dtype=np.int64),
+        two_way=np.zeros(count, dtype=bool),
+        limits_mps=np.zeros(count),
+        limited=np.zeros(count, dtype=bool),
+    )
+
+
+@pytest.mark.parametrize(
+    ("x", "y", "heading", "arc_m"),
+    [
+        (4.0, 1.0, 0.0, 4.0),
+        (-3.0, 1.0, 0.0, 0.0),  # before its beginning
+        (9.0, 5.0, math.pi / 2, 15.0),
+        (11.0, 12.0, math.pi / 2, 20.0),  # beyond its end
+        (11.0, -1.0, 0.0, 10.0),  # equally near to both segments: the first
+    ],
+)
+def test_coordinates_on_a_lane_with_a_corner(
+    x: float, y: float, heading: float, arc_m: float
+) -> None:
+    """10 m to the east, a repeated point, and 10 m to the north; 0 in a lane that is not asked."""
+    line = np.array([(0.0, 0.0), (10.0, 0.0), (10.0, 0.0), (10.0, 10.0)])
+    _, ring = strip(0, 0, 10, 0)
+    bent = map_of((line, ring), (line[::-1], ring))
+    found = lane_coordinates(bent, np.array([x, y]), np.array([True, False]))
+    np.testing.assert_allclose(found, [(heading, 0), (arc_m, 0)])
+
+
+@pytest.mark.parametrize(("other_x", "crossing"), [(60.0, True), (68.0, False)])
+def test_between_two_crossings_within_10_m_is_at_a_crossing(other_x: float, crossing: bool) -> None:
+    """Lanes 4 m wide cross at 50 m and at 60 or 68 m: the gap is 6 or 14 m."""
+    crossed = map_of(strip(0, 0, 100, 0), strip(50, -30, 50, 30), strip(other_x, -30, other_x, 30))
+    middle = at((50 + other_x) / 2, 0)
+    small = np.array([[1.0, 1.0]])
+    assert at_crossing(crossed, middle, small).tolist() == [crossing]
+    for x, expected in ((45.0, False), (50.0, True), (other_x, True), (other_x + 5, False)):
+        assert at_crossing(crossed, at(x, 0), small).tolist() == [expected]
+
+
+@pytest.mark.parametrize(
+    ("region_m", "crossing"), [((30.0, -9.0, 70.0, 9.0), True), ((0.0, -9.0, 30.0, 9.0), False)]
+)
+def test_crossings_are_sought_where_agents_are(
+    region_m: tuple[float, float, float, float], crossing: bool
+) -> None:
+    inside = replace(STREET, region_m=region_m)
+    assert at_crossing(inside, at(50, 0), CAR[None]).tolist() == [crossing]
 
 
 @pytest.mark.parametrize(

@@ -1,6 +1,8 @@
 """Demonstrations: the logged drivers' episodes in Minari's format, as their clients read them."""
 
 import json
+import subprocess
+import sys
 from pathlib import Path
 from typing import Any
 
@@ -209,6 +211,35 @@ def test_an_interrupted_command_writes_nothing(
     monkeypatch.setattr("policies.demonstrations.record_episodes", interrupted)
     with pytest.raises(KeyboardInterrupt):
         Demonstrations(data=DATA, out=tmp_path / "a-v0", observations=PARTS).run()
+    assert list(tmp_path.iterdir()) == []
+
+
+FULL = """
+import resource, sys
+from pathlib import Path
+import h5py, numpy as np
+from asp_env.files import atomic_folder
+from policies.dataset import _LateErrors
+
+resource.setrlimit(resource.RLIMIT_FSIZE, (int(sys.argv[1]), resource.RLIM_INFINITY))
+with atomic_folder(Path("out")) as folder, _LateErrors(folder / "data.hdf5") as disk:
+    with h5py.File(disk, "w") as file:
+        for number in range(20):
+            file.create_dataset(str(number), data=np.random.rand(1000))
+    disk.check()
+"""
+
+
+@pytest.mark.parametrize("most_bytes", [1, 100_000])
+def test_a_full_disk_is_an_error(tmp_path: Path, most_bytes: int) -> None:
+    """HDF5 alone would end the process."""
+    done = subprocess.run(
+        [sys.executable, "-c", FULL, str(most_bytes)],
+        cwd=tmp_path, capture_output=True, text=True, check=False,
+    )  # fmt: skip
+    assert done.returncode == 1
+    error = done.stderr.splitlines()[-1]
+    assert "AspEnvError: out/data.hdf5 cannot be written (File too large); free some" in error
     assert list(tmp_path.iterdir()) == []
 
 

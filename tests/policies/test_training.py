@@ -111,6 +111,15 @@ class TestRefusals:
         with pytest.raises(AspEnvError, match="no run to resume"):
             train_policy(small_settings(), tmp_path, resume=True)
 
+    def test_a_run_that_was_killed_after_its_last_file(self, run: Path, tmp_path: Path) -> None:
+        """It is finished; its checkpoint is removed."""
+        shutil.copytree(run, tmp_path / "run")
+        (tmp_path / "run" / CHECKPOINT).write_text("old")
+        with pytest.raises(AspEnvError, match="training has ended"):
+            train_policy(small_settings(), tmp_path / "run", resume=True)
+        assert not (tmp_path / "run" / CHECKPOINT).exists()
+        load_policy(tmp_path / "run")
+
     def test_other_settings(self, run: Path, tmp_path: Path) -> None:
         shutil.copytree(run, tmp_path / "run")
         (tmp_path / "run" / POLICY).unlink()

@@ -1,6 +1,8 @@
 """Tests of frames: positions and colours."""
 
 import dataclasses
+import struct
+import zlib
 from pathlib import Path
 
 import cv2
@@ -226,6 +228,14 @@ def test_bad_arguments_are_refused(tmp_path: Path) -> None:
         draw_frame(scene, extent_m=0.0)
     with pytest.raises(DataError, match="not an image that can be read"):
         draw_frame(scene, background=Background(path=tmp_path / "no.png", metres_per_pixel=0.1))
+    huge = tmp_path / "huge.png"
+    cv2.imwrite(str(huge), np.zeros((2, 2, 3), dtype=np.uint8))
+    content = huge.read_bytes()
+    header = b"IHDR" + struct.pack(">II", 65_535, 65_535) + content[24:29]
+    checksum = struct.pack(">I", zlib.crc32(header))
+    huge.write_bytes(content[:12] + header + checksum + content[33:])
+    with pytest.raises(DataError, match=r"huge\.png: not an image that can be read"):
+        draw_frame(scene, background=Background(path=huge, metres_per_pixel=0.1))
 
 
 def test_pedestrians_are_always_visible() -> None:

@@ -137,7 +137,7 @@ def test_an_episode_that_is_over_does_not_change(traffic):
     ("unfit", "message"),
     [
         (scenario(9), "has no track 9"),
-        (scenario(1, start=14), "ticks -1 to"),
+        (scenario(1, start=2), "ticks -1 to"),
         (scenario(1, length=0), "are needed"),
         (scenario(1, start=90, length=11), "spans 0 to 100"),
     ],

@@ -9,7 +9,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from asp_env.data.road_map import LineType, MapCache
+from asp_env.data.road_map import LineType
 from asp_env.views.map_layers import drivable_rings, fill_rings, line_segments
 from asp_env.views.raster import Viewport, place_targets
 from tests.views.scenes import make_map, make_scene, standing
@@ -156,13 +156,3 @@ def test_repeated_and_single_points_are_left_out() -> None:
     lines = [(LineType.CURB, [(1, 1)]), (LineType.CURB, [(2, 2), (2, 2), (5, 2), (5, 2)])]
     segments = line_segments(make_map(lines))
     np.testing.assert_allclose(segments, [[3.5, 2, 1, 0, 1.5]])
-
-
-def test_segments_are_cached_by_map() -> None:
-    cache = MapCache(line_segments, 2)
-    maps = [make_map([(LineType.CURB, [(0, 0), (i, 1)])]) for i in range(4)]
-    first = cache(maps[0])
-    assert cache(maps[0]) is first
-    for road_map in maps:
-        np.testing.assert_array_equal(cache(road_map), line_segments(road_map))
-    assert cache(maps[0]) is not first

@@ -1,6 +1,5 @@
 """Results of readers in the cache: read once, mapped into memory later."""
 
-import warnings
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
@@ -19,7 +18,7 @@ def cached(
 ) -> CacheEntry:
     """The result of `make`, from the cache if it is stored there and no source has changed since.
 
-    If the cache cannot be written, there is a warning, and `make` is called every time.
+    If the cache cannot be written, one line is logged, and `make` is called every time.
 
     Args:
         path: the file that the result is named after.
@@ -31,7 +30,7 @@ def cached(
     try:
         stored = cache.entry_path(cache.cache_folder(), path, salt)
     except DataError as error:
-        warnings.warn(f"results are not cached: {error}", stacklevel=1)  # once per process
+        cache.note_uncached(error)
         return _read_only(make())
     if (found := cache.load(stored, current)) is not None:
         return found
@@ -39,7 +38,7 @@ def cached(
     try:
         cache.save(stored, current, *made)
     except OSError as error:
-        warnings.warn(f"results are not cached: {stored}: {error.strerror}", stacklevel=1)
+        cache.note_uncached(error, stored)
     return cache.load(stored, current) or _read_only(made)
 
 

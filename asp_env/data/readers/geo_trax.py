@@ -18,6 +18,7 @@ from asp_env.data.readers.measurements import Measurements
 from asp_env.data.readers.ranges import POSITION, SIZE, Limit
 from asp_env.data.readers.tables import Kind, find_line, has_columns, number_ids, read_table
 from asp_env.errors import DataError
+from asp_env.stored import brief
 
 CLASSES: Mapping[str, str] = {"0": "car", "1": "bus", "2": "truck", "3": "motorcycle"}
 """Class by its number; 0 includes vans."""
@@ -67,7 +68,8 @@ def read_geo_trax(paths: tuple[Path, ...]) -> RecordingTables:
         text = str(table["Timestamp"][int(times.isna().to_numpy().argmax())])
         line = find_line(path, {"Timestamp": text})
         raise DataError(
-            f"{path}, line {line}: Timestamp is {text!r}, expected such as 2022-10-07 17:52:13.500"
+            f"{path}, line {line}: Timestamp is {brief(repr(text))}, expected such as "
+            "2022-10-07 17:52:13.500"
         )
     names = ClassNames()
     classes = [CLASSES.get(str(name).strip(), name) for name in table["Vehicle_Class"]]

@@ -13,7 +13,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import pandas as pd
 
 from asp_env.data.readers.caching import CacheEntry, cached
 from asp_env.data.readers.interaction import (
@@ -27,7 +26,7 @@ from asp_env.data.readers.interaction import (
 from asp_env.data.readers.layout import ClassNames, TrackTable, natural_key, walk
 from asp_env.data.readers.measurements import derive_tracks
 from asp_env.data.readers.positions import Origin
-from asp_env.data.readers.tables import Kind, find_line, has_columns, read_table
+from asp_env.data.readers.tables import Kind, find_line, has_columns, number_texts, read_table
 from asp_env.errors import DataError
 
 _TABLE = re.compile(r"^(.+?)(?:_(?:train|val|test|obs))?\.csv(?:\.gz)?$", re.IGNORECASE)
@@ -148,13 +147,9 @@ def _list_cases(path: Path) -> CacheEntry:
 def _read_cases(path: Path) -> CacheEntry:
     names = ClassNames()
     columns = read_measurements(path, names, _CASES, optional=OPTIONAL_TRACKS)
-    ids = columns["track_id"]
-    codes, known = pd.factorize(ids)
-    numbers = np.array(pd.to_numeric(pd.Series(known), errors="coerce"), dtype=np.float64)
-    whole = np.isfinite(numbers) & (numbers == np.floor(numbers)) & (np.abs(numbers) < 2**53)
-    start = int(numbers[whole].max(initial=-1)) + 1
-    numbers[~whole] = start + np.arange((~whole).sum())  # such as P1, the ids of pedestrians
-    columns["track_id"] = numbers[codes]
+    ids = number_texts(columns["track_id"])
+    columns["track_id"] = ids.numbers
+    of_table = (*names.repairs(), *ids.repairs)
     order = np.argsort(columns["case_id"], kind="stable")
     columns = {name: cells[order] for name, cells in columns.items()}
     measurements = measurements_of(columns)
@@ -165,7 +160,7 @@ def _read_cases(path: Path) -> CacheEntry:
         def located(
             track: int, time_ms: float, occurrence: int, what: str, case: float = float(case)
         ) -> str:
-            cells = {"case_id": case, "track_id": str(known[list(numbers).index(track)])}
+            cells = {"case_id": case, "track_id": ids.texts[track]}
             line = find_line(path, {**cells, "timestamp_ms": time_ms}, occurrence=occurrence)
             text = what.format(track=cells["track_id"], time=f"{time_ms:g}")
             return f"{path}, line {line}: case {case:g}: {text}"
@@ -176,7 +171,7 @@ def _read_cases(path: Path) -> CacheEntry:
         except DataError as error:
             cases.append({"fault": str(error)})
         else:
-            repairs = [*(names.repairs() if case == case_ids[0] else []), *table.repairs]
+            repairs = [*(of_table if case == case_ids[0] else ()), *table.repairs]
             cases.append(
                 {
                     "rate_hz": rate_hz,

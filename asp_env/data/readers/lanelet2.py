@@ -31,6 +31,7 @@ from asp_env.data.readers.tags import (
 from asp_env.data.road_map import LineType, Ragged, RoadMap
 from asp_env.errors import DataError
 from asp_env.geometry import arc_lengths, points_at
+from asp_env.stored import brief
 
 VEHICLE_SUBTYPES = frozenset(
     {"", "road", "highway", "bus_lane", "play_street", "emergency_lane", "exit", "entry"}
@@ -368,14 +369,13 @@ def _use(relation: Relation, subtype: str, unknown: dict[str, list[str]]) -> Use
         if subtype in subtypes:
             of_subtype = use
     allowed = vehicles_allowed(relation.tags)
+    shown = brief(repr(subtype or "road"))
     if allowed and of_subtype != "along":
-        what = f"of subtype {subtype!r} are roads, since a participant tag allows vehicles"
+        what = f"of subtype {shown} are roads, since a participant tag allows vehicles"
         unknown.setdefault(what, []).append(relation.id)
         return "along"
     if allowed is False and of_subtype in ("along", "unlisted"):
-        what = (
-            f"of subtype {subtype or 'road'!r} left out, since no participant tag allows vehicles"
-        )
+        what = f"of subtype {shown} left out, since no participant tag allows vehicles"
         unknown.setdefault(what, []).append(relation.id)
         return "not"
     return of_subtype
@@ -390,7 +390,7 @@ def _limit_mps(
         if limit is not None:
             break
         if text.strip().lower() != "none":
-            what = f"with the unknown speed limit {text!r}, which is not used"
+            what = f"with the unknown speed limit {brief(repr(text))}, which is not used"
             unknown.setdefault(what, []).append(relation.id)
     return limit
 
@@ -423,7 +423,7 @@ class _SpeedRules:
             known = [speed for speed in speeds if speed is not None]
             if not known:
                 sign = relation.tags.get("sign_type") or next(iter(signs), "")
-                self._unknown.append(f"{relation.id} ({sign!r})")
+                self._unknown.append(f"{relation.id} ({brief(repr(sign))})")
                 continue
             self._rules[relation.id] = known[0]
             self._unused.add(relation.id)

@@ -57,8 +57,8 @@ def is_hidden(name: str) -> bool:
 def walk(root: Path) -> list[tuple[Path, list[str]]]:
     """Every folder in and below `root` with the names of its files.
 
-    Hidden and temporary files and folders are left out; links are followed, but no folder is
-    visited twice.
+    Hidden and temporary files and folders are left out, and so are pipes and devices, at which a
+    reader might wait forever; links are followed, but no folder is visited twice.
     """
     visited: set[str] = set()
     found = []
@@ -69,8 +69,17 @@ def walk(root: Path) -> list[tuple[Path, list[str]]]:
             continue
         visited.add(real)
         folders[:] = sorted(name for name in folders if not is_hidden(name))
-        found.append((Path(folder), sorted(name for name in names if not is_hidden(name))))
+        shown = (name for name in names if not is_hidden(name))
+        found.append((Path(folder), sorted(n for n in shown if may_be_read(Path(folder) / n))))
     return found
+
+
+def may_be_read(path: Path) -> bool:
+    """Whether reading a file ends: not of pipes and devices; missing files are errors elsewhere."""
+    try:
+        return not path.exists() or path.is_file()
+    except OSError:
+        return True
 
 
 def archive_hint(folder: Path) -> str:

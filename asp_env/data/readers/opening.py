@@ -68,6 +68,8 @@ class ReaderState:
 
     dt_s: float = DEFAULT_DT_S
     """Seconds per tick. Recordings whose rate does not fit are resampled."""
+    quiet: bool = False
+    """Whether repairs of maps are reported by the caller, not by a warning for each map."""
     recordings: dict[str, Recording] = field(default_factory=dict)
     maps: dict["MapKey | Path | str", RoadMap] = field(default_factory=dict)
     """By file, frame and part; by a table of cases, which have one map; or by a hash of their
@@ -282,7 +284,7 @@ def _open_found(files: FoundRecording, state: ReaderState) -> Recording:
     key = about["map_hash"]
     if key not in state.maps:
         state.maps[key] = _map_of(about["map"], parts)
-        if about["map_of_file"]:
+        if about["map_of_file"] and not state.quiet:
             _warn_of_repairs(about["map_of_file"], state.maps[key])
     return Recording(
         name=files.name,
@@ -369,7 +371,8 @@ def _road_map(
             (origin, region_m, driven),
         )
         state.maps[key] = _map_of({"name": path.stem, **facts}, arrays)
-        _warn_of_repairs(path.name, state.maps[key])
+        if not state.quiet:
+            _warn_of_repairs(path.name, state.maps[key])
 
     def check() -> CacheEntry:
         name = files.tracks.name if is_case else files.name

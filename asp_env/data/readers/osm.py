@@ -1,5 +1,6 @@
 """Elements of an OSM file: nodes, ways and relations with their tags."""
 
+import warnings
 import xml.etree.ElementTree as ElementTree
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -11,6 +12,7 @@ from jaxtyping import Float
 
 from asp_env.data.readers.layout import shorten
 from asp_env.errors import DataError
+from asp_env.stored import brief
 
 COORDINATES = ("lat", "lon", "x", "y", "local_x", "local_y")
 """What a node may have: degrees, metres, and metres in tags as Autoware writes them."""
@@ -63,9 +65,14 @@ def read_osm(path: Path) -> Osm:
             declares entities.
     """
     try:
-        _check_prolog(path)
-        return _read(path)
-    except (ElementTree.ParseError, expat.ExpatError, ValueError, LookupError) as error:
+        with warnings.catch_warnings():
+            warnings.simplefilter("error", DeprecationWarning)  # of codecs such as unicode_escape
+            _check_prolog(path)
+            return _read(path)
+    except (
+        *(ElementTree.ParseError, expat.ExpatError, ValueError, LookupError),
+        DeprecationWarning,
+    ) as error:
         if isinstance(error, DataError):
             raise
         raise DataError(
@@ -84,8 +91,8 @@ def _check_prolog(path: Path) -> None:
 
     def refuse(name: str, *_: object) -> None:
         raise DataError(
-            f"{path}: declares the XML entity {name!r}; expected a lanelet2 map, which has none: "
-            "put the right file in its place"
+            f"{path}: declares the XML entity {brief(repr(name))}; expected a lanelet2 map, which "
+            "has none: put the right file in its place"
         )
 
     parser = expat.ParserCreate()
@@ -113,7 +120,7 @@ def _read(path: Path) -> Osm:
         elif number in elements:
             doubles.append(f"{element.tag} {number}")
         elif element.tag == "node":
-            sample = sample or " ".join(f"{key}={value!r}" for key, value in element.items())
+            sample = sample or " ".join(f"{k}={v!r}" for k, v in element.items())[:200]
             nodes[number] = len(coordinates)
             coordinates.append(_coordinates(element))
         elif element.tag == "way":

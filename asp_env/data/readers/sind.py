@@ -2,11 +2,14 @@
 
 A recording is a folder with `Veh_smoothed_tracks.csv`, optionally `Ped_smoothed_tracks.csv` and
 `Traffic_Lights.csv` (or `TrafficLight_NAME.csv`); the location's lanelet2 map, `.osm`, lies in this
-folder or in one above. Positions and the map are in metres from 0° N 0° E. The format is described
-in https://github.com/SOTIF-AVLab/SinD/blob/main/Format.md.
+folder or in one above, or in `maps` there. Positions and the map are in metres from 0° N 0° E. The
+format is described in https://github.com/SOTIF-AVLab/SinD/blob/main/Format.md.
 
-No file contains where the lights' stop lines are. `stop_lines.csv` beside the lights gives them,
-with the columns `signal, x1, y1, x2, y2`: the number of the light's column and two points, m.
+Columns of lights are called `Traffic light N` or `Vehicle Traffic light N`; those of lights for
+pedestrians are left out. No file of the release contains where the stop lines are. A file of one's
+own, `stop_lines.csv` beside the lights, may give them, with the columns `signal, x1, y1, x2, y2`:
+the number of the light's column and two points, m. A recording is read without it, and without
+lights that cannot be read.
 """
 
 import re
@@ -14,7 +17,7 @@ from collections.abc import Iterator, Mapping
 from pathlib import Path
 
 import numpy as np
-import pandas as pd
+from jaxtyping import Float, Int8
 
 from asp_env.data.readers.found import FoundRecording, RecordingTables, SignalChanges
 from asp_env.data.readers.interaction import measurements_of, read_measurements
@@ -23,19 +26,21 @@ from asp_env.data.readers.layout import (
     ClassNames,
     is_hidden,
     map_suffix,
+    may_be_read,
     shorten,
     walk,
     with_parents,
 )
 from asp_env.data.readers.positions import Origin
 from asp_env.data.readers.ranges import HEADING_RAD
-from asp_env.data.readers.tables import Kind, header_of, read_table
+from asp_env.data.readers.tables import Kind, header_of, number_texts, read_table
 from asp_env.data.signals import SignalState
 from asp_env.errors import DataError
 
 VEHICLES = "veh_smoothed_tracks.csv"
 PEDESTRIANS = "ped_smoothed_tracks.csv"
 STOP_LINES = "stop_lines.csv"
+MAPS = "maps"
 
 STATES: Mapping[float, SignalState] = {
     0: SignalState.RED,
@@ -44,9 +49,11 @@ STATES: Mapping[float, SignalState] = {
 }
 """State of a light by its number in the files."""
 
-_LIGHTS = re.compile(r"^traffic_?lights?.*\.csv$", re.IGNORECASE)
+_LIGHTS = re.compile(r"^traff?ic_?lights?.*\.csv$", re.IGNORECASE)
 _LIGHT = re.compile(r"light\s*([0-9]+)$", re.IGNORECASE)
+_PEDESTRIAN = re.compile(r"^ped", re.IGNORECASE)
 _TIME = "timestamp(ms)"
+_FRAME = "RawFrameID"
 _TRACKS: Mapping[str, Kind] = {
     "track_id": "text",
     "timestamp_ms": "number",
@@ -96,12 +103,18 @@ def read_sind(paths: tuple[Path, ...]) -> RecordingTables:
         tables.append(_tracks(by_name[PEDESTRIANS], names))
         ids.append(np.array([f"pedestrian {name}" for name in tables[1]["track_id"]], dtype=object))
     columns = {name: np.concatenate([table[name] for table in tables]) for name in vehicles}
-    columns["track_id"] = _numbers(*ids)
-    repairs = names.repairs()
+    numbered = number_texts(np.concatenate(ids))
+    columns["track_id"] = numbered.numbers
+    repairs = [*names.repairs(), *numbered.repairs]
     lights = next((path for name, path in by_name.items() if _LIGHTS.match(name)), None)
     signals = None
     if lights is not None:
-        signals = _signals(lights, by_name.get(STOP_LINES), repairs)
+        try:
+            changes = _changes(lights, repairs)
+        except DataError as error:
+            repairs.append(f"the lights are left out: {error}")
+        else:
+            signals = _placed(lights, *changes, by_name.get(STOP_LINES), repairs)
     found = next((path for path in paths if map_suffix(path) == ".osm"), None)
     origin = Origin.at(latitude_deg=0.0, longitude_deg=0.0)
     return RecordingTables(
@@ -116,10 +129,12 @@ def read_sind(paths: tuple[Path, ...]) -> RecordingTables:
 def _map(place: Path, root: Path) -> Path | None:
     """The lanelet2 map of a recording's folder: in the nearest folder with one, up to `root`."""
     for folder in with_parents(place, root):
+        inside = [each for each in folder.iterdir() if each.name.lower() == MAPS and each.is_dir()]
         maps = sorted(
             path
-            for path in folder.iterdir()
-            if map_suffix(path) == ".osm" and not is_hidden(path.name)
+            for each in (folder, *inside)
+            for path in each.iterdir()
+            if map_suffix(path) == ".osm" and not is_hidden(path.name) and may_be_read(path)
         )
         if maps:
             location = place.parent.name.lower()
@@ -133,27 +148,29 @@ def _tracks(path: Path, names: ClassNames) -> dict[str, np.ndarray]:
     return columns
 
 
-def _numbers(vehicles: np.ndarray, pedestrians: np.ndarray | None = None) -> np.ndarray:
-    """Ids as numbers: those of vehicles as in the file if they are whole, then pedestrians'."""
-    codes, known = pd.factorize(vehicles)
-    numbers = np.array(pd.to_numeric(pd.Series(known), errors="coerce"), dtype=np.float64)
-    is_plain = np.isfinite(numbers) & (numbers == np.floor(numbers)) & (np.abs(numbers) < 2**53)
-    if not is_plain.all():
-        numbers = np.arange(len(known), dtype=np.float64)
-    first = int(numbers.max(initial=-1)) + 1
-    parts = [numbers[codes]]
-    if pedestrians is not None:
-        parts.append(first + pd.factorize(pedestrians)[0])
-    return np.concatenate(parts)
+def _changes(
+    lights: Path, repairs: list[str]
+) -> tuple[Float[np.ndarray, " changes"], dict[int, Int8[np.ndarray, " changes"]]]:
+    """When the lights of vehicles change, ms, and their states from then on, by number.
 
-
-def _signals(lights: Path, stop_lines: Path | None, repairs: list[str]) -> SignalChanges:
-    columns = [name for name in header_of(lights) if _LIGHT.search(name)]
+    Raises:
+        DataError: the file is damaged, or has no such lights.
+    """
+    names = [name for name in header_of(lights) if _LIGHT.search(name)]
+    columns = {int(_LIGHT.findall(n)[0]): n for n in names if not _PEDESTRIAN.match(n)}
     if not columns:
         raise DataError(f"{lights}: has no column such as 'Traffic light 1'; copy it again")
-    table = read_table(lights, {_TIME: "number", **dict.fromkeys(columns, "number")})
-    order = np.argsort(table[_TIME], kind="stable")
-    codes = np.stack([table[name][order] for name in columns])
+    if len(columns) < len(names):
+        repairs.append(f"{len(names) - len(columns)} lights of pedestrians are left out")
+    kinds: dict[str, Kind] = {
+        **{_TIME: "number or empty", _FRAME: "number or empty"},
+        **dict.fromkeys(columns.values(), "number"),
+    }
+    table = read_table(lights, kinds, optional=frozenset({_FRAME}))
+    times_ms = _complete_times(lights, table, repairs)
+    known = np.flatnonzero(np.isfinite(times_ms))
+    order = known[np.argsort(times_ms[known], kind="stable")]
+    codes = np.stack([table[name][order] for name in columns.values()])
     states = np.full(codes.shape, SignalState.UNKNOWN, dtype=np.int8)
     for code, state in STATES.items():
         states[codes == code] = state
@@ -164,11 +181,49 @@ def _signals(lights: Path, stop_lines: Path | None, repairs: list[str]) -> Signa
             f"{count} states of lights have unknown numbers ({shorten([f'{o:g}' for o in odd])}), "
             "expected 0, 1 or 3: read as unknown"
         )
-    lines = np.full((len(columns), 2, 2), np.nan)
+    return times_ms[order], dict(zip(columns, states, strict=True))
+
+
+def _complete_times(
+    lights: Path, table: Mapping[str, np.ndarray], repairs: list[str]
+) -> Float[np.ndarray, " rows"]:
+    """The times of all rows, ms: where one is empty it follows from the frame, else it is NaN.
+
+    Frames and times are those of one video, so that the times are a line over the frames.
+    """
+    times_ms, frames = table[_TIME].copy(), table.get(_FRAME)
+    missing = ~np.isfinite(times_ms)
+    if not missing.any():
+        return times_ms
+    usable = None if frames is None else ~missing & np.isfinite(frames)
+    if frames is not None and usable is not None and len(np.unique(frames[usable])) > 1:
+        rate, offset = np.polyfit(frames[usable], times_ms[usable], 1)
+        times_ms[missing] = offset + rate * frames[missing]
+    left_out = int((~np.isfinite(times_ms)).sum())
+    if found := int(missing.sum()) - left_out:
+        repairs.append(f"{found} rows of {lights.name} have no time, which follows from {_FRAME}")
+    if left_out:
+        repairs.append(f"{left_out} rows of {lights.name} have no time and are left out")
+    return times_ms
+
+
+def _placed(
+    lights: Path,
+    times_ms: Float[np.ndarray, " changes"],
+    states: Mapping[int, Int8[np.ndarray, " changes"]],
+    stop_lines: Path | None,
+    repairs: list[str],
+) -> SignalChanges:
+    """The lights with the stop lines that the user's own file gives.
+
+    Raises:
+        DataError: that file is damaged.
+    """
+    numbers = list(states)
+    lines = np.full((len(numbers), 2, 2), np.nan)
     if stop_lines is not None:
         kinds: dict[str, Kind] = dict.fromkeys(("x1", "y1", "x2", "y2"), "number")
         given = read_table(stop_lines, {"signal": "whole", **kinds})
-        numbers = [int(_LIGHT.findall(name)[0]) for name in columns]
         for row, number in enumerate(given["signal"].tolist()):
             if number not in numbers:
                 raise DataError(
@@ -180,7 +235,7 @@ def _signals(lights: Path, stop_lines: Path | None, repairs: list[str]) -> Signa
     unknown = int(np.isnan(lines[:, 0, 0]).sum())
     if unknown:
         repairs.append(
-            f"{unknown} of {len(columns)} lights have no stop line, so that scenes do not show "
+            f"{unknown} of {len(numbers)} lights have no stop line, so that scenes do not show "
             f"them: give the lines in {STOP_LINES}"
         )
-    return SignalChanges(stop_lines=lines, time_ms=table[_TIME][order], states=states)
+    return SignalChanges(stop_lines=lines, time_ms=times_ms, states=np.stack([*states.values()]))

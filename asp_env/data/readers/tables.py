@@ -18,6 +18,7 @@ from jaxtyping import Float, Int
 
 from asp_env.data.readers.ranges import Limit
 from asp_env.errors import DataError
+from asp_env.stored import brief
 
 Kind = Literal["id", "whole", "number", "number or empty", "text"]
 """What the cells of a column must be: whole numbers of any size, whole numbers below `EXACT`,
@@ -175,6 +176,49 @@ def number_ids(*columns: np.ndarray) -> NumberedIds:
         np.array([numbers[name] for name in column.tolist()], dtype=np.int64) for column in columns
     )
     return NumberedIds(columns=numbered, originals=tuple(known))
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class NumberedTexts:
+    """Ids that may be any texts, as whole numbers."""
+
+    numbers: Float[np.ndarray, " rows"]
+    """The number of each id."""
+    texts: dict[int, str]
+    """The id in the files of each number."""
+    repairs: tuple[str, ...]
+    """A line if ids are numbers, but not those that they have in the files."""
+
+
+def number_texts(ids: np.ndarray) -> NumberedTexts:
+    """Converts ids that may be any texts to numbers.
+
+    Whole numbers below `EXACT` stay. Other texts, such as P1, larger numbers, and texts of a
+    number that another text has already, such as 01 beside 1, get numbers above these in order of
+    appearance.
+
+    Args:
+        ids: (rows,) texts.
+    """
+    codes, known = pd.factorize(ids)
+    values = np.array(pd.to_numeric(pd.Series(known), errors="coerce"), dtype=np.float64)
+    is_number = np.isfinite(values)
+    stays = is_number & (values == np.floor(values)) & (np.abs(values) < EXACT)
+    is_first = np.zeros(len(values), dtype=bool)
+    is_first[np.unique(values, return_index=True)[1]] = True
+    stays &= is_first
+    start = int(values[stays].max(initial=-1)) + 1
+    values[~stays] = start + np.arange((~stays).sum())
+    renumbered = np.flatnonzero(is_number & ~stays)
+    repairs = ()
+    if len(renumbered):
+        example = renumbered[0]
+        repairs = (
+            f"{len(renumbered)} track ids are no whole numbers below {EXACT:,} or equal others: "
+            f"they are numbered from {start} on, such as {known[example]} as {values[example]:g}",
+        )
+    texts = dict(zip(values.astype(np.int64).tolist(), map(str, known), strict=True))
+    return NumberedTexts(numbers=values[codes], texts=texts, repairs=repairs)
 
 
 def find_line(path: Path, cells: Mapping[str, object], *, occurrence: int = 1) -> int:
@@ -428,8 +472,8 @@ def _diagnose(
             if expected := _expected(row[index], kind, limits.get(name)):
                 more = _count_beyond(path, index, limits.get(name))
                 raise DataError(
-                    f"{path}, line {number}: {name} is {row[index]!r}{more}, expected {expected}; "
-                    "correct the line or remove it"
+                    f"{path}, line {number}: {name} is {brief(repr(row[index]))}{more}, expected "
+                    f"{expected}; correct the line or remove it"
                 )
 
 

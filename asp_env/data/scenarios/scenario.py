@@ -4,6 +4,7 @@ import dataclasses
 import difflib
 import math
 import re
+import warnings
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
@@ -19,6 +20,13 @@ MAX_LENGTH_S = 15.0
 
 MIN_LENGTH_S = 4.0
 """Shortest scenario. Chosen by hand."""
+
+SHORT_HISTORY_S = 0.6
+"""History of scenarios and snippets of data whose recordings are all too short for the usual one,
+such as the cases of INTERACTION 1.2, 4 s. A multiple of all usual time steps."""
+
+SHORT_LENGTH_S = 2.0
+"""Shortest scenario of such data. Chosen by hand."""
 
 MIN_DISTANCE_M = 10.0
 """Shortest distance that the ego drives in a scenario. Chosen by hand: parking is left out."""
@@ -294,9 +302,17 @@ class ScenarioSet:
         Raises:
             AspEnvError: no scenario has this name; the message lists similar ones.
         """
+        return self[self.index_of(name)]
+
+    def index_of(self, name: str) -> int:
+        """The row of the scenario with a name.
+
+        Raises:
+            AspEnvError: no scenario has this name; the message lists similar ones.
+        """
         names = [each.name for each in self]
         if name in names:
-            return self[names.index(name)]
+            return names.index(name)
         near = difflib.get_close_matches(name, names, n=3, cutoff=0.0)
         raise AspEnvError(
             f"unknown scenario {name!r}: {len(self)} are known, such as {', '.join(near) or 'none'}"
@@ -317,6 +333,9 @@ def find_scenarios(
     15 s, from the first tick that has a full history. Windows of at least 4 s in which the vehicle
     drives at least 10 m become scenarios.
 
+    If no recording lasts as long as the history and 4 s, the history is 0.6 s, windows last at
+    least 2 s, and a warning says so.
+
     Args:
         recordings: the recordings.
         source: the data as the user named them.
@@ -327,17 +346,26 @@ def find_scenarios(
     Returns:
         The scenarios with their tags and columns, sorted by recording, track and start.
     """
-    found = []
+    found, shortest_s = [], MIN_LENGTH_S
+    if all_shorter(recordings, history * dt_s + MIN_LENGTH_S):
+        history, shortest_s = short_history(history, dt_s), SHORT_LENGTH_S
     for number, recording in enumerate(recordings):
         stride = frames_per_tick(recording.frame_rate_hz, dt_s)
         ticks_allowed = None if allowed is None else allowed[number]
         for track in np.flatnonzero(recording.predicted).tolist():
             first, last = track_ticks(recording, track, stride)
-            windows = _windows(first, last, history, dt_s, ticks_allowed)
+            windows = _windows(first, last, history, (shortest_s, dt_s), ticks_allowed)
             found += [(number, track, start, length) for start, length in windows]
     rows = np.array(found, dtype=np.int64).reshape(-1, 4)
     scenarios = make_scenarios(recordings, rows, source=source, dt_s=dt_s, history=history)
     scenarios = scenarios.select(scenarios.column("distance_m") >= MIN_DISTANCE_M)
+    if len(scenarios) and shortest_s < MIN_LENGTH_S:
+        warnings.warn(
+            f"data {source!r}: no recording lasts {MIN_LENGTH_S:g} s after the usual history, so "
+            f"that scenarios last {shortest_s:g} s or more after {history * dt_s:g} s of history; "
+            "constant velocity takes the place of forecasts that need a longer one",
+            stacklevel=2,
+        )
     return dataclasses.replace(scenarios, seed=np.arange(len(scenarios)))
 
 
@@ -396,11 +424,30 @@ def track_ticks(recording: Recording, track: int, stride: int) -> tuple[int, int
     return first, int(recording.last_frames[track]) // stride
 
 
+def all_shorter(recordings: Sequence[Recording], least_s: float) -> bool:
+    """Whether every recording is too short for a window of some seconds."""
+    lasting = (each.num_frames - 1 >= least_s * each.frame_rate_hz - 1e-6 for each in recordings)
+    return not any(lasting)
+
+
+def short_history(history: int, dt_s: float) -> int:
+    """The history of data whose recordings are all too short for the usual one, in ticks."""
+    return min(history, round(SHORT_HISTORY_S / dt_s))
+
+
 def _windows(
-    first: int, last: int, history: int, dt_s: float, allowed: Bool[np.ndarray, " ticks"] | None
+    first: int,
+    last: int,
+    history: int,
+    durations_s: tuple[float, float],
+    allowed: Bool[np.ndarray, " ticks"] | None,
 ) -> Iterator[tuple[int, int]]:
-    """(start, length) of the windows within the allowed ones of the ticks first to last."""
-    longest, shortest = int(MAX_LENGTH_S / dt_s + 1e-6), math.ceil(MIN_LENGTH_S / dt_s - 1e-6)
+    """(start, length) of the windows within the allowed ones of the ticks first to last.
+
+    The durations are that of the shortest window and that of a tick.
+    """
+    shortest_s, dt_s = durations_s
+    longest, shortest = int(MAX_LENGTH_S / dt_s + 1e-6), math.ceil(shortest_s / dt_s - 1e-6)
     usable = np.ones(last - first + 1, dtype=bool) if allowed is None else allowed[first : last + 1]
     edges = np.flatnonzero(np.diff(usable, prepend=False, append=False)) + first
     for begin, end in edges.reshape(-1, 2).tolist():

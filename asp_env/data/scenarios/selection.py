@@ -16,16 +16,20 @@ from asp_env.data.classes import PREDICTED, AgentClass
 from asp_env.data.recording import Recording, frames_per_tick
 from asp_env.data.scenarios.scenario import (
     MAX_LENGTH_S,
+    MIN_LENGTH_S,
     Scenario,
     ScenarioFilter,
     ScenarioSet,
+    all_shorter,
     find_scenarios,
     make_scenarios,
+    short_history,
     track_ticks,
 )
 from asp_env.data.source import Recordings
 from asp_env.errors import AspEnvError, DataError
 from asp_env.files import atomic_file
+from asp_env.stored import parse_json
 
 SUFFIX = ".json"
 """Suffix of scenario files."""
@@ -49,7 +53,8 @@ def choose_scenarios(
     Args:
         recordings: the recordings.
         selection: a `ScenarioFilter` as text, or the path of a file written by `save_scenarios`,
-            which ends in `.json`; empty for everything that `find_scenarios` finds.
+            which ends in `.json`, or `FILE.json#NAME` for one scenario of a file; empty for
+            everything that `find_scenarios` finds.
         dt_s: seconds per tick.
         history: number of ticks of history before each start.
         allowed: of each recording, a mask of the ticks that scenarios and histories may use.
@@ -59,8 +64,12 @@ def choose_scenarios(
             other ticks than those allowed.
         DataError: the file cannot be read, or belongs to other recordings.
     """
-    if selection.strip().endswith(SUFFIX):
-        scenarios = load_scenarios(Path(selection.strip()), recordings, dt_s=dt_s, history=history)
+    path, is_one, name = selection.strip().partition(SUFFIX + "#")
+    path += SUFFIX if is_one else ""
+    if path.endswith(SUFFIX):
+        scenarios = load_scenarios(Path(path), recordings, dt_s=dt_s, history=history)
+        if is_one:
+            scenarios = scenarios.select(np.array([scenarios.index_of(name)]))
         if allowed is not None:
             _check_allowed(scenarios, allowed, selection)
         return scenarios
@@ -210,14 +219,15 @@ def load_scenarios(path: Path, recordings: Recordings, *, dt_s: float, history: 
         path: the file.
         recordings: recordings that include those of the file.
         dt_s: seconds per tick, which must be the file's.
-        history: number of ticks of history before each start, at most the file's.
+        history: number of ticks of history before each start, at most the file's unless all
+            recordings are too short for it.
 
     Raises:
         DataError: the file is missing or damaged, has another time step, or belongs to recordings
             with other content.
     """
     try:
-        head = json.loads(path.read_text())
+        head = parse_json(path.read_bytes())
         table = np.array(head["scenarios"], dtype=np.int64).reshape(-1, len(_FIELDS))
         contents = [(str(name), str(content)) for name, content in head["recordings"]]
         version, file_dt_s, file_history = (
@@ -235,12 +245,17 @@ def load_scenarios(path: Path, recordings: Recordings, *, dt_s: float, history: 
         ) from error
     if version != FORMAT:
         raise DataError(f"{path}: scenarios of format {version}, expected {FORMAT}")
-    if abs(file_dt_s - dt_s) > 1e-9 or file_history < history:
-        raise DataError(
-            f"{path}: made for ticks of {file_dt_s:g} s with {file_history} of history, expected "
-            f"{dt_s:g} s and {history}"
-        )
+    wrong_ticks = DataError(
+        f"{path}: made for ticks of {file_dt_s:g} s with {file_history} of history, expected "
+        f"{dt_s:g} s and {history}"
+    )
+    if abs(file_dt_s - dt_s) > 1e-9 or file_history < short_history(history, dt_s):
+        raise wrong_ticks
     indices = _recording_indices(path, contents, recordings)
+    if all_shorter(recordings, history * dt_s + MIN_LENGTH_S):
+        history = min(history, file_history)
+    elif file_history < history:
+        raise wrong_ticks
     rows = _table_rows(path, table, indices, recordings, dt_s=dt_s, history=history)
     return make_scenarios(
         recordings, rows, source=recordings.source, dt_s=dt_s, history=history, seeds=table[:, 4]

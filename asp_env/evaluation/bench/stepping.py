@@ -12,7 +12,7 @@ from asp_env.dynamics import forward, inverse
 from asp_env.evaluation.bench.timing import Rate, median_s
 from asp_env.evaluation.selection import no_data_error
 from asp_env.geometry import box_corners
-from asp_env.metrics.drivable import CELL_M, MARGIN_M, drivable_field
+from asp_env.metrics.drivable import CELL_M, MARGIN_M, TILE_CELLS, drivable_field
 from asp_env.sim.simulation import Simulation
 from asp_env.sim.traffic.assignment import make_traffic
 
@@ -244,9 +244,11 @@ def _plain_numpy(recordings: Sequence[Recording], episodes: int, agents: int, dt
         overlaps_first(moved, corners)
         cells = (corners[:, 0] - np.array(field.origin_m)) / CELL_M + 0.5
         column, row = np.floor(np.moveaxis(cells, -1, 0)).astype(int)
-        rows, columns = field.outside_m.shape
+        rows, columns = field.shape
         inside = (row >= 0) & (row < rows) & (column >= 0) & (column < columns)
-        looked_up = field.outside_m[np.where(inside, row, 0), np.where(inside, column, 0)]
+        row, column = np.where(inside, row, 0), np.where(inside, column, 0)
+        tiles = field.tile_of[row // TILE_CELLS, column // TILE_CELLS]
+        looked_up = field.tiles[tiles, row % TILE_CELLS, column % TILE_CELLS]
         np.where(inside, looked_up, MARGIN_M).max(axis=-1)
 
     return episodes / median_s(step)

@@ -305,9 +305,7 @@ def _write(config: Benchmark, folder: Path) -> tuple[list[BenchmarkRow], list[st
         privileged=privileged,
         drives={each.manifest["planner"]: each.manifest for each in results},
     )
-    write_scenario_table(
-        folder, first.scenarios, [method for each in written for method in each.methods]
-    )
+    write_scenario_table(folder, [each.driven for each in written])
     for each in written:
         save_rollouts(folder, each)
     maps = {name: road_map for each in results for name, road_map in each.maps.items()}

@@ -5,13 +5,14 @@ other or on the number of processes, and networks run on one thread, so results 
 for bit however the units are distributed.
 """
 
+import dataclasses
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
 from typing import Any, final
 
 import numpy as np
-from jaxtyping import Int
+from jaxtyping import Float, Int
 
 from asp_env.data.predictor import Predictor
 from asp_env.data.recording import ticks
@@ -19,9 +20,10 @@ from asp_env.data.rollout import Rollout
 from asp_env.data.scenarios.scenario import Scenario, ScenarioSet
 from asp_env.data.snippets import HISTORY_S
 from asp_env.data.source import Recordings
+from asp_env.evaluation.closed_loop.containment import Fault
 from asp_env.evaluation.closed_loop.episodes import EpisodeSettings, drive_episodes
-from asp_env.evaluation.results import FALLBACK
-from asp_env.evaluation.selection import load_predictors
+from asp_env.evaluation.results import FALLBACK, FAULTY
+from asp_env.evaluation.selection import load_predictors, short_names
 from asp_env.metrics.driving.rules import Rules, find_rules
 from asp_env.metrics.driving.scores import driving_metrics
 from asp_env.metrics.masked import Masked
@@ -35,7 +37,11 @@ EPISODES_AT_ONCE = 16
 processes finish at about the same time, and larger ones are no faster."""
 
 SAVED_ROLLOUTS = 6
-"""Number of scenarios whose rollouts are saved, for every method."""
+"""Number of the worst scenarios, whose rollouts are saved for every method."""
+
+TELLING_ROLLOUTS = 3
+"""Number of scenarios with the largest gains over the reference whose rollouts are saved as well,
+and of those with the largest losses."""
 
 EXPERT = "expert"
 """Name of the planner that replays the logged ego; the reference of every comparison."""
@@ -73,6 +79,8 @@ class EpisodeScores:
     """Values (b,) by name."""
     endings: tuple[Ending, ...]
     rollouts: tuple[Rollout, ...]
+    faults: tuple[Fault | None, ...]
+    """The first fault of each episode, where faults are contained."""
 
 
 @final
@@ -99,6 +107,9 @@ class Methods:
         rules: str,
         horizon_s: float,
         dt_s: float,
+        contain_faults: bool = False,
+        budget_ms: float | None = None,
+        measure_forecasts: bool = False,
     ) -> None:
         """Loads the planner and the predictors, but opens no data.
 
@@ -111,6 +122,10 @@ class Methods:
             rules: name of the driving rules.
             horizon_s: horizon of forecasts and plans in seconds.
             dt_s: duration of a tick in seconds.
+            contain_faults: as of `EpisodeSettings`.
+            budget_ms: as of `EpisodeSettings`.
+            measure_forecasts: as of `EpisodeSettings`. If the planner is the expert, the methods
+                are then the forecasts of each predictor while it is replayed.
 
         Raises:
             AspEnvError: a name is unknown, something cannot be loaded, or the options do not fit.
@@ -123,6 +138,9 @@ class Methods:
             "rules": rules,
             "horizon_s": horizon_s,
             "dt_s": dt_s,
+            "contain_faults": contain_faults,
+            "budget_ms": budget_ms,
+            "measure_forecasts": measure_forecasts,
         }
         world = world_class(data)
         self.settings = EpisodeSettings(
@@ -132,6 +150,9 @@ class Methods:
             horizon=ticks(horizon_s, dt_s),
             history=ticks(HISTORY_S, dt_s),
             dt_s=dt_s,
+            contain_faults=contain_faults,
+            budget_ms=budget_ms,
+            measure_forecasts=measure_forecasts,
         )
         chosen = load_planner(planner)
         runs = [run for names in predictors.values() for run in names]
@@ -141,8 +162,9 @@ class Methods:
             for each in loaded if chosen.uses_forecasts else []:
                 chosen.check_predictor(each)
         alone = partial(Method, predictor=loaded[0], predictor_name="", run="")
-        methods = [alone(planner=load_planner(EXPERT))]
-        if chosen.uses_forecasts:
+        at_log = chosen.privileged and measure_forecasts
+        methods = [] if at_log else [alone(planner=load_planner(EXPERT))]
+        if chosen.uses_forecasts or at_log:
             methods += [
                 Method(
                     planner=chosen,
@@ -156,6 +178,15 @@ class Methods:
         elif not chosen.privileged:
             methods.append(alone(planner=chosen))
         self.all: tuple[Method, ...] = tuple(methods)
+
+    @property
+    def labels(self) -> list[str]:
+        """A short name for every run of every method."""
+        short = short_names([*self.predictors])
+        return [
+            " + ".join([method.planner.name, *([short[method.run]] if method.run else [])])
+            for method in self.all
+        ]
 
     def __reduce__(self) -> tuple[Any, ...]:
         return partial(Methods, **self._options), ()
@@ -171,15 +202,26 @@ class Methods:
             AspEnvError: the data do not suit a predictor or a driver.
         """
         method = self.all[unit.method]
+        measured = self.settings.measure_forecasts and bool(method.run)
+        settings = dataclasses.replace(self.settings, measure_forecasts=measured)
         with one_thread():
             driven = drive_episodes(
-                recordings, unit.scenarios, method.planner, method.predictor, self.settings
+                recordings, unit.scenarios, method.planner, method.predictor, settings
             )
         metrics = driving_metrics(driven.drives, self.settings.rules)
+        faulty = np.array([fault is not None for fault in driven.faults])
+        contained = np.full(len(faulty), self.settings.contain_faults)
         return EpisodeScores(
-            metrics={**metrics, **driven.realism, FALLBACK: driven.fallback},
+            metrics={
+                **metrics,
+                **driven.realism,
+                FALLBACK: driven.fallback,
+                FAULTY: Masked(value=faulty.astype(np.float64), valid=contained),
+                **driven.forecasts,
+            },
             endings=tuple(Ending(kind) for kind in driven.endings.tolist()),
             rollouts=driven.rollouts,
+            faults=driven.faults,
         )
 
 
@@ -207,27 +249,41 @@ def work_units(scenarios: ScenarioSet, methods: int) -> list[WorkUnit]:
 
 @final
 class ComparisonScores:
-    """Scores of all methods in all scenarios, and the rollouts of the worst scenarios.
+    """Scores of all methods in all scenarios, and the rollouts of the worst and most telling ones.
 
     A method of several training runs counts once for each of them. The worst scenarios have the
     lowest mean score over the methods. The expert counts only if it
-    is the only method. Rules without a score use the product of three metrics instead: no
-    collision, on road and progress.
+    is the only method. The most telling scenarios are those in which one of the methods under test
+    gains most over the reference, and those in which one loses most. Rules without a score use the
+    product of three metrics instead: no collision, on road and progress.
     """
 
-    def __init__(self, methods: int, rules: Rules) -> None:
+    def __init__(
+        self,
+        methods: int,
+        rules: Rules,
+        *,
+        under_test: Sequence[int] = (),
+        reference: int | None = None,
+    ) -> None:
         """Creates an empty collection.
 
         Args:
             methods: number of methods.
             rules: the driving rules.
+            under_test: indices of the methods that are compared with the reference.
+            reference: index of the reference; None for no most telling scenarios.
         """
         self._methods = methods
+        self._under_test = [*under_test]
+        self._reference = reference
+        self._gains: list[_Ranked] = []
+        self._losses: list[_Ranked] = []
         self._ranked_by = ("score",) if rules.weights else ("no collision", "on road", "progress")
         self._incomplete: dict[int, dict[int, EpisodeScores]] = {}
         self._numbers: list[Int[np.ndarray, " b"]] = []
         self._complete: list[Sequence[EpisodeScores]] = []
-        self._worst: list[tuple[float, int, tuple[Rollout, ...]]] = []
+        self._worst: list[_Ranked] = []
 
     def add(self, unit: WorkUnit, scores: EpisodeScores) -> None:
         """Adds the scores of a work unit; units may come in any order."""
@@ -241,34 +297,44 @@ class ComparisonScores:
     def _complete_unit(
         self, numbers: Int[np.ndarray, " b"], by_method: Sequence[EpisodeScores]
     ) -> None:
-        """Stores the scores of all methods in the same scenarios, and the worst rollouts."""
-        products = [
-            np.prod([scores.metrics[name].value for name in self._ranked_by], axis=0)
-            for scores in by_method[1:] or by_method
-        ]
-        means = np.mean(products, axis=0).tolist()
-        rollouts = zip(*(scores.rollouts for scores in by_method), strict=True)
-        ranked = zip(means, numbers.tolist(), rollouts, strict=True)
-        worst = sorted([*self._worst, *ranked], key=lambda each: each[:2])
-        self._worst = worst[:SAVED_ROLLOUTS]
-        self._numbers.append(numbers)
-        self._complete.append(
+        """Stores the scores of all methods in the same scenarios, and the rollouts to be saved."""
+        products = np.stack(
             [
-                EpisodeScores(metrics=scores.metrics, endings=scores.endings, rollouts=())
+                np.prod([scores.metrics[name].value for name in self._ranked_by], axis=0)
                 for scores in by_method
             ]
         )
+        rollouts = [*zip(*(scores.rollouts for scores in by_method), strict=True)]
+        means = products[min(1, self._methods - 1) :].mean(axis=0)
+        self._worst = _lowest([*self._worst, *_ranked(means, numbers, rollouts)], SAVED_ROLLOUTS)
+        if self._reference is not None and self._under_test:
+            gains = products[self._under_test] - products[self._reference]
+            up = _ranked(-gains.max(axis=0), numbers, rollouts)
+            down = _ranked(gains.min(axis=0), numbers, rollouts)
+            self._gains = _lowest([*self._gains, *_below_zero(up)], TELLING_ROLLOUTS)
+            self._losses = _lowest([*self._losses, *_below_zero(down)], TELLING_ROLLOUTS)
+        self._numbers.append(numbers)
+        self._complete.append([dataclasses.replace(scores, rollouts=()) for scores in by_method])
 
     @property
-    def worst(self) -> list[int]:
-        """Indices of the scenarios whose rollouts are stored, the worst first."""
-        return [number for _, number, _ in self._worst]
+    def saved(self) -> list[int]:
+        """Indices of the scenarios whose rollouts are stored.
+
+        The worst are first, then those with the largest gains, then those with the largest losses.
+        """
+        return [*self._saved()]
+
+    def _saved(self) -> dict[int, tuple[Rollout, ...]]:
+        """The stored rollouts of all methods by the index of their scenario."""
+        ranked = (*self._worst, *self._gains, *self._losses)
+        return {number: rollouts for _, number, rollouts in ranked}
 
     def of(self, method: int) -> EpisodeScores:
-        """Scores of a method in all scenarios, in their order, with the rollouts of the worst."""
+        """Scores of a method in all scenarios, in their order, with the rollouts of `saved`."""
         order = np.argsort(np.concatenate(self._numbers))
         parts = [by_method[method] for by_method in self._complete]
         endings = [ending for part in parts for ending in part.endings]
+        faults = [fault for part in parts for fault in part.faults]
         return EpisodeScores(
             metrics={
                 name: Masked(
@@ -278,5 +344,26 @@ class ComparisonScores:
                 for name in parts[0].metrics
             },
             endings=tuple(endings[i] for i in order.tolist()),
-            rollouts=tuple(rollouts[method] for _, _, rollouts in self._worst),
+            faults=tuple(faults[i] for i in order.tolist()),
+            rollouts=tuple(rollouts[method] for rollouts in self._saved().values()),
         )
+
+
+_Ranked = tuple[float, int, tuple[Rollout, ...]]
+"""A value by which scenarios are ranked, the index of a scenario, its rollouts by method."""
+
+
+def _ranked(
+    values: Float[np.ndarray, " b"],
+    numbers: Int[np.ndarray, " b"],
+    rollouts: Sequence[tuple[Rollout, ...]],
+) -> list[_Ranked]:
+    return [*zip(values.tolist(), numbers.tolist(), rollouts, strict=True)]
+
+
+def _lowest(ranked: Sequence[_Ranked], count: int) -> list[_Ranked]:
+    return sorted(ranked, key=lambda each: each[:2])[:count]
+
+
+def _below_zero(ranked: Sequence[_Ranked]) -> list[_Ranked]:
+    return [each for each in ranked if each[0] < 0]

@@ -27,10 +27,15 @@ from asp_env.evaluation.closed_loop.comparison import (
     WorkUnit,
     work_units,
 )
-from asp_env.evaluation.closed_loop.scenario_table import write_scenario_table
-from asp_env.evaluation.closed_loop.summary import Comparison, MethodScores, comparison_rows
+from asp_env.evaluation.closed_loop.scenario_table import DrivenScenarios, write_scenario_table
+from asp_env.evaluation.closed_loop.summary import (
+    Comparison,
+    MethodScores,
+    comparison_rows,
+    scores_by_method,
+)
 from asp_env.evaluation.hard import HARD_NOTE, is_hard, select_scenarios
-from asp_env.evaluation.ladder import BASELINE, missing_controls
+from asp_env.evaluation.ladder import BASELINE, is_under_test, missing_controls
 from asp_env.evaluation.report import check_report_possible, write_report
 from asp_env.evaluation.results import (
     SCORE,
@@ -44,7 +49,6 @@ from asp_env.evaluation.selection import (
     PartChoice,
     expand_runs,
     no_data_error,
-    short_names,
     ticks_to_evaluate,
     with_fallback,
 )
@@ -83,7 +87,8 @@ class Drive:
     The default is log for recordings and own for highway:…."""
     scenarios: Annotated[str, tyro.conf.arg(metavar="FILTER|FILE")] = ""
     """Tags and comparisons, such as 'left,!stopping,length>=8',
-    or the scenarios.json of another run. The default is all;
+    or the scenarios.json of another run, or scenarios.json#NAME
+    for one scenario of it. The default is all;
     hard are interactive ones in which constant velocity fails."""
     max_scenarios: int | None = None
     """Largest number of scenarios; they are chosen at even spacing."""
@@ -118,7 +123,7 @@ class Drive:
             write_metrics(folder, result.rows)
             write_manifest(folder, "drive", **result.manifest)
             save_scenarios(folder / "scenarios.json", result.scenarios, result.recordings)
-            write_scenario_table(folder, result.scenarios, result.methods)
+            write_scenario_table(folder, [result.driven])
             save_rollouts(folder, result)
             title = f"Driving on {Path(self.data).name}"
             write_report(folder, title=title, lead=note, maps=result.maps)
@@ -143,12 +148,24 @@ class ClosedLoopResult:
     """Scores of all methods in every scenario; the expert is the first."""
     manifest: dict[str, Any]
     rollouts: Mapping[str, tuple[Rollout, ...]]
-    """Rollouts of the worst scenarios, by method; the scenarios are the same for all methods."""
+    """Rollouts of the worst and the most telling scenarios, by method; the scenarios are the same
+    for all methods."""
     maps: dict[str, RoadMap]
     """Maps of the rollouts by recording name."""
     scenarios: ScenarioSet
     """All scenarios that were driven."""
     recordings: Recordings
+
+    @property
+    def driven(self) -> DrivenScenarios:
+        """The scenarios with the scores of all methods."""
+        return DrivenScenarios(
+            data=self.manifest["data"],
+            traffic=self.manifest["traffic"],
+            latency_ticks=0,
+            scenarios=self.scenarios,
+            methods=self.methods,
+        )
 
 
 def drive(config: Drive) -> ClosedLoopResult:
@@ -179,12 +196,13 @@ def drive(config: Drive) -> ClosedLoopResult:
     run_unit = partial(methods.drive, recordings)
     with WorkerPool(run_unit, config.jobs) if config.jobs > 1 else nullcontext() as pool:
         chosen, part = _choose_scenarios(config, recordings, methods)
-        scores = _drive_all(pool, run_unit, chosen, methods)
+        reference = config.reference or BASELINE
+        scores = _drive_all(pool, run_unit, chosen, methods, reference)
     by_run = [scores.of(number) for number in range(len(methods.all))]
-    by_method = _by_method(methods, by_run)
-    labels = _labels(methods)
+    by_method = scores_by_method(methods, by_run)
+    labels = methods.labels
     rules, predictors = methods.settings.rules, methods.predictors
-    worst = [chosen[number] for number in scores.worst]
+    saved = [chosen[number] for number in scores.saved]
     rows = comparison_rows(_comparison(config, rules, by_method, chosen))
     return ClosedLoopResult(
         rows=rows,
@@ -216,7 +234,7 @@ def drive(config: Drive) -> ClosedLoopResult:
             "intervals": "95 %, bootstrap over recordings and, with several, over training runs",
         },
         rollouts={label: each.rollouts for label, each in zip(labels, by_run, strict=True)},
-        maps={each.recording_name: recordings[each.recording].road_map for each in worst},
+        maps={each.recording_name: recordings[each.recording].road_map for each in saved},
         scenarios=chosen,
         recordings=recordings,
     )
@@ -242,34 +260,6 @@ def _runs_to_drive(config: Drive) -> dict[str, tuple[str, ...]]:
             f"--reference {config.reference}: expected one of the predictors, {', '.join(runs)}"
         )
     return runs
-
-
-def _by_method(methods: Methods, by_run: Sequence[EpisodeScores]) -> list[MethodScores]:
-    """The scores of all runs, grouped by method."""
-    groups: dict[tuple[str, str], list[int]] = {}
-    for number, method in enumerate(methods.all):
-        groups.setdefault((method.planner.name, method.predictor_name), []).append(number)
-    return [
-        MethodScores(
-            planner=planner,
-            predictor=predictor,
-            runs={
-                methods.all[i].run: methods.all[i].predictor if predictor else None for i in numbers
-            },
-            scores=[by_run[i] for i in numbers],
-            stream=position,
-        )
-        for position, ((planner, predictor), numbers) in enumerate(groups.items())
-    ]
-
-
-def _labels(methods: Methods) -> list[str]:
-    """A short name for every run of every method."""
-    short = short_names([*methods.predictors])
-    return [
-        " + ".join([method.planner.name, *([short[method.run]] if method.run else [])])
-        for method in methods.all
-    ]
 
 
 def _comparison(
@@ -320,10 +310,22 @@ def _drive_all(
     run_unit: Callable[[WorkUnit], EpisodeScores],
     scenarios: ScenarioSet,
     methods: Methods,
+    reference: str,
 ) -> ComparisonScores:
     """Drives all work units in the processes of the pool, or without one in this process."""
     units = work_units(scenarios, len(methods.all))
-    scores = ComparisonScores(len(methods.all), methods.settings.rules)
+    names = [method.predictor_name for method in methods.all]
+    scores = ComparisonScores(
+        len(methods.all),
+        methods.settings.rules,
+        under_test=[
+            number
+            for number, method in enumerate(methods.all)
+            if names[number] != reference
+            and is_under_test(names[number], privileged=method.predictor.privileged)
+        ],
+        reference=names.index(reference) if reference in names else None,
+    )
     with Progress(transient=True) as progress:
         task = progress.add_task("driving", total=len(methods.all) * len(scenarios))
         found = pool.map(units) if pool is not None else map(run_unit, units)

@@ -13,6 +13,8 @@ from asp_env.data.rollout import Rollout
 from asp_env.data.scenarios.scenario import Scenario
 from asp_env.data.scene import EGO, Scene
 from asp_env.data.snippets import Future
+from asp_env.evaluation.closed_loop.containment import Containment, Fault, coasting_plan
+from asp_env.evaluation.closed_loop.forecast_quality import forecast_quality
 from asp_env.metrics.drivable import OFF_ROAD_M
 from asp_env.metrics.driving.cost import log_route_m
 from asp_env.metrics.driving.map_context import map_context
@@ -61,6 +63,14 @@ class EpisodeSettings:
     history: int
     """Number of ticks of history; a predictor that needs more is shown more."""
     dt_s: float
+    contain_faults: bool = False
+    """Whether a faulty predictor or planner is filled in for by constant velocity, and its episodes
+    are marked, instead of raising; see `asp_env.evaluation.closed_loop.containment`."""
+    budget_ms: float | None = None
+    """Largest wall time of a forecast and of a plan, with `contain_faults`; None for no limit."""
+    measure_forecasts: bool = False
+    """Whether the forecasts are measured, see `asp_env.evaluation.closed_loop.forecast_quality`;
+    they are then made while an expert is replayed, too."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -86,6 +96,10 @@ class DrivenEpisodes:
     endings: Int[np.ndarray, " b"]
     """`Ending` of each episode."""
     rollouts: tuple[Rollout, ...]
+    faults: tuple[Fault | None, ...]
+    """The first fault of each episode; None for one without."""
+    forecasts: Mapping[str, Masked]
+    """Measures of the forecasts (b,), if they are measured."""
 
 
 def drive_episodes(
@@ -123,14 +137,25 @@ def drive_episodes(
     decisions: list[Decision] = []
     endings = np.zeros(len(scenarios), dtype=np.int64)
     active = [np.ones(len(scenarios), dtype=bool)]
+    containment = None
+    if settings.contain_faults:
+        containment = Containment(len(scenarios), budget_ms=settings.budget_ms)
     while (endings == Ending.RUNNING).any():
         running = endings == Ending.RUNNING
         actions = np.zeros((len(scenarios), 2), dtype=np.float32)
-        if not planner.privileged:
+        if not planner.privileged or settings.measure_forecasts:
             last_plan = decisions[-1].plan if decisions else None
             decisions.append(
-                _decide(simulation, running, planner, predictor, settings.horizon, last_plan)
+                _decide(
+                    simulation,
+                    running,
+                    (planner, predictor),
+                    settings.horizon,
+                    last_plan,
+                    containment,
+                )
             )
+        if not planner.privileged:
             actions = decisions[-1].plan.actions[:, 0].astype(np.float32)
         simulation.step(actions, running & (not planner.privileged))
         events.append(world.events())
@@ -138,11 +163,14 @@ def drive_episodes(
         endings = np.where(running, ending(events[-1]), endings)
     drives = _measure(world, events, np.stack(active, axis=1), settings.rules)
     flags = _event_flags(drives, settings.rules)
+    made = [decision.forecast for decision in decisions]
     return DrivenEpisodes(
         drives=drives,
         realism=traffic_realism(world, drives.active),
-        fallback=fallback_share([each.forecast for each in decisions], len(scenarios)),
+        fallback=fallback_share(made, len(scenarios)),
+        forecasts=_measured(world, made, drives.active) if settings.measure_forecasts else {},
         endings=endings,
+        faults=(None,) * len(scenarios) if containment is None else tuple(containment.faults),
         rollouts=tuple(
             _rollout(world, scenario, b, int(drives.active[b].sum()), flags[b], decisions)
             for b, scenario in enumerate(scenarios)
@@ -150,14 +178,24 @@ def drive_episodes(
     )
 
 
+def _measured(
+    world: World, forecasts: Sequence[Forecast], active: Bool[np.ndarray, "b t"]
+) -> dict[str, Masked]:
+    """Measures of the forecasts, by what happens in the episodes."""
+    ticks = slice(world.history, world.history + active.shape[1])
+    valid = world.episodes.valid[:, ticks] & active[..., None]
+    return forecast_quality(forecasts, world.episodes.states[:, ticks], valid)
+
+
 def _decide(
     simulation: Simulation,
     running: Bool[np.ndarray, " b"],
-    planner: Planner,
-    predictor: Predictor,
+    method: tuple[Planner, Predictor],
     horizon: int,
     last_plan: Plan | None,
+    containment: Containment | None,
 ) -> Decision:
+    planner, predictor = method
     scene = simulation.world.scene()
     scene = scene.with_targets(targets_near_egos(scene, running))
     future = None
@@ -166,8 +204,21 @@ def _decide(
         future = simulated_future(simulation, scene, actions, running)
     elif predictor.privileged:
         future = recorded_future(simulation.world, scene, horizon)
-    forecast = forecast_for_planner(predictor, scene, future, horizon)
-    return Decision(running=running, forecast=forecast, plan=planner.plan(scene, forecast))
+    if containment is None:
+        forecast = forecast_for_planner(predictor, scene, future, horizon)
+    else:
+        given = future if predictor.privileged else None
+        made = containment.predict(predictor, scene, given, running)
+        forecast = fill_missing(_cut(made, horizon), scene)
+    if planner.privileged:
+        plan = coasting_plan(scene, horizon)
+    elif containment is None:
+        plan = planner.plan(scene, forecast)
+    else:
+        plan = containment.plan(planner, scene, forecast, running)
+    if containment is not None:
+        containment.next_tick()
+    return Decision(running=running, forecast=forecast, plan=plan)
 
 
 def continued_actions(
@@ -201,12 +252,15 @@ def forecast_for_planner(
         horizon: number of ticks; longer forecasts are cut, so that plans are equally long.
     """
     forecast = predictor.predict(scene, future if predictor.privileged else None)
-    forecast = dataclasses.replace(
+    return fill_missing(_cut(forecast, horizon), scene)
+
+
+def _cut(forecast: Forecast, horizon: int) -> Forecast:
+    return dataclasses.replace(
         forecast,
         states=forecast.states[:, :, :horizon],
         actions=forecast.actions[:, :, :horizon],
     )
-    return fill_missing(forecast, scene)
 
 
 def targets_near_egos(scene: Scene, running: Bool[np.ndarray, " b"]) -> Int[np.ndarray, "t 2"]:
@@ -361,6 +415,33 @@ def _event_flags(drives: EpisodeRecord, rules: Rules) -> Bool[np.ndarray, "b t k
     )
 
 
+def _with_modes(forecast: Forecast, modes: int) -> Forecast:
+    """The same forecast with a number of modes: the first one is divided into equal ones.
+
+    A forecast that is filled in has fewer modes than the predictor's own.
+    """
+    missing = modes - forecast.states.shape[1]
+    if not missing:
+        return forecast
+    index = np.r_[np.zeros(missing, dtype=np.int64), np.arange(forecast.states.shape[1])]
+    log_probs = forecast.log_probs[:, index].copy()
+    log_probs[:, : missing + 1] -= np.log(missing + 1)
+    return dataclasses.replace(
+        forecast,
+        states=forecast.states[:, index],
+        actions=forecast.actions[:, index],
+        log_probs=log_probs.astype(np.float32),
+    )
+
+
+def _stacked(plans: Sequence[Float[np.ndarray, "_ 2"]]) -> Float[np.ndarray, "plans horizon 2"]:
+    """Planned positions of all ticks; shorter plans stay where they end."""
+    if not plans:
+        return np.zeros((0, 1, 2), dtype=np.float32)
+    steps = np.arange(max(len(plan) for plan in plans))
+    return np.stack([plan[np.minimum(steps, len(plan) - 1)] for plan in plans])
+
+
 def _rollout(
     world: World,
     scenario: Scenario,
@@ -374,11 +455,13 @@ def _rollout(
     ticks = slice(world.history, world.history + count)
     agents = int((episodes.ids[b] >= 0).sum())
     made = [(k, decision) for k, decision in enumerate(decisions) if decision.running[b]]
+    modes = max((decision.forecast.states.shape[1] for decision in decisions), default=1)
+    steps = decisions[0].forecast.states.shape[2] if decisions else 1
     forecasts = [
-        (k, decision.forecast, np.flatnonzero(decision.forecast.targets[:, 0] == b))
+        (k, forecast, np.flatnonzero(forecast.targets[:, 0] == b))
         for k, decision in made
+        for forecast in [_with_modes(decision.forecast, modes)]
     ]
-    modes, steps = decisions[0].forecast.states.shape[1:3] if decisions else (1, 1)
     return Rollout(
         scenario=scenario,
         dt_s=world.dt_s,
@@ -390,9 +473,7 @@ def _rollout(
         classes=episodes.classes[b, :agents],
         ids=episodes.ids[b, :agents],
         route=episodes.route[b, episodes.route_valid[b]],
-        plans=np.stack([decision.plan.states[b, :, :2] for _, decision in made])
-        if made
-        else np.zeros((0, 1, 2), dtype=np.float32),
+        plans=_stacked([decision.plan.states[b, :, :2] for _, decision in made]),
         forecast_states=np.concatenate(
             [np.zeros((0, modes, steps, 2), dtype=np.float32)]
             + [forecast.states[rows, ..., :2] for _, forecast, rows in forecasts]

@@ -14,7 +14,7 @@ from asp_env.data.predictor import Predictor
 from asp_env.data.scenarios.scenario import ScenarioSet
 from asp_env.data.scenarios.tags import TAGS
 from asp_env.evaluation import ladder, statistics
-from asp_env.evaluation.closed_loop.comparison import EpisodeScores
+from asp_env.evaluation.closed_loop.comparison import EpisodeScores, Methods
 from asp_env.evaluation.results import HEADROOM, ORACLE_SHARE, SCORE, Row, difference_name
 from asp_env.evaluation.selection import shared_metadata
 from asp_env.evaluation.statistics import Difference, Estimate
@@ -46,6 +46,30 @@ class MethodScores:
     def metadata(self, key: str) -> str:
         """An entry of the predictors' metadata; empty without forecasts."""
         return shared_metadata([each for each in self.runs.values() if each is not None], key)
+
+
+def scores_by_method(methods: Methods, by_run: Sequence[EpisodeScores]) -> list[MethodScores]:
+    """The scores of all runs, grouped by method.
+
+    Args:
+        methods: the methods.
+        by_run: scores of each of `methods.all` in all scenarios.
+    """
+    groups: dict[tuple[str, str], list[int]] = {}
+    for number, method in enumerate(methods.all):
+        groups.setdefault((method.planner.name, method.predictor_name), []).append(number)
+    return [
+        MethodScores(
+            planner=planner,
+            predictor=predictor,
+            runs={
+                methods.all[i].run: methods.all[i].predictor if predictor else None for i in numbers
+            },
+            scores=[by_run[i] for i in numbers],
+            stream=position,
+        )
+        for position, ((planner, predictor), numbers) in enumerate(groups.items())
+    ]
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

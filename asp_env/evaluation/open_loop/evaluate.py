@@ -1,5 +1,6 @@
 """`asp-env evaluate`: forecasts compared with the recorded future, on snippets of recordings."""
 
+import warnings
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -13,7 +14,7 @@ from rich.console import Console
 from asp_env.data.histories import History, histories
 from asp_env.data.predictor import Predictor
 from asp_env.data.recording import DEFAULT_DT_S, ticks
-from asp_env.data.scenarios.scenario import find_scenarios
+from asp_env.data.scenarios.scenario import SHORT_HISTORY_S, all_shorter, find_scenarios
 from asp_env.data.snippets import (
     HISTORY_S,
     SnippetIndex,
@@ -22,6 +23,7 @@ from asp_env.data.snippets import (
     index_snippets,
 )
 from asp_env.data.source import Recordings, open_readable
+from asp_env.errors import AspEnvError
 from asp_env.evaluation import statistics
 from asp_env.evaluation.open_loop.scoring import (
     ALL_MODES,
@@ -164,14 +166,7 @@ def evaluate(config: Evaluate) -> OpenLoopResult:
     names = [run for members in runs.values() for run in members]
     loaded = load_predictors(names, horizon=horizon, dt_s=config.dt)
     allowed, part = ticks_to_evaluate(recordings, loaded, config.part, dt_s=config.dt)
-    index = index_snippets(
-        recordings,
-        dt_s=config.dt,
-        horizon_s=config.horizon,
-        history_s=max(HISTORY_S, *(predictor.history * config.dt for predictor in loaded)),
-        parked=config.parked,
-    )
-    index = snippets_within(index, allowed)
+    index = snippets_within(_snippets(config, recordings, loaded), allowed)
     predictors = dict(zip(names, loaded, strict=True))
     scenes = histories(recordings, config.history)
     scores = score_forecasts(
@@ -218,6 +213,39 @@ def evaluate(config: Evaluate) -> OpenLoopResult:
             moving,
             {name: predictors[run] for name, (run, *_) in runs.items()},
         ),
+    )
+
+
+def _snippets(
+    config: Evaluate, recordings: Recordings, predictors: Sequence[Predictor]
+) -> SnippetIndex:
+    """All snippets; of recordings that are all too short those with the shortest usual history.
+
+    Raises:
+        AspEnvError: a predictor needs a longer history than all recordings have.
+    """
+    needed_s = max(predictor.history * config.dt for predictor in predictors)
+    history_s = max(HISTORY_S, needed_s)
+    if all_shorter(recordings, history_s + config.horizon):
+        history_s = max(SHORT_HISTORY_S, needed_s)
+        if all_shorter(recordings, history_s + config.horizon):
+            longest_s = max((each.num_frames - 1) / each.frame_rate_hz for each in recordings)
+            raise AspEnvError(
+                f"data {config.data!r}: no recording lasts {history_s + config.horizon:g} s, for "
+                f"{history_s:g} s of history and --horizon {config.horizon:g}; the longest lasts "
+                f"{longest_s:g} s: give a shorter --horizon, or other predictors or data"
+            )
+        warnings.warn(
+            f"data {config.data!r}: no recording lasts {HISTORY_S + config.horizon:g} s, so that "
+            f"predictors observe {history_s:g} s of history instead of {HISTORY_S:g} s",
+            stacklevel=3,
+        )
+    return index_snippets(
+        recordings,
+        dt_s=config.dt,
+        horizon_s=config.horizon,
+        history_s=history_s,
+        parked=config.parked,
     )
 
 

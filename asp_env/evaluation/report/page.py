@@ -1,7 +1,10 @@
-"""The report: one file of HTML that shows the results of a run and needs no network."""
+"""The report: one file of HTML that shows the results of a run and needs no network.
 
-import json
-from collections.abc import Iterator, Mapping, Sequence
+For every setting, that is data, traffic and latency, the page answers first: one sentence, then the
+ranking of the methods, the forecasts, what decides, and drives to look at.
+"""
+
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cache
 from importlib.resources import files
@@ -11,6 +14,16 @@ from typing import Any
 
 from asp_env.data.road_map import RoadMap
 from asp_env.errors import DataError, MissingExtraError
+from asp_env.evaluation.report import figures
+from asp_env.evaluation.report.answer import (
+    Answer,
+    driving_answer,
+    forecast_answer,
+    gain,
+    outcome,
+    score_differences,
+)
+from asp_env.evaluation.report.episodes import Episode, find_episodes
 from asp_env.evaluation.report.payload import (
     ForecastExamples,
     MapTable,
@@ -21,49 +34,82 @@ from asp_env.evaluation.report.results import (
     MetricNote,
     Result,
     Results,
-    best_result,
+    Setting,
     distinct,
+    methods_of,
     metric_note,
     read_results,
+    setting_labels,
+    short_labels,
+)
+from asp_env.evaluation.report.scenario_values import (
+    EXPERT,
+    ListedDrive,
+    ScenarioValues,
+    read_scenario_values,
+    telling_drives,
+    values_in,
+    worst_drives,
 )
 from asp_env.evaluation.report.tables import (
     breakdown_figures,
     comparison_figures,
+    difference_figures,
     result_figures,
 )
 from asp_env.evaluation.results import SCORE, difference_of
 from asp_env.evaluation.selection import split_name
 from asp_env.files import atomic_file
+from asp_env.stored import brief, parse_json
 
-BASELINE = "constant-velocity"
-RATIO = "FDE / constant velocity"
-CARD_METRICS = ("score", "no at-fault collision")
-CARD_SELECTIONS = ("most-probable", "best-of-3")
 ASSETS = files("asp_env.evaluation.report") / "assets"
-SCRIPTS = ("draw.js", "pictures.js", "replay.js", "page.js")
+SCRIPTS = ("draw.js", "charts.js", "pictures.js", "stage.js", "player.js", "page.js")
+COLOURS = 8
+"""Number of colours of predictors in the style sheet."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Card:
-    """The best value of a metric, shown at the top of the page."""
+class DriveList:
+    """Scenarios under a heading, each with the two methods to be shown side by side."""
 
     heading: str
-    value: str
-    unit: str
-    method: str
-    comparison: str
-    """The value of a reference method; may be empty."""
+    drives: tuple[ListedDrive, ...]
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Part:
+    """What the page shows of one setting."""
+
+    number: int
+    setting: Setting
+    answer: Answer | None
+    comparison_tables: list[Any]
+    driving_tables: list[Any]
+    same: str
+    """The metrics that do not vary, as text."""
+    has_tags: bool
+    drives: list[DriveList]
+    forecast_answer: Answer | None
+    forecast_tables: list[Any]
+    breakdown_tables: list[Any]
+    forecasts_at: int | None
+    """Number of the part that shows the forecasts on these data, if it is another one."""
+    figures: dict[str, list[figures.Payload]]
+    """Figures by section."""
+
+    def anchor(self, section: str) -> str:
+        """The anchor of one of its sections."""
+        return f"{section}-{self.number}" if self.number else section
 
 
 def check_report_possible() -> None:
-    """Checks that the packages of the extra `report` are installed, before a long run begins.
+    """Checks that the package of the extra `report` is installed, before a long run begins.
 
     Raises:
-        MissingExtraError: plotly or jinja2 is not installed.
+        MissingExtraError: jinja2 is not installed.
     """
-    for package in ("plotly", "jinja2"):
-        if find_spec(package) is None:
-            raise MissingExtraError(package, "report", "a report")
+    if find_spec("jinja2") is None:
+        raise MissingExtraError("jinja2", "report", "a report")
 
 
 def write_report(
@@ -73,55 +119,72 @@ def write_report(
     lead: str = "",
     maps: Mapping[str, RoadMap] | None = None,
     examples: ForecastExamples | None = None,
+    episodes: Sequence[Episode] | None = None,
+    answers: Mapping[str, Sequence[str]] | None = None,
 ) -> Path:
     """Writes `report.html` into a run folder.
 
-    The function reads `metrics.csv`, `manifest.json` and the rollouts below `rollouts/`. Rollouts
-    in sub-folders, such as `rollouts/sampling + ffw-asp/00-12-300.npz`, are grouped by method;
-    those of one file name can be compared between methods.
+    The function reads `metrics.csv`, `manifest.json`, `scenarios.csv` if there is one, and the
+    rollouts below `rollouts/`. Rollouts in sub-folders, such as
+    `rollouts/sampling + ffw-asp/00-12-300.npz`, are grouped by method; those of one file name can
+    be compared between methods. Rows of `metrics.csv` and of `scenarios.csv` with several data,
+    traffics or latencies become parts of the page, between which one chooses.
 
     Args:
         out: The run folder.
         title: Title of the page, plain text.
         lead: A sentence or two below the title, plain text.
-        maps: Road maps by the names of the rollouts' recordings.
+        maps: Road maps by the names of the rollouts' recordings; `DATA/RECORDING` for a recording
+            whose name occurs in several data.
         examples: Forecasts to draw over the map.
+        episodes: The rollouts to show; by default those that `find_episodes` finds.
+        answers: Sentences that answer further questions, by question.
 
     Returns:
         The path of the page.
 
     Raises:
-        MissingExtraError: plotly or jinja2 is not installed.
+        MissingExtraError: jinja2 is not installed.
         DataError: A file is missing or damaged, or the map of a rollout is missing.
     """
     check_report_possible()
-    from plotly.offline import get_plotlyjs
-
-    run = _read_manifest(out / "manifest.json")
-    results = read_results(out / "metrics.csv", privileged=run.get("privileged", ()))
+    manifest = _read_manifest(out / "manifest.json")
+    privileged = [*manifest.get("privileged", ())]
+    results = read_results(out / "metrics.csv", privileged=privileged)
+    values = read_scenario_values(out / "scenarios.csv")
+    episodes = find_episodes(out, manifest) if episodes is None else episodes
+    colours = {name: i % COLOURS for i, name in enumerate(results.predictors)}
+    parts = [
+        _part(number, results, values_in(values, setting), privileged, colours)
+        for number, setting in enumerate(results.settings)
+    ]
     map_table = MapTable()
     data = {
-        **_plots(results),
+        "figures": {
+            part.anchor(section): each for part in parts for section, each in part.figures.items()
+        },
+        "colours": colours | {split_name(name)[0]: number for name, number in colours.items()},
         "pictures": examples_payload(examples, map_table) if examples else [],
-        "drives": rollouts_payload(out / "rollouts", maps or {}, map_table),
+        "drives": rollouts_payload(episodes, maps or {}, map_table, results.settings),
+        "settings": setting_labels(results.settings),
     }
     data["maps"] = map_table.payloads
-    context = {
-        "cards": [*_forecast_cards(results.open_loop), *_driving_cards(results.driving)],
-        "forecast_figures": result_figures(results.open_loop),
-        "breakdown_figures": breakdown_figures(results.open_loop),
-        "comparison_figures": comparison_figures(results.driving),
-        "driving_figures": result_figures(results.driving),
-        "notes": _notes(results),
-        "run": run,
-        "data": data,
-    }
     page = _page_template().render(
-        context,
         title=title,
         lead=lead,
-        sections=_sections(context),
-        plotly=_markup(get_plotlyjs() if data["figures"] else ""),
+        parts=parts,
+        summary=_summary(parts, results),
+        labels={
+            (each.setting, (each.planner, each.predictor)): each.label
+            for each in reversed(episodes)
+        },
+        saved={(each.label, each.path.stem) for each in episodes},
+        names=_names(results),
+        notes=_notes(results),
+        answers=answers or {},
+        run=manifest,
+        data=data,
+        sections=_sections(parts, data, answers or {}),
     )
     path = out / "report.html"
     with atomic_file(path) as partial:
@@ -131,43 +194,153 @@ def write_report(
 
 def _read_manifest(path: Path) -> dict[str, Any]:
     try:
-        manifest = json.loads(path.read_text(encoding="utf-8"))
+        manifest = parse_json(path.read_bytes())
     except (OSError, ValueError) as error:
         raise DataError(f"{path}: not a manifest that can be read ({error})") from error
     if not isinstance(manifest, dict):
         raise DataError(f"{path}: expected a JSON object, found {type(manifest).__name__}")
+    privileged = manifest.get("privileged", [])
+    if not (isinstance(privileged, list) and all(isinstance(name, str) for name in privileged)):
+        raise DataError(
+            f"{path}: privileged is {brief(repr(privileged))}, expected a list of names; make the "
+            "results again"
+        )
     return manifest
 
 
-def _plots(results: Results) -> dict[str, Any]:
-    """The plotly figures that have data, and the colour of each predictor."""
-    from asp_env.evaluation.report import plots
-
-    colours = plots.colours(results.predictors)
-    figures = {
-        "final-errors": plots.final_errors(results.open_loop, colours),
-        "errors-over-time": plots.errors_over_time(results.open_loop, colours),
-        "driving-metrics": plots.driving_metrics(results.driving, colours),
+def _part(
+    number: int,
+    results: Results,
+    values: ScenarioValues | None,
+    privileged: Sequence[str],
+    colours: Mapping[str, int],
+) -> Part:
+    """What the page shows of a setting."""
+    setting = results.settings[number]
+    driving = [r for r in results.driving if r.setting == setting]
+    first = next(i for i, s in enumerate(results.settings) if s.data == setting.data)
+    forecasts = [r for r in results.open_loop if r.setting.data == setting.data]
+    shown = forecasts if first == number else []
+    answer = driving_answer(driving, places=values.places if values else None)
+    others, same = figures.other_metrics(driving)
+    by_tag = figures.tags(driving)
+    drawn = {
+        "ranking": [figures.ranking(driving)],
+        "others": others,
+        "forecasts": [
+            *figures.forecast_errors(shown),
+            *figures.errors_over_time(shown, colours),
+            figures.regret(shown),
+        ],
+        "tags": [by_tag],
+        "drives": [figures.scenario_differences(driving, values)],
     }
-    return {
-        "figures": {name: json.loads(text) for name, text in figures.items() if text},
-        "colours": colours | {split_name(name)[0]: value for name, value in colours.items()},
-    }
+    return Part(
+        number=number,
+        setting=setting,
+        answer=answer or (forecast_answer(forecasts) if not driving else None),
+        comparison_tables=comparison_figures(driving),
+        driving_tables=[*difference_figures(driving), *result_figures(driving)],
+        same=same,
+        has_tags=by_tag is not None,
+        drives=_drive_lists(driving, values, answer, privileged),
+        forecast_answer=forecast_answer(shown) if driving else None,
+        forecast_tables=result_figures(shown),
+        breakdown_tables=breakdown_figures(shown),
+        forecasts_at=first if forecasts and first != number else None,
+        figures={
+            section: kept
+            for section, each in drawn.items()
+            if (kept := [figure for figure in each if figure])
+        },
+    )
 
 
-def _sections(context: Mapping[str, Any]) -> dict[str, str]:
-    """Headings of the sections that have something to show, by their anchors."""
-    data = context["data"]
+def _drive_lists(
+    driving: Sequence[Result],
+    values: ScenarioValues | None,
+    answer: Answer | None,
+    privileged: Sequence[str],
+) -> list[DriveList]:
+    """The drives with the largest gains and losses, and the worst ones."""
+    if values is None:
+        return []
+    scores = score_differences(driving)
+    pair = difference_of(scores[0].metric) if scores else None
+    lists = []
+    if pair is not None:
+        gains, losses = telling_drives(values, pair[1], privileged)
+        lists = [("Largest gains", gains), ("Largest losses", losses)]
+    methods = [m for m in values.scores if m[0] != EXPERT]
+    if methods:
+        best = answer.method if answer else None
+        key = (best.planner, best.predictor) if best else methods[-1]
+        reference = (key[0], pair[1]) if pair else methods[0]
+        worst = worst_drives(values, key, reference)
+        lists.append((f"Lowest scores of {' + '.join(filter(None, _short(key)))}", worst))
+    return [DriveList(heading=heading, drives=tuple(each)) for heading, each in lists if each]
+
+
+def _short(method: tuple[str, str]) -> tuple[str, str]:
+    return method[0], split_name(method[1])[0]
+
+
+def _names(results: Results) -> dict[tuple[str, str], str]:
+    """Short names of methods by planner and predictor."""
+    labels = short_labels(methods_of(results.driving))
+    return {(m.planner, m.predictor): label for m, label in labels.items()}
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Summary:
+    """The differences of the score by method and setting."""
+
+    settings: tuple[tuple[int, str], ...]
+    """Number and label of each column."""
+    rows: tuple[tuple[str, bool, tuple[tuple[str, str, str] | None, ...]], ...]
+    """Name, whether privileged, and text, interval and outcome of each cell."""
+    sentence: str
+
+
+def _summary(parts: Sequence[Part], results: Results) -> Summary | None:
+    """The summary of several settings; None if there is one, or no differences."""
+    scores = [score_differences([r for r in results.driving if r.setting == p.setting])
+              for p in parts]  # fmt: skip
+    methods = methods_of(r for each in scores for r in each)
+    if len(parts) < 2 or not methods:
+        return None
+    labels = short_labels(methods)
+    columns = [{r.method: r for r in each} for each in scores]
+    rows = []
+    for method in methods:
+        cells = []
+        for column in columns:
+            result = column.get(method)
+            value, _, interval = gain(result).partition(" ") if result else ("", "", "")
+            cells.append((value, interval, outcome(result)) if result else None)
+        rows.append((labels[method], method.privileged, tuple(cells)))
+    verdicts = [part.answer.verdict for part in parts if part.answer]
+    counts = [f"{verdict} in {verdicts.count(verdict)}" for verdict in distinct(verdicts)]
+    return Summary(
+        settings=tuple(enumerate(setting_labels(results.settings))),
+        rows=tuple(rows),
+        sentence=f"{len(parts)} settings: {', '.join(counts)}.",
+    )
+
+
+def _sections(
+    parts: Sequence[Part], data: Mapping[str, Any], answers: Mapping[str, Sequence[str]]
+) -> dict[str, str]:
+    """Headings of the sections that have something to show in any part, by their anchors."""
     sections = {
-        "forecasts": ("Forecast errors", context["forecast_figures"]),
-        "breakdown": ("Forecast errors by kind of target", context["breakdown_figures"]),
+        "ranking": ("Ranking", any(p.comparison_tables or p.driving_tables for p in parts)),
+        "forecasts": ("Forecasts", any(p.forecast_tables for p in parts)),
         "examples": ("Example forecasts", data["pictures"]),
-        "driving": (
-            "Closed-loop driving",
-            [*context["comparison_figures"], *context["driving_figures"]],
-        ),
-        "rollouts": ("Rollouts", data["drives"]),
-        "metrics": ("Metrics", context["notes"]),
+        "tags": ("What decides", any(p.has_tags for p in parts)),
+        "drives": ("Drives", any(p.drives or "drives" in p.figures for p in parts)),
+        "questions": ("Questions", answers),
+        "player": ("Player", data["drives"]),
+        "metrics": ("Metrics", True),
         "manifest": ("Manifest", True),
     }
     return {anchor: heading for anchor, (heading, shown) in sections.items() if shown}
@@ -176,6 +349,7 @@ def _sections(context: Mapping[str, Any]) -> dict[str, str]:
 @cache
 def _page_template() -> Any:
     import jinja2
+    from markupsafe import Markup
 
     environment = jinja2.Environment(
         loader=jinja2.PackageLoader("asp_env.evaluation.report", "assets"),
@@ -185,82 +359,11 @@ def _page_template() -> Any:
         lstrip_blocks=True,
     )
     environment.policies["json.dumps_kwargs"] = {"separators": (",", ":")}
-    environment.globals["style"] = _markup((ASSETS / "style.css").read_text(encoding="utf-8"))
-    environment.globals["scripts"] = _markup(
+    environment.globals["style"] = Markup((ASSETS / "style.css").read_text(encoding="utf-8"))
+    environment.globals["scripts"] = Markup(
         "\n".join((ASSETS / name).read_text(encoding="utf-8") for name in SCRIPTS)
     )
     return environment.get_template("page.html.j2")
-
-
-def _markup(text: str) -> Any:
-    """Trusted text, which the template does not escape."""
-    from markupsafe import Markup
-
-    return Markup(text)
-
-
-def _forecast_cards(results: Sequence[Result]) -> Iterator[Card]:
-    """FDE of the best predictor beside constant velocity, for each selection of modes."""
-    subset = _first_subset(results, "moving", "all")
-    for selection in CARD_SELECTIONS:
-        comparable = [
-            r for r in results if (r.subset, r.selection) == (subset, selection) and r.at_s is None
-        ]
-        winner = best_result([r for r in comparable if r.metric == "FDE"], better="lower")
-        if winner is not None:
-            horizon = f" at {winner.horizon_s} s" if winner.horizon_s else ""
-            heading = f"FDE{horizon}, {selection.replace('-', ' ')}, {subset or 'all'} targets"
-            yield _card(heading, winner, _beside_baseline(winner, comparable))
-
-
-def _beside_baseline(winner: Result, results: Sequence[Result]) -> str:
-    """FDE of constant velocity on the same data, and the paired ratio to it where there is one."""
-    same_data = [
-        r
-        for r in results
-        if (r.data, r.horizon_s) == (winner.data, winner.horizon_s) and r.value is not None
-    ]
-    base = [r for r in same_data if r.metric == "FDE" and r.method.predictor == BASELINE]
-    ratio = [r for r in same_data if r.metric == RATIO and r.method == winner.method]
-    if not base or winner.method.predictor == BASELINE:
-        return ""
-    text = f"constant velocity: {base[0].value:.2f} m"
-    if ratio:
-        text += f"; ratio {ratio[0].value:.2f}"
-        if ratio[0].low is not None and ratio[0].high is not None:
-            text += f" ({ratio[0].low:.2f} to {ratio[0].high:.2f})"
-    return text
-
-
-def _driving_cards(results: Sequence[Result]) -> Iterator[Card]:
-    """The best method beside the expert, for each of the main metrics."""
-    subset = _first_subset(results, "all")
-    for metric in CARD_METRICS:
-        note = metric_note(metric)
-        column = [r for r in results if (r.subset, r.metric) == (subset, metric)]
-        winner = best_result(column, better=note.better)
-        if winner is not None:
-            expert = [
-                f"expert: {note.format(r.value)} {note.unit}"
-                for r in column
-                if r.method.planner == "expert" and r.value is not None and r.data == winner.data
-            ]
-            yield _card(metric.capitalize(), winner, "".join(expert[:1]))
-
-
-def _first_subset(results: Sequence[Result], *preferred: str) -> str:
-    return next(iter(distinct((result.subset for result in results), first=preferred)), "")
-
-
-def _card(heading: str, winner: Result, comparison: str) -> Card:
-    note = metric_note(winner.metric)
-    return Card(
-        heading=heading,
-        value=note.format(winner.value or 0.0),
-        unit=note.unit,
-        method=winner.method.name,
-        comparison=comparison,
-    )
 
 
 def _notes(results: Results) -> list[MetricNote]:

@@ -1,12 +1,15 @@
 """Maps, forecasts and rollouts as JSON values that the scripts of the page draw.
 
 Points are in centimetres: the first point, then the steps from point to point, which keeps the text
-short. Headings are in thousandths of a radian.
+short. Headings are in thousandths of a radian. What happens in a rollout is compressed, and the
+script decompresses it when the rollout is shown.
 """
 
-from collections.abc import Mapping
+import base64
+import gzip
+import json
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -19,6 +22,8 @@ from asp_env.data.rollout import Rollout
 from asp_env.data.scene import Scene
 from asp_env.data.snippets import Future
 from asp_env.errors import AspEnvError, DataError
+from asp_env.evaluation.report.episodes import Episode
+from asp_env.evaluation.report.results import Setting
 
 FORECAST_POINT_S = 0.4
 """Time between the drawn points of a forecast; its last point is always drawn. Chosen by hand: a
@@ -214,38 +219,57 @@ def _box(size: Float[np.ndarray, " 2"]) -> list[int]:
 
 
 def rollouts_payload(
-    folder: Path, road_maps: Mapping[str, RoadMap], maps: MapTable
+    episodes: Sequence[Episode],
+    road_maps: Mapping[str, RoadMap],
+    maps: MapTable,
+    settings: Sequence[Setting],
 ) -> list[dict[str, Any]]:
-    """All rollouts below a folder in the order of their paths.
+    """The rollouts of some episodes, in their order.
 
     Args:
-        folder: A sub-folder holds the rollouts of one method.
-        road_maps: Road maps by the name of the recording.
+        episodes: The episodes.
+        road_maps: Road maps by the name of the recording, or by `DATA/RECORDING`.
         maps: The table that receives the maps.
+        settings: The settings of the page; an episode has the index of its own.
 
     Raises:
         DataError: A rollout cannot be read, or the map of its recording is missing.
     """
     rollouts = []
-    for path in sorted(folder.rglob("*.npz")):
-        rollout = Rollout.load(path)
+    for episode in episodes:
+        rollout = Rollout.load(episode.path)
         name = rollout.scenario.recording_name
+        own = f"{rollout.scenario.source}/{name}"
+        name = own if own in road_maps else name
         if name not in road_maps:
             known = ", ".join(sorted(road_maps)) or "none"
-            raise DataError(f"{path}: no map of recording {name!r} was given; given were {known}")
-        group = path.parent.relative_to(folder).as_posix()
-        head = {"driver": "" if group == "." else group, "name": path.stem}
-        rollouts.append(head | _rollout(rollout, maps.number(road_maps[name])))
+            raise DataError(
+                f"{episode.path}: no map of recording {name!r} was given; given were {known}"
+            )
+        setting = episode.setting
+        head = {
+            "driver": episode.label,
+            "name": episode.path.stem,
+            "setting": settings.index(setting) if setting in settings else 0,
+            "command": episode.command,
+            "tags": " · ".join(rollout.scenario.tags),
+            "ticks": len(rollout.states),
+            "dt": round(rollout.dt_s, 4),
+        }
+        body = _rollout(rollout, maps.number(road_maps[name]))
+        rollouts.append(head | {"body": _compressed(body)})
     return rollouts
+
+
+def _compressed(value: object) -> str:
+    """A JSON value as text: compressed by gzip, in base64."""
+    text = json.dumps(value, separators=(",", ":")).encode()
+    return base64.b64encode(gzip.compress(text, mtime=0)).decode()
 
 
 def _rollout(rollout: Rollout, map_number: int) -> dict[str, Any]:
     return {
         "map": map_number,
-        "tags": " · ".join(rollout.scenario.tags),
-        "start_s": round(rollout.scenario.start_tick * rollout.dt_s, 3),
-        "dt": round(rollout.dt_s, 4),
-        "ticks": len(rollout.states),
         "agents": [_track(rollout, slot) for slot in range(len(rollout.ids))],
         "log": [
             pose if valid else None

@@ -2,13 +2,14 @@
 
 import csv
 import re
+from collections import Counter
 from collections.abc import Collection, Iterable, Sequence
 from dataclasses import dataclass, fields
 from pathlib import Path, PurePath
 from typing import Literal
 
 from asp_env.errors import DataError
-from asp_env.evaluation.results import HEADROOM, ORACLE_SHARE, Row, difference_of
+from asp_env.evaluation.results import ANSWER, HEADROOM, ORACLE_SHARE, Row, difference_of
 from asp_env.evaluation.selection import split_name
 
 SELECTIONS = ("most-probable", "best-of-3", "")
@@ -20,7 +21,7 @@ ADDED_COLUMNS = ("runs", "mde", "p_holm")
 """Columns that older run folders lack."""
 RENAMED_COLUMNS = {"preset": "recipe"}
 """Columns of older run folders and their present names."""
-DETAILS = ("trained_on", "view", "recipe", "chaining", "traffic", "latency_ticks")
+DETAILS = ("trained_on", "view", "recipe", "chaining")
 """Columns that distinguish methods of the same name."""
 
 Better = Literal["lower", "higher", "neither"]
@@ -36,6 +37,8 @@ class MetricNote:
     better: Better
     text: str
     """Definition in a sentence; empty for an unknown metric."""
+    decimals: int | None = None
+    """None for one decimal of percentages, two of other numbers, three of small ones."""
 
     @property
     def unit_and_arrow(self) -> str:
@@ -45,9 +48,44 @@ class MetricNote:
 
     def format(self, value: float) -> str:
         """The value as text, without its unit."""
-        if self.unit == "%":
-            return f"{100 * value:.1f}"
-        return f"{value:.3f}" if 0 < abs(value) < 0.1 else f"{value:.2f}"
+        default = 1 if self.unit == "%" else 3 if 0 < abs(value) < 0.1 else 2
+        decimals = default if self.decimals is None else self.decimals
+        return f"{round(self.scale * value, decimals) + 0.0:.{decimals}f}"
+
+    @property
+    def scale(self) -> float:
+        """Factor from a value to the printed number."""
+        return 100.0 if self.unit == "%" else 1.0
+
+    def signed(self, value: float) -> str:
+        """The value of a difference with its sign, without its unit."""
+        text = self.format(value)
+        return text if text.startswith("-") else f"+{text}"
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Setting:
+    """What methods are compared under; every setting is a part of the page."""
+
+    data: str
+    traffic: str = ""
+    """Drivers of the other agents; empty in open loop."""
+    latency_ticks: str = ""
+    """Delay of the plans in ticks; empty in open loop."""
+
+    @property
+    def details(self) -> tuple[str, ...]:
+        """The traffic, and the latency if there is one, as text."""
+        parts = [f"traffic {self.traffic}"] if self.traffic else []
+        if self.latency_ticks not in ("", "0"):
+            ticks = "tick" if self.latency_ticks == "1" else "ticks"
+            parts.append(f"latency {self.latency_ticks} {ticks}")
+        return tuple(parts)
+
+    @property
+    def label(self) -> str:
+        """All of it as text."""
+        return " · ".join((self.data, *self.details))
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -78,10 +116,10 @@ class Result:
     """One row of `metrics.csv`; a missing number is None."""
 
     method: MethodResult
-    data: str
+    setting: Setting
     horizon_s: str
     fixed: tuple[str, ...]
-    """Details that all results of the same kind share, such as the traffic."""
+    """Details that all results of the same kind share, such as the view."""
     selection: str
     subset: str
     metric: str
@@ -111,6 +149,14 @@ class Results:
     driving: tuple[Result, ...]
 
     @property
+    def settings(self) -> list[Setting]:
+        """The settings of the drives, then those of forecasts on data that nobody drives on."""
+        driven = dict.fromkeys(result.setting for result in self.driving)
+        data = {setting.data for setting in driven}
+        forecast = dict.fromkeys(r.setting for r in self.open_loop if r.setting.data not in data)
+        return [*driven, *forecast]
+
+    @property
     def predictors(self) -> list[str]:
         """Predictors that are not privileged, in the order of their first results."""
         methods = [result.method for result in (*self.open_loop, *self.driving)]
@@ -118,7 +164,7 @@ class Results:
 
 
 def read_results(path: Path, *, privileged: Collection[str] = ()) -> Results:
-    """Reads `metrics.csv`.
+    """Reads `metrics.csv`, without rows that answer a question of a study.
 
     Args:
         path: The file. Names of columns in older files are understood.
@@ -136,9 +182,14 @@ def read_results(path: Path, *, privileged: Collection[str] = ()) -> Results:
     except (OSError, ValueError, csv.Error) as error:
         raise DataError(f"{path}: not a table of metrics ({error})") from error
     missing = [name for name in COLUMNS if name not in columns]
+    if cut := next((n for n, row in enumerate(rows, 2) if None in row or None in row.values()), 0):
+        raise DataError(
+            f"{path}, row {cut}: has another number of cells than the header, {len(columns)}; make "
+            "the results again"
+        )
     if set(missing) - set(ADDED_COLUMNS):
         raise DataError(f"{path}: no column {missing[0]!r}, expected {', '.join(COLUMNS)}")
-    rows = [dict.fromkeys(missing, "") | row for row in rows]
+    rows = [dict.fromkeys(missing, "") | row for row in rows if row.get("subset") != ANSWER]
     return Results(
         open_loop=_results(path, [row for row in rows if not row["planner"]], privileged),
         driving=_results(path, [row for row in rows if row["planner"]], privileged),
@@ -149,6 +200,34 @@ def methods_of(results: Iterable[Result]) -> list[MethodResult]:
     """The methods of some results: the expert, then other privileged methods, then the rest."""
     methods = dict.fromkeys(result.method for result in results)
     return sorted(methods, key=lambda method: (not method.privileged, method.planner != "expert"))
+
+
+def short_labels(methods: Sequence[MethodResult]) -> dict[MethodResult, str]:
+    """The shortest distinct labels of methods.
+
+    The planner is left out where all methods with a predictor have the same, details where names
+    are distinct without them.
+    """
+    one_planner = len({method.planner for method in methods if method.predictor}) == 1
+    names = {
+        method: split_name(method.predictor)[0] if one_planner and method.predictor else method.name
+        for method in methods
+    }
+    counts = Counter(names.values())
+    return {m: name if counts[name] == 1 else m.label for m, name in names.items()}
+
+
+def setting_labels(settings: Sequence[Setting]) -> list[str]:
+    """Labels of settings: what differs between them; all of it for a single one."""
+    if len(settings) == 1:
+        return [settings[0].label]
+    parts = [
+        {setting: setting.data for setting in settings},
+        {setting: f"traffic {setting.traffic}" for setting in settings},
+        {setting: f"latency {setting.latency_ticks or 0}" for setting in settings},
+    ]
+    varying = [part for part in parts if len({*part.values()}) > 1]
+    return [" · ".join(part[setting] for part in varying) for setting in settings]
 
 
 def best_result(results: Iterable[Result], *, better: str) -> Result | None:
@@ -201,7 +280,9 @@ def _result(
             details=tuple(details),
             privileged=row["planner"] in privileged or row["predictor"] in privileged,
         ),
-        data=row["data"],
+        setting=Setting(
+            data=row["data"], traffic=row["traffic"], latency_ticks=row["latency_ticks"]
+        ),
         horizon_s=row["horizon_s"],
         fixed=fixed,
         selection=row["selection"],
@@ -213,8 +294,6 @@ def _result(
 
 
 def _detail(column: str, value: str) -> str:
-    if column == "latency_ticks":
-        return f"latency {value} ticks"
     return f"{column.replace('_', ' ')} {value}"
 
 
@@ -232,11 +311,14 @@ def metric_note(metric: str) -> MetricNote:
         base.unit,
         base.better,
         f"{base.label} less that of the same planner with {reference}, paired by scenario.",
+        base.decimals,
     )
 
 
-def _note(label: str, unit: str, better: Better, text: str) -> MetricNote:
-    return MetricNote(label=label, unit=unit, better=better, text=text)
+def _note(
+    label: str, unit: str, better: Better, text: str, decimals: int | None = None
+) -> MetricNote:
+    return MetricNote(label=label, unit=unit, better=better, text=text, decimals=decimals)
 
 
 METRIC_NOTES = {
@@ -341,15 +423,18 @@ METRIC_NOTES = {
     ),
     "score": _note(
         "Score",
-        "%",
+        "",
         "higher",
-        "Score of the rules: the product of their multipliers times their weighted mean.",
+        "Score of the rules, from 0 to 1: the product of their multipliers times their weighted "
+        "mean.",
+        3,
     ),
     "score - constant-velocity": _note(
         "Score - CV",
-        "%",
+        "",
         "higher",
-        "Score minus that of the same planner with constant velocity; paired interval.",
+        "Score less that of the same planner with constant velocity; paired interval.",
+        3,
     ),
     ORACLE_SHARE: _note(
         "Oracle share",

@@ -1,10 +1,9 @@
 """The contents of the page's tables: one figure per data set and horizon, a tab per subset."""
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from types import MappingProxyType
 
-from asp_env.evaluation.ladder import is_under_test
 from asp_env.evaluation.report.results import (
     SELECTIONS,
     SUBSETS,
@@ -15,9 +14,10 @@ from asp_env.evaluation.report.results import (
     distinct,
     methods_of,
     metric_note,
+    short_labels,
 )
 from asp_env.evaluation.results import HEADROOM, ORACLE_SHARE, SCORE, difference_name, difference_of
-from asp_env.evaluation.verdicts import NOT_RESOLVED, RESOLVED, headline, verdict_text
+from asp_env.evaluation.verdicts import NOT_RESOLVED, RESOLVED, verdict_text
 
 COMPARISON = (ORACLE_SHARE, HEADROOM)
 """Metrics beside the difference of the score."""
@@ -49,6 +49,8 @@ class MethodRow:
     """A method and its values, None where a value is missing."""
 
     method: MethodResult
+    name: str
+    """The method's name, without its planner where all have the same."""
     cells: tuple[Cell | None, ...]
 
 
@@ -66,12 +68,12 @@ class Column:
 DIFFERENCE_COLUMNS = (
     Column(
         label="Difference",
-        detail="% ↑",
+        detail="↑",
         title="Mean difference of the score in the same scenarios, with its 95 % interval.",
     ),
     Column(
         label="MDE",
-        detail="%",
+        detail="",
         title="Minimal detectable effect: the smallest difference that these scenarios resolve "
         "with 80 % power at the 5 % level, 2.8 standard errors.",
     ),
@@ -104,8 +106,6 @@ class Tab:
 
     label: str
     tables: tuple[Table, ...]
-    sentences: tuple[str, ...] = ()
-    """What the tables show, in words."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -118,11 +118,15 @@ class Figure:
 
 
 def result_figures(results: Sequence[Result]) -> list[Figure]:
-    """Metrics by method, without comparisons, metrics over time and kinds of targets."""
-    groups: dict[tuple[str, str], list[Result]] = {}
+    """Metrics by method, without comparisons, metrics over time and kinds of targets.
+
+    Args:
+        results: Results of one setting.
+    """
+    groups: dict[str, list[Result]] = {}
     for result in results:
         if result.at_s is None and ":" not in result.subset and not result.is_comparison:
-            groups.setdefault((result.data, result.horizon_s), []).append(result)
+            groups.setdefault(result.horizon_s, []).append(result)
     figures = []
     for group in groups.values():
         subsets = distinct((result.subset for result in group), first=SUBSETS)
@@ -138,15 +142,19 @@ def result_figures(results: Sequence[Result]) -> list[Figure]:
 
 
 def comparison_figures(results: Sequence[Result]) -> list[Figure]:
-    """Differences to the reference with verdicts, oracle shares and headroom, a tab per subset."""
-    groups: dict[tuple[str, str, str], list[Result]] = {}
+    """Differences to the reference with verdicts, oracle shares and headroom, a tab per subset.
+
+    Args:
+        results: Closed-loop results of one setting.
+    """
+    groups: dict[tuple[str, str], list[Result]] = {}
     for result in results:
         difference = difference_of(result.metric)
         if difference is not None and difference[0] == SCORE:
-            groups.setdefault((result.data, result.horizon_s, difference[1]), []).append(result)
+            groups.setdefault((result.horizon_s, difference[1]), []).append(result)
     figures = []
-    for (data, horizon_s, reference), group in groups.items():
-        same = [r for r in results if (r.data, r.horizon_s) == (data, horizon_s)]
+    for (horizon_s, reference), group in groups.items():
+        same = [r for r in results if r.horizon_s == horizon_s]
         subsets = distinct((result.subset for result in group), first=COMPARED_SUBSETS)
         tabs = [
             _comparison_tab(subset, reference, [r for r in same if r.subset == subset])
@@ -157,14 +165,21 @@ def comparison_figures(results: Sequence[Result]) -> list[Figure]:
 
 
 def _comparison_tab(subset: str, reference: str, results: Sequence[Result]) -> Tab:
-    """The differences of a subset: a table of the score, one of the other metrics, sentences."""
+    """The differences of the score in a subset."""
     of = {(result.method, result.metric): result for result in results}
     score = difference_name(SCORE, reference)
-    methods = methods_of(result for result in results if result.metric == score)
+    methods = [
+        result.method
+        for result in sorted(
+            (r for r in results if r.metric == score), key=lambda r: -(r.value or 0.0)
+        )
+    ]
     columns = [column for column in COMPARISON if _occurs(column, results)]
+    names = _short_names(methods)
     rows = tuple(
         MethodRow(
             method=method,
+            name=names[method],
             cells=(
                 *_difference_cells(of[method, score]),
                 *(_cell(of.get((method, metric)), None, SHARE_NOTES) for metric in columns),
@@ -173,20 +188,13 @@ def _comparison_tab(subset: str, reference: str, results: Sequence[Result]) -> T
         for method in methods
     )
     headings = [*DIFFERENCE_COLUMNS, *(_heading(metric_note(metric)) for metric in columns)]
-    sentences = [
-        headline(
-            method.label,
-            reference,
-            _gain(of[method, score]),
-            of[method, score],
-            of.get((method, ORACLE_SHARE)),
-        )
-        for method in methods
-        if is_under_test(method.predictor, privileged=method.privileged)
-    ]
     table = Table(heading=f"score less {reference}", columns=tuple(headings), rows=rows)
-    others = _other_differences(reference, methods, results)
-    return Tab(label=subset, tables=(table, *others), sentences=tuple(sentences))
+    return Tab(label=subset, tables=(table,))
+
+
+def _short_names(methods: Sequence[MethodResult]) -> dict[MethodResult, str]:
+    """Short names of methods; their details stand below."""
+    return {m: label.partition(" · ")[0] for m, label in short_labels(methods).items()}
 
 
 def _occurs(metric: str, results: Sequence[Result]) -> bool:
@@ -223,46 +231,64 @@ def _text(value: str) -> Cell:
     return Cell(value=value, best=False, interval=None, count=None)
 
 
-def _gain(result: Result) -> str:
-    """A difference with its sign, unit and interval, such as `+2.6 % [0.2, 5.1]`."""
-    note = metric_note(result.metric)
-    sign = "+" if (result.value or 0.0) >= 0 else ""
-    text = f"{sign}{note.format(result.value or 0.0)} {note.unit}"
-    if result.low is None or result.high is None:
-        return text
-    return f"{text} [{note.format(result.low)}, {note.format(result.high)}]"
+def difference_figures(results: Sequence[Result]) -> list[Figure]:
+    """Differences of all metrics except the score to the reference, a tab per subset.
 
-
-def _other_differences(
-    reference: str, methods: Sequence[MethodResult], results: Sequence[Result]
-) -> Iterator[Table]:
-    """A table of the differences of all metrics except the score, if there are any."""
-    columns: dict[str, dict[MethodResult, Result]] = {}
+    Args:
+        results: Closed-loop results of one setting.
+    """
+    groups: dict[tuple[str, str], list[Result]] = {}
     for result in results:
         difference = difference_of(result.metric)
-        if difference is not None and difference[0] != SCORE and difference[1] == reference:
-            columns.setdefault(difference[0], {})[result.method] = result
-    if columns:
-        rows = tuple(
-            MethodRow(
-                method=method,
-                cells=tuple(_cell(column.get(method), None) for column in columns.values()),
+        if difference is not None and difference[0] != SCORE:
+            groups.setdefault((result.horizon_s, difference[1]), []).append(result)
+    figures = []
+    for (_, reference), group in groups.items():
+        subsets = distinct((result.subset for result in group), first=COMPARED_SUBSETS)
+        tabs = [
+            Tab(
+                label=subset,
+                tables=(_other_differences(reference, [r for r in group if r.subset == subset]),),
             )
-            for method in methods
+            for subset in subsets
+        ]
+        figures.append(_figure(group[0], (f"less {reference}",), tabs))
+    return figures
+
+
+def _other_differences(reference: str, results: Sequence[Result]) -> Table:
+    """A table of the differences of all metrics except the score in a subset."""
+    columns: dict[str, dict[MethodResult, Result]] = {}
+    for result in results:
+        name, _ = difference_of(result.metric) or ("", "")
+        columns.setdefault(name, {})[result.method] = result
+    methods = methods_of(results)
+    names = _short_names(methods)
+    rows = tuple(
+        MethodRow(
+            method=method,
+            name=names[method],
+            cells=tuple(_cell(column.get(method), None) for column in columns.values()),
         )
-        headings = tuple(_heading(metric_note(metric)) for metric in columns)
-        yield Table(heading=f"less {reference}", columns=headings, rows=rows)
+        for method in methods
+    )
+    headings = tuple(_heading(metric_note(metric)) for metric in columns)
+    return Table(heading=f"less {reference}", columns=headings, rows=rows)
 
 
 def breakdown_figures(results: Sequence[Result]) -> list[Figure]:
-    """FDE by manoeuvre and by class, a figure for each and a table for each selection."""
-    groups: dict[tuple[str, str, str], list[Result]] = {}
+    """FDE by manoeuvre and by class, a figure for each and a table for each selection.
+
+    Args:
+        results: Open-loop results of one setting.
+    """
+    groups: dict[tuple[str, str], list[Result]] = {}
     for result in results:
         division, is_kind, _ = result.subset.partition(":")
         if is_kind and result.metric == BREAKDOWN_METRIC and result.at_s is None:
-            groups.setdefault((result.data, result.horizon_s, division), []).append(result)
+            groups.setdefault((result.horizon_s, division), []).append(result)
     figures = []
-    for (*_, division), group in groups.items():
+    for (_, division), group in groups.items():
         selections = distinct((result.selection for result in group), first=SELECTIONS)
         tables = tuple(
             _kind_table([result for result in group if result.selection == selection])
@@ -275,7 +301,8 @@ def breakdown_figures(results: Sequence[Result]) -> list[Figure]:
 
 def _figure(one: Result, headings: Sequence[str], tabs: Sequence[Tab]) -> Figure:
     horizon = [f"horizon {one.horizon_s} s"] if one.horizon_s else []
-    return Figure(data=one.data, details=(*headings, *horizon, *one.fixed), tabs=tuple(tabs))
+    details = (*headings, *horizon, *one.setting.details, *one.fixed)
+    return Figure(data=one.setting.data, details=details, tabs=tuple(tabs))
 
 
 def _metric_tables(results: Sequence[Result]) -> tuple[Table, ...]:
@@ -316,9 +343,11 @@ def _table(
     methods: Sequence[MethodResult],
 ) -> Table:
     best_texts = [_best_text(list(column.values())) for column in columns]
+    names = _short_names(methods)
     rows = [
         MethodRow(
             method=method,
+            name=names[method],
             cells=tuple(
                 _cell(column.get(method), best)
                 for column, best in zip(columns, best_texts, strict=True)

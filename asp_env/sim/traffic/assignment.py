@@ -9,6 +9,7 @@ import numpy as np
 from jaxtyping import Bool
 
 from asp_env import registry
+from asp_env.arguments import shown, whole_number
 from asp_env.data.classes import AgentClass, parse_class
 from asp_env.data.recording import DEFAULT_DT_S
 from asp_env.errors import AspEnvError, DataError
@@ -151,19 +152,26 @@ def _make_table(spec: Mapping[Any, str | Driver], dt_s: float) -> Traffic:
     by_id: dict[int, int] = {}
     default = 0
     for key, value in spec.items():
+        if value is None:
+            raise AspEnvError(f"traffic for {key!r}: None, expected the name of a driver")
         name = value if isinstance(value, str) else id(value)
         if name not in indices:
             indices[name] = len(drivers)
             drivers.append(make_traffic(value, dt_s=dt_s))
         if key == DEFAULT:
             default = indices[name]
-        elif isinstance(key, str) and not key.isdigit():
+        elif isinstance(key, str) and not key.isdecimal():
             by_class[_controllable_class(key)] = indices[name]
-        elif int(key) >= 0:
-            by_id[int(key)] = indices[name]
         else:
-            raise AspEnvError(f"traffic for {key}: expected {_KEYS}")
+            by_id[_agent_id(key)] = indices[name]
     return Traffic(drivers, default=default, by_class=by_class, by_id=by_id)
+
+
+def _agent_id(key: object) -> int:
+    try:
+        return whole_number("", int(key) if isinstance(key, str) else key, least=0)
+    except AspEnvError:
+        raise AspEnvError(f"traffic for {shown(key)}: expected {_KEYS}") from None
 
 
 def _controllable_class(key: str) -> AgentClass:
@@ -178,5 +186,8 @@ def _controllable_class(key: str) -> AgentClass:
 
 def _make_driver(name: str, dt_s: float) -> Driver:
     kind, _, argument = name.partition(":")
-    plug: DriverPlug = registry.find("drivers", kind)
-    return plug.from_name(argument, dt_s=dt_s)
+
+    def made_by(plug: DriverPlug) -> Any:
+        return plug.from_name(argument, dt_s=dt_s)
+
+    return registry.make("drivers", kind, made_by, Driver)

@@ -1,5 +1,6 @@
 """Folders as users have them: hidden files, archives, names in any case, classes of other data."""
 
+import re
 import shutil
 from pathlib import Path
 
@@ -10,11 +11,14 @@ import asp_env
 from asp_env.cli import main
 from asp_env.data.classes import AgentClass
 from asp_env.data.readers.layout import natural_key
+from asp_env.data.readers.tables import number_texts
+from asp_env.data.scenarios.selection import choose_scenarios, load_scenarios, save_scenarios
 from asp_env.data.source import open_data, open_readable
-from asp_env.errors import DataError, LeftOutWarning
+from asp_env.errors import DataError, LeftOutWarning, RepairWarning
+from asp_env.sim.episodes import initialize
 from tests.data.interaction_files import PLACE, rows, some_cars
 from tests.data.interaction_files import write_folder as write_interaction
-from tests.data.levelx_files import write_folder
+from tests.data.levelx_files import write_folder, write_recording
 
 FORK = bytes([0, 5, 22, 7, 0, 2, 0, 0]) + b"Mac OS X        " + bytes(50)
 
@@ -165,6 +169,45 @@ def test_each_case_of_interaction_1_2_is_a_recording(tmp_path: Path) -> None:
     assert (first.sizes > 0).all()
     assert first.road_map is second.road_map
     assert len(set(recordings.hashes())) == 2
+
+
+def test_cases_of_4_s_can_be_driven(tmp_path: Path) -> None:
+    """40 rows are the ticks 0 to 19: 3 of history, then 16 to drive; 4 cars, 12.8 m each."""
+    write_cases(tmp_path / "cases")
+    recordings = open_data(tmp_path / "cases")
+    with pytest.warns(UserWarning, match=r"last 2 s or more after 0\.6 s of history"):
+        scenarios = choose_scenarios(recordings, "", dt_s=0.2, history=15)
+    assert (len(scenarios), scenarios.history) == (4, 3)
+    assert set(scenarios.start_tick) == {3}
+    assert set(scenarios.length) == {16}
+    path = tmp_path / "scenarios.json"
+    save_scenarios(path, scenarios, recordings)
+    assert len(load_scenarios(path, recordings, dt_s=0.2, history=15)) == 4
+    init = initialize(recordings[0], scenarios[0], dt_s=0.2, history=15)
+    assert init.first_frame == -24  # ticks before the recording are not valid
+
+
+def test_repairs_are_warned_of_once_per_folder(tmp_path: Path) -> None:
+    """Two recordings, of which one has a class that is not known."""
+    folder = write_folder(tmp_path / "folder")
+    write_recording(folder, number=1, classes=["hovercraft", "car", "pedestrian"])
+    with pytest.warns(RepairWarning) as caught:
+        open_readable(folder)
+    (warning,) = caught
+    assert re.fullmatch(
+        r"data '.*': 1 repairs of 1 of 2 recordings and 0 of maps: recording 01: 1 tracks of the "
+        r"unknown class 'hovercraft' .* \(asp-env inspect lists all repairs\)",
+        str(warning.message),
+    )
+
+
+def test_ids_that_are_texts_are_numbered_above_those_that_are_numbers() -> None:
+    """P1 is no number, 01 has that of 1, and 2^60 is too large: 8, 9 and 10."""
+    ids = number_texts(np.array(["1", "7", "P1", "01", str(2**60), "P1", "7.0"], dtype=object))
+    assert ids.numbers.tolist() == [1, 7, 8, 9, 10, 8, 11]
+    assert ids.texts[8] == "P1"
+    assert len(ids.repairs) == 1
+    assert number_texts(np.array(["3", "5"], dtype=object)).repairs == ()
 
 
 def test_a_bad_case_blocks_only_itself(tmp_path: Path) -> None:

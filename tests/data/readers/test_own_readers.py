@@ -153,6 +153,39 @@ def test_sind_is_read_with_its_lights(tmp_path: Path, stop_lines: bool) -> None:
         assert scene is None
 
 
+def test_lights_as_in_the_release_of_sind(tmp_path: Path) -> None:
+    """A first row without a time, at 29.97 frames per second: frame -60 is at -2002 ms.
+
+    Light 2 is green from then until 2002 ms. The lights of pedestrians are left out.
+    """
+    folder = write_sind(tmp_path / "sind", stop_lines=False)
+    place = folder / "Tianjin" / "8_2_1"
+    (place / "Traffic_Lights.csv").rename(place / "TrafficLight_8_2_1.csv")
+    head = "RawFrameID,timestamp(ms),Vehicle Traffic light 1,Vehicle Traffic light 2"
+    rows = ["-60,,0,1,1", "60,2002.002,0,3,1", "90,3003.003,1,0,0"]
+    text = "\n".join([f"{head},Pedestrian Traffic light 1", *rows]) + "\n"
+    (place / "TrafficLight_8_2_1.csv").write_text(text)
+    maps = folder / "Tianjin" / "Maps"
+    maps.mkdir()
+    (folder / "Tianjin" / "map.osm").rename(maps / "Tianjin.osm")
+    (recording,) = open_data(folder)
+    assert recording.signals is not None
+    assert recording.signals.states[1, :20].tolist() == [SignalState.GREEN] * 20
+    assert len(recording.signals.states) == 2
+    assert len(recording.road_map.lanes) == 2
+    for line in ("1 lights of pedestrians are left out", "have no time, which follows from"):
+        assert any(line in each for each in recording.repairs)
+
+
+def test_lights_that_cannot_be_read_do_not_stop_the_reading(tmp_path: Path) -> None:
+    folder = write_sind(tmp_path / "sind", stop_lines=True)
+    path = folder / "Tianjin" / "8_2_1" / "Traffic_Lights.csv"
+    path.write_text(path.read_text().replace(",", ";"))
+    (recording,) = open_data(folder)
+    assert recording.signals is None
+    assert any("the lights are left out" in line for line in recording.repairs)
+
+
 def test_states_of_signals_hold_until_the_next_change() -> None:
     changes = SignalChanges(
         stop_lines=np.zeros((1, 2, 2)),

@@ -36,7 +36,6 @@ def windows(scenarios: ScenarioSet) -> list[tuple[int, int]]:
 @pytest.mark.parametrize(
     ("duration_s", "expected"),
     [
-        (6.8, []),  # up to tick 34: 19 ticks after the history
         (7.0, [(15, 20)]),
         (18.0, [(15, 75)]),
         (20.0, [(15, 75)]),  # the remaining 2 s are too short
@@ -47,6 +46,12 @@ def windows(scenarios: ScenarioSet) -> list[tuple[int, int]]:
 def test_windows(duration_s: float, expected: list[tuple[int, int]]) -> None:
     """Windows of 20 to 75 ticks from tick 15 on."""
     assert windows(found(CAR, duration_s=duration_s)) == expected
+
+
+def test_windows_of_a_recording_that_is_too_short_for_the_usual_ones() -> None:
+    """Up to tick 34: 19 ticks after 3 s of history, but 31 after 0.6 s of it, with a warning."""
+    with pytest.warns(UserWarning, match=r"no recording lasts 4 s .* 2 s or more after 0\.6 s"):
+        assert windows(found(CAR, duration_s=6.8)) == [(3, 31)]
 
 
 def test_window_of_a_vehicle_that_appears_late() -> None:

@@ -188,7 +188,21 @@ def test_damaged_files_are_rejected(
         load_scenarios(path, recordings, **TICKS)
 
 
-@pytest.mark.parametrize("text", ["", "[1, 2]", "{", "3", '"a"', "\x00"])
+def test_one_scenario_of_a_file(
+    scenarios: ScenarioSet, recordings: Recordings, tmp_path: Path
+) -> None:
+    """It has the seed that it has in the file."""
+    path = tmp_path / "set.json"
+    save_scenarios(path, scenarios, recordings)
+    one = scenarios[len(scenarios) - 1]
+    (found,) = choose_scenarios(recordings, f"{path}#{one.name}", **TICKS)
+    assert found == load_scenarios(path, recordings, **TICKS)[len(scenarios) - 1]
+    assert (found.name, found.seed) == (one.name, one.seed)
+    with pytest.raises(AspEnvError, match=r"unknown scenario 'x': .* such as "):
+        choose_scenarios(recordings, f"{path}#x", **TICKS)
+
+
+@pytest.mark.parametrize("text", ["", "[1, 2]", "{", "3", '"a"', "\x00", "[" * 100_000])
 def test_other_and_missing_files_are_rejected(
     text: str, recordings: Recordings, tmp_path: Path
 ) -> None:

@@ -80,6 +80,7 @@ def episodes(*scores: float, **metrics: tuple[float, ...]) -> EpisodeScores:
     return EpisodeScores(
         metrics={name: Masked(value=np.array(each), valid=valid) for name, each in values.items()},
         endings=(Ending.GOAL,) * len(scores),
+        faults=(None,) * len(scores),
         rollouts=tuple(dataclasses.replace(make_rollout(), dt_s=score) for score in scores),
     )
 
@@ -123,7 +124,7 @@ def test_scores_are_in_the_order_of_the_scenarios(
         scores.add(*parts[number])
     assert scores.of(0).metrics["score"].value.tolist() == [0.1, 0.2, 0.3, 0.0]
     assert scores.of(1).metrics["score"].value.tolist() == [0.9, 0.3, 0.2, 0.3]
-    assert scores.worst == [2, 1, 3, 0]
+    assert scores.saved == [2, 1, 3, 0]
     assert scores_of_rollouts(scores, 1) == [0.2, 0.3, 0.3, 0.9]
     assert scores_of_rollouts(scores, 0) == [0.3, 0.2, 0.0, 0.1]
     assert len(scores.of(1).endings) == 4
@@ -137,11 +138,34 @@ def test_only_the_worst_rollouts_are_stored(
     alone = ComparisonScores(1, PDMS)
     alone.add(unit(scenarios, 0, 1, method=0), episodes(0.5, 0.4))
     alone.add(unit(scenarios, 2, method=0), episodes(0.6))
-    assert (alone.worst, scores_of_rollouts(alone, 0)) == ([1], [0.4])
+    assert (alone.saved, scores_of_rollouts(alone, 0)) == ([1], [0.4])
     unscored = ComparisonScores(1, WAYMAX)
     metrics = {"no_collision": (1.0, 1.0), "on_road": (1.0, 0.0), "progress": (0.1, 0.9)}
     unscored.add(unit(scenarios, 0, 1, method=0), episodes(0.5, 0.6, **metrics))
-    assert (unscored.worst, scores_of_rollouts(unscored, 0)) == ([1], [0.6])
+    assert (unscored.saved, scores_of_rollouts(unscored, 0)) == ([1], [0.6])
+
+
+@pytest.mark.parametrize("order", [(0, 1, 2, 3, 4, 5), (5, 4, 3, 2, 1, 0)])
+def test_rollouts_of_the_most_telling_scenarios_are_stored(
+    scenarios: ScenarioSet, monkeypatch: pytest.MonkeyPatch, order: tuple[int, ...]
+) -> None:
+    """Method 2 less the reference 1: +0.5, 0, -0.1, +0.1. The worst is 2, then gain 0, loss 2."""
+    monkeypatch.setattr(comparison, "SAVED_ROLLOUTS", 1)
+    monkeypatch.setattr(comparison, "TELLING_ROLLOUTS", 1)
+    parts = [
+        (unit(scenarios, *numbers, method=method), episodes(*scores))
+        for method, rows in enumerate([(0.9,) * 4, (0.4, 0.8, 0.2, 0.6), (0.9, 0.8, 0.1, 0.7)])
+        for numbers, scores in (((0, 1), rows[:2]), ((2, 3), rows[2:]))
+    ]
+    scores = ComparisonScores(3, PDMS, under_test=[2], reference=1)
+    for number in order:
+        scores.add(*parts[number])
+    assert scores.saved == [2, 0]
+    assert scores_of_rollouts(scores, 2) == [0.1, 0.9]
+    controls = ComparisonScores(3, PDMS, reference=1)
+    for number in order:
+        controls.add(*parts[number])
+    assert controls.saved == [2]
 
 
 def same(one: Rollout, other: Rollout, folder: Path) -> bool:

@@ -5,16 +5,13 @@ import csv
 import numpy as np
 import pytest
 
-from asp_env.data.predictor import Predictor
 from asp_env.data.scenarios.scenario import ScenarioSet
-from asp_env.data.scenarios.tags import COLUMNS, TAGS
-from asp_env.evaluation.closed_loop.comparison import EpisodeScores
-from asp_env.evaluation.closed_loop.scenario_table import write_scenario_table
+from asp_env.evaluation.closed_loop.scenario_table import DrivenScenarios, write_scenario_table
 from asp_env.evaluation.closed_loop.summary import Comparison, MethodScores, comparison_rows
 from asp_env.evaluation.results import Row
-from asp_env.metrics.masked import Masked
-from asp_env.sim.world import Ending
-from predictors.physical import ConstantVelocity
+from tests.evaluation.made_up import made_method as _method
+from tests.evaluation.made_up import made_scenarios as _scenarios
+from tests.evaluation.made_up import made_scores as _scores
 
 LADDER = {
     "constant-velocity": 0.90,
@@ -23,54 +20,6 @@ LADDER = {
     "blend:0.75": 0.96,
     "oracle": 0.98,
 }
-
-
-def _scenarios(*recordings: int, left: tuple[int, ...] = ()) -> ScenarioSet:
-    """Scenarios of recordings `r0`, `r1`, …; those of the given numbers turn left."""
-    count = len(recordings)
-    tags = np.zeros((count, len(TAGS)), dtype=bool)
-    tags[list(left), TAGS.index("left")] = True
-    names = tuple(f"r{i}" for i in range(max(recordings) + 1))
-    return ScenarioSet(
-        source="d",
-        recordings=names,
-        locations=("here",) * len(names),
-        dt_s=0.2,
-        history=15,
-        recording=np.array(recordings),
-        ego_id=np.arange(count),
-        start_tick=np.full(count, 15),
-        length=np.full(count, 50),
-        seed=np.zeros(count, dtype=np.int64),
-        tags=tags,
-        values=np.zeros((count, len(COLUMNS))),
-    )
-
-
-def _scores(values, **more) -> EpisodeScores:
-    """Scores with other metrics; NaN is a metric that is not defined."""
-    metrics = {"score": np.array(values, dtype=float)}
-    metrics |= {name: np.array(each, dtype=float) for name, each in more.items()}
-    return EpisodeScores(
-        metrics={
-            name: Masked(value=np.nan_to_num(each), valid=~np.isnan(each))
-            for name, each in metrics.items()
-        },
-        endings=(Ending.GOAL,) * len(values),
-        rollouts=(),
-    )
-
-
-def _method(predictor: str, *runs: EpisodeScores, planner="sampling", stream=0) -> MethodScores:
-    loaded: Predictor = ConstantVelocity(horizon=15, dt_s=0.2)
-    names = [predictor] if len(runs) == 1 else [f"{predictor} {i}" for i in range(len(runs))]
-    return MethodScores(
-        planner=planner,
-        predictor=predictor,
-        runs=dict.fromkeys(names, loaded if predictor else None),
-        scores=runs,
-        stream=stream,
-    )
 
 
 def _rows(methods: list[MethodScores], scenarios: ScenarioSet, **options) -> dict[tuple, Row]:
@@ -94,7 +43,10 @@ DIFFERENCE = "score - constant-velocity"
 def test_differences_are_paired_by_scenario():
     """Gains of 0.2 and 0.4 in two recordings: 0.3 [0.2, 0.4], although the scores vary by 0.8."""
     rows = _rows(
-        [_method("constant-velocity", _scores([0.1, 0.5])), _method("mtp", _scores([0.3, 0.9]))],
+        [
+            _method("constant-velocity", _scores([0.1, 0.5])),
+            _method("mtp", _scores([0.3, 0.9])),
+        ],
         _scenarios(0, 1),
     )
     row = rows["mtp", "all", DIFFERENCE]
@@ -122,7 +74,10 @@ def test_several_runs_are_one_method():
     """The mean over two runs in two recordings, with an interval over both."""
     runs = _scores([0.2, 0.4]), _scores([0.6, 0.8])
     rows = _rows(
-        [_method("constant-velocity", _scores([0.1, 0.3])), _method("m:*", *runs, stream=1)],
+        [
+            _method("constant-velocity", _scores([0.1, 0.3])),
+            _method("m:*", *runs, stream=1),
+        ],
         _scenarios(0, 1),
     )
     score, gain = rows["m:*", "all", "score"], rows["m:*", "all", DIFFERENCE]
@@ -137,7 +92,9 @@ def test_metrics_that_a_run_lacks_are_means_of_the_others():
     methods = [
         _method("constant-velocity", _scores([0, 0, 0], comfort=[0.0, 0.0, nan])),
         _method(
-            "m", _scores([0, 0, 0], comfort=[1, nan, 0]), _scores([0, 0, 0], comfort=[1, 1, 0])
+            "m",
+            _scores([0, 0, 0], comfort=[1, nan, 0]),
+            _scores([0, 0, 0], comfort=[1, 1, 0]),
         ),
     ]
     rows = _rows(methods, _scenarios(0, 1, 1), compared=["score", "comfort"])
@@ -152,7 +109,8 @@ def test_the_oracle_share_is_that_of_the_ladder():
     blind = _method("blind", _scores([0.2] * 4))
     expert = _method("", _scores([1.0] * 4), planner="expert")
     rows = _rows(
-        [expert, *ladder, blind, _method("m", _scores([0.93] * 4))], _scenarios(0, 0, 1, 1)
+        [expert, *ladder, blind, _method("m", _scores([0.93] * 4))],
+        _scenarios(0, 0, 1, 1),
     )
     share, headroom = rows["m", "all", "oracle share"], rows["m", "all", "headroom"]
     assert (share.value, share.low, share.high, share.n) == pytest.approx((0.375, 0.375, 0.375, 4))
@@ -203,13 +161,20 @@ def test_an_unresolved_headroom_has_no_number():
 def test_the_reference_may_be_any_method():
     """Also one of several runs, which are resampled too."""
     reference = _method("m:*", _scores([0.2, 0.2]), _scores([0.4, 0.4]), stream=3)
-    rows = _rows([reference, _method("b", _scores([0.5, 0.5]))], _scenarios(0, 1), reference="m:*")
+    rows = _rows(
+        [reference, _method("b", _scores([0.5, 0.5]))],
+        _scenarios(0, 1),
+        reference="m:*",
+    )
     gain = rows["b", "all", "score - m:*"]
     assert (gain.value, gain.low, gain.high) == pytest.approx((0.2, 0.1, 0.3))
 
 
 def test_subsets_have_their_own_rows():
-    methods = [_method("constant-velocity", _scores([0, 0])), _method("m", _scores([1.0, 0.5]))]
+    methods = [
+        _method("constant-velocity", _scores([0, 0])),
+        _method("m", _scores([1.0, 0.5])),
+    ]
     rows = _rows(methods, _scenarios(0, 1, left=(1,)))
     assert rows["m", "left", DIFFERENCE].value == 0.5
     assert rows["m", "all", DIFFERENCE].value == 0.75
@@ -222,18 +187,82 @@ def test_the_scenario_table_has_a_row_for_each_method_run_and_scenario(tmp_path)
         _method("", _scores([1, 1], comfort=[1, np.nan]), planner="expert"),
         _method("m:*", _scores([1 / 3, 1]), _scores([0.5, 1])),
     ]
-    write_scenario_table(tmp_path, _scenarios(0, 1, left=(0,)), methods)
+    scenarios = _scenarios(0, 1, left=(0,))
+    driven = DrivenScenarios(
+        data="d", traffic="log", latency_ticks=2, scenarios=scenarios, methods=methods
+    )
+    write_scenario_table(tmp_path, [driven])
     with (tmp_path / "scenarios.csv").open(newline="") as file:
         header, *rows = csv.reader(file)
     assert header == [
-        "scenario", "recording", "location", "tags", "planner", "predictor", "run", "ending",
-        "score", "comfort",
+        "data", "traffic", "latency_ticks", "scenario", "recording", "location", "tags", "planner",
+        "predictor", "run", "ending", "fault", "score", "comfort",
     ]  # fmt: skip
     assert rows == [
-        ["r0-0-15", "r0", "here", "left", "expert", "", "", "GOAL", "1", "1"],
-        ["r1-1-15", "r1", "here", "", "expert", "", "", "GOAL", "1", ""],
-        ["r0-0-15", "r0", "here", "left", "sampling", "m:*", "m:* 0", "GOAL", "0.333333", ""],
-        ["r1-1-15", "r1", "here", "", "sampling", "m:*", "m:* 0", "GOAL", "1", ""],
-        ["r0-0-15", "r0", "here", "left", "sampling", "m:*", "m:* 1", "GOAL", "0.5", ""],
-        ["r1-1-15", "r1", "here", "", "sampling", "m:*", "m:* 1", "GOAL", "1", ""],
+        ["d", "log", "2", "r0-0-15", "r0", "here", "left", "expert", "", "", "GOAL", "", "1", "1"],
+        ["d", "log", "2", "r1-1-15", "r1", "here", "", "expert", "", "", "GOAL", "", "1", ""],
+        [
+            "d",
+            "log",
+            "2",
+            "r0-0-15",
+            "r0",
+            "here",
+            "left",
+            "sampling",
+            "m:*",
+            "m:* 0",
+            "GOAL",
+            "",
+            "0.333333",
+            "",
+        ],
+        [
+            "d",
+            "log",
+            "2",
+            "r1-1-15",
+            "r1",
+            "here",
+            "",
+            "sampling",
+            "m:*",
+            "m:* 0",
+            "GOAL",
+            "",
+            "1",
+            "",
+        ],
+        [
+            "d",
+            "log",
+            "2",
+            "r0-0-15",
+            "r0",
+            "here",
+            "left",
+            "sampling",
+            "m:*",
+            "m:* 1",
+            "GOAL",
+            "",
+            "0.5",
+            "",
+        ],
+        [
+            "d",
+            "log",
+            "2",
+            "r1-1-15",
+            "r1",
+            "here",
+            "",
+            "sampling",
+            "m:*",
+            "m:* 1",
+            "GOAL",
+            "",
+            "1",
+            "",
+        ],
     ]

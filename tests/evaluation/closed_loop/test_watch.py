@@ -139,7 +139,7 @@ def test_files_that_are_no_rollouts_are_errors(drives, tmp_path, capsys):
     states = rollout.states.copy()
     states[3, 0, 0] = np.nan
     dataclasses.replace(rollout, states=states).save(damaged)
-    with pytest.raises(DataError, match=r"00-1-15\.npz: states: expected finite numbers"):
+    with pytest.raises(DataError, match=r"00-1-15\.npz: states: expected numbers up to 10,000,000"):
         make_films(load_rollouts(damaged), None)
 
 

@@ -157,9 +157,9 @@ def test_a_horizon_that_is_no_whole_number_of_ticks_is_an_error(crossings):
 
 
 def test_data_without_snippets_are_an_error(tmp_path):
-    """Five seconds are shorter than a history and a horizon of 3 s each."""
-    write_crossing(tmp_path, drives=((car(-90, 5),),), seconds=5.0)
-    with pytest.raises(AspEnvError, match="no snippet is left to evaluate on"):
+    """Three seconds are shorter than 0.6 s of history, the least, and a horizon of 3 s."""
+    write_crossing(tmp_path, drives=((car(-90, 5),),), seconds=3.0)
+    with pytest.raises(AspEnvError, match=r"no recording lasts 3\.6 s, for 0\.6 s of history"):
         _evaluate(tmp_path, "oracle")
 
 

@@ -129,6 +129,9 @@ def test_motions_shorter_than_one_window_are_missing(ticks: int) -> None:
     states, mask = np.zeros((ticks + 6, 4)), np.ones((), dtype=bool)
     assert not comfortable(states, 0.1, mask).valid
     assert comfortable(np.zeros((11, 4)), 0.1, mask).valid
+    several = comfortable(np.zeros((2, 3, ticks, 4)), DT_S, np.ones((2, 3), dtype=bool))
+    assert several.value.shape == several.valid.shape == (2, 3)
+    assert not several.valid.any()
 
 
 def test_the_given_mask_is_returned() -> None:

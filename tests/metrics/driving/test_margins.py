@@ -12,6 +12,7 @@ from asp_env.geometry import from_frame
 from asp_env.metrics.boxes import Contact
 from asp_env.metrics.driving.margins import (
     MAX_BRAKING_MPS2,
+    _curvature,
     bounded_ttc_s,
     near_misses,
     required_deceleration,
@@ -146,6 +147,13 @@ def test_required_deceleration_for_a_crossing_car() -> None:
     assert found == pytest.approx(4.96, abs=0.25)  # the instants before and after 1.79 s
 
 
+def test_required_deceleration_has_the_sector_of_nuplan() -> None:
+    """A car from the side, 48° off the heading seen from the rear axle, counts if it is wide."""
+    crossing, slow = (6.0, 8.0, -math.pi / 2, 5.0), (0.0, 0.0, 0.0, 5.0)
+    assert braking(crossing, ego=slow, wide_sector=True) > 0
+    assert braking(crossing, ego=slow, wide_sector=False) == 0
+
+
 def test_an_agent_that_hits_the_standing_ego_requires_nothing_more() -> None:
     """Head on, braking to a stop is all that the ego can do: v² / 2 a ≤ its share of the gap.
 
@@ -167,6 +175,34 @@ def test_the_ego_continues_along_its_curvature() -> None:
     assert measures(on_circle)[2].max() == 0
     assert measures(on_line)[2][0] == pytest.approx(2.5, abs=0.03)
     assert measures(on_circle)[1][0] < 3  # the time to collision extrapolates straight on
+
+
+def test_curvature_by_hand() -> None:
+    """Turns of 0.09, 0.14, 0.24 and -0.4 rad over 1.8, 1.4, 1 and 0.6 m, which is clipped.
+
+    At a mean speed of 0.5 m/s there is none. The headings pass π.
+    """
+    egos = np.zeros((1, 6, 4))
+    egos[0, :, 2] = (3.1 + np.cumsum([0, 0.09, 0.14, 0.24, -0.4, 1]) + np.pi) % (2 * np.pi) - np.pi
+    egos[0, :, 3] = [10, 8, 6, 4, 2, -1]
+    np.testing.assert_allclose(_curvature(egos, DT_S), [[0.05, 0.05, 0.1, 0.24, -0.3, 0]])
+    assert _curvature(egos[:, :1], DT_S).tolist() == [[0.0]]
+
+
+@pytest.mark.parametrize("side", [1, -1])
+def test_the_ego_brakes_for_a_car_on_its_circle(side: int) -> None:
+    """A car stands 20 m further along a circle of 20 m, to the left or the right: 10² / (2 · 16).
+
+    On the other side it is not in the way.
+    """
+    angle = np.arange(5) * 10 * DT_S / 20
+    path = np.stack([20 * np.sin(angle), 20 - 20 * np.cos(angle), angle, 10 + 0 * angle], axis=-1)
+    ahead = np.tile([20 * math.sin(1), 20 - 20 * math.cos(1), 1.0, 0.0], (5, 1))
+    mirror = np.array([1, side, side, 1])
+    inside = np.stack([path * mirror, ahead * mirror], axis=1)[None]
+    outside = np.stack([path * mirror, ahead * mirror * [1, -1, -1, 1]], axis=1)[None]
+    assert measures(inside, wide_sector=True)[2][0] == pytest.approx(100 / 32, abs=0.1)
+    assert measures(outside, wide_sector=True)[2][0] == 0
 
 
 states = st.tuples(

@@ -277,6 +277,8 @@ def test_log_divergence() -> None:
     log_states[0, 2:, :2] += (3.0, 4.0)
     log_states[0, 4:] = math.nan
     assert values(record(log_states=log_states, active=4))["log divergence"] == pytest.approx(2.5)
+    away = record().states + np.array([3.0, 4.0, 0.0, 0.0])
+    assert values(record(log_states=away, active=1))["log divergence"] == pytest.approx(5)
 
 
 def test_route_deviation() -> None:
@@ -317,6 +319,27 @@ def test_scores_do_not_depend_on_order_padding_and_pose(rules: Rules) -> None:
     for name, metric in driving_metrics(elsewhere, rules).items():
         np.testing.assert_allclose(metric.value, metrics[name].value[order], atol=1e-9)
         np.testing.assert_array_equal(metric.valid, metrics[name].valid[order])
+
+
+@pytest.mark.parametrize("rules", [NUPLAN, GRADED], ids=["nuplan", "graded"])
+def test_metrics_of_a_batch_are_those_of_each_episode(rules: Rules) -> None:
+    """Faults, delays, short episodes and missing limits of one leave the others as they are."""
+    braking = record().states.copy()
+    braking[0, :, 3] = 15 - np.arange(TICKS)
+    episodes = [
+        record(),
+        record(contacts=contact(2, Contact.FRONT), near_miss=at_tick(2, 1).astype(bool)),
+        record(active=3, off_road_m=0.4, bounded_ttc_s=at_tick(1, 1.2, 3.0)),
+        record(states=braking, required_mps2=at_tick(4, 2.5), against_m=at_tick(3, 2.5)),
+        record(limit_mps=4.0, distance_to_route_lanes_m=4.0, ttc_s=0.5, route_m=34.0),
+        record(active=0),
+    ]
+    batch = driving_metrics(joined(episodes), rules)
+    for number, episode in enumerate(episodes):
+        for name, metric in driving_metrics(episode, rules).items():
+            assert batch[name].valid[number] == metric.valid[0], name
+            if metric.valid[0]:
+                assert batch[name].value[number] == pytest.approx(metric.value[0], abs=1e-12), name
 
 
 def test_rules_have_labels_and_name_metrics_that_exist() -> None:

@@ -11,7 +11,7 @@ from hypothesis import given
 from asp_env.geometry import from_frame
 from asp_env.metrics.boxes import Contact
 from asp_env.metrics.driving.rules import NUPLAN, PDMS, STRICT
-from asp_env.metrics.driving.ttc import TtcRule, time_to_collision
+from asp_env.metrics.driving.ttc import TtcRule, agent_counts, time_to_collision
 
 State = tuple[float, float, float, float]
 CAR = (4.0, 2.0)
@@ -27,6 +27,7 @@ def over_ticks(
     valid: np.ndarray | None = None,
     wide_sector: bool = False,
     num_ticks: int | None = None,
+    dt_s: float = DT_S,
 ) -> np.ndarray:
     """(t,) the times to collision in one episode of cars with states (t, a, 4)."""
     ticks, agents = states.shape[:2]
@@ -40,7 +41,7 @@ def over_ticks(
         wide_sector=np.full((1, ticks), wide_sector),
         num_ticks=np.array([ticks if num_ticks is None else num_ticks]),
         rule=rule,
-        dt_s=DT_S,
+        dt_s=dt_s,
     )
     return found
 
@@ -140,6 +141,33 @@ def test_sector(angle_deg: float, wide_sector: bool, counts: bool) -> None:
     assert (found < 1.5) is counts
 
 
+@pytest.mark.parametrize("heading", [0.0, 1.0, 2.5, -2.0])
+@pytest.mark.parametrize(
+    ("angle_deg", "narrow", "wide"),
+    [(29, True, True), (-31, False, True), (149, False, True), (-151, False, False)],
+)
+def test_sectors_turn_with_the_vehicle(
+    heading: float, angle_deg: float, narrow: bool, wide: bool
+) -> None:
+    """Seen from the rear axle, 1.2 m behind the centre at (7, -3), in any heading."""
+    angle = heading + math.radians(angle_deg)
+    x = 7 - 1.2 * math.cos(heading) + 2 * math.cos(angle)
+    y = -3 - 1.2 * math.sin(heading) + 2 * math.sin(angle)
+    assert agent_counts(7.0, -3.0, heading, 4.0, x, y, True, False) == narrow
+    assert agent_counts(7.0, -3.0, heading, 4.0, x, y, True, True) == wide
+
+
+@pytest.mark.parametrize("heading", [0.0, 1.0, 2.5, -2.0])
+@pytest.mark.parametrize(("ahead_m", "counts"), [(-1.9, True), (-2.1, False)])
+def test_without_a_sector_agents_count_from_the_rear_bumper_on(
+    heading: float, ahead_m: float, counts: bool
+) -> None:
+    """The rear bumper is 2 m behind the centre; 5 m to the left changes nothing."""
+    cos, sin = math.cos(heading), math.sin(heading)
+    x, y = 7 + ahead_m * cos - 5 * sin, -3 + ahead_m * sin + 5 * cos
+    assert agent_counts(7.0, -3.0, heading, 4.0, x, y, False, False) == counts
+
+
 def test_agents_that_have_touched_the_ego_are_ignored() -> None:
     """By nuPlan for the rest of the episode, by the strict rules only during the contact."""
     states = np.array([[EGO, (3.5, 0, 0, 0)], [EGO, (13.95, 0, 0, 0)], [EGO, (13.95, 0, 0, 0)]])
@@ -188,6 +216,29 @@ def test_recorded_futures_between_ticks() -> None:
     assert over_ticks(np.stack([ego, other], axis=1), rule)[0] == math.inf
     other[:, 0] -= 0.1
     assert over_ticks(np.stack([ego, other], axis=1), rule)[0] == pytest.approx(0.3)
+
+
+@pytest.mark.parametrize(("y_m", "expected"), [(3.9, 0.3), (4.1, math.inf)])
+def test_recorded_futures_to_the_side(y_m: float, expected: float) -> None:
+    """A car 3 m ahead moves sideways from y to 0 between 0.2 and 0.4 s, so it is at y / 2 at 0.3 s.
+
+    The ego is 3 m ahead then, and the boxes overlap if their centres are less than 2 m apart.
+    """
+    other = np.array([(3.0, y, 0.0, 0.0) for y in (y_m, y_m, 0, 0, 0)])
+    ego = np.broadcast_to(np.array(EGO), other.shape)
+    for side in (1, -1):
+        both = np.stack([ego, other * [1, side, 1, 1]], axis=1)
+        found = over_ticks(both, replace(PDMS.ttc, horizon_s=0.3), wide_sector=True)
+        assert found[0] == pytest.approx(expected)
+
+
+@pytest.mark.parametrize(("y_m", "expected"), [(1.9, 0.3), (2.1, math.inf)])
+def test_recorded_headings_that_do_not_change(y_m: float, expected: float) -> None:
+    """At three quarters of a tick of 0.4 s a car beside the ego is not turned: 2 m are free."""
+    other = np.array([(3.0, y_m, 0.0, 10.0)] * 3)
+    ego = np.broadcast_to(np.array(EGO), other.shape)
+    found = over_ticks(np.stack([ego, other], axis=1), replace(PDMS.ttc, horizon_s=0.3), dt_s=0.4)
+    assert found[0] == pytest.approx(expected)
 
 
 def test_absent_agents_and_ticks_after_the_end_are_ignored() -> None:

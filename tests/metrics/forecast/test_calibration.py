@@ -44,6 +44,13 @@ def test_nll(ends: list[tuple[float, float]], probabilities: list[float], expect
     assert nll(ends, probabilities) == pytest.approx(expected)
 
 
+def test_nll_of_a_target_does_not_depend_on_the_others() -> None:
+    """A target that is 300 m off has 300² / 2 nats more than one that is right, side by side."""
+    ends = np.array([[(0.0, 0.0)], [(300.0, 0.0)]])
+    found = mixture_nll(ends, np.zeros((2, 1)), np.zeros((2, 2)), np.ones(2, dtype=bool))
+    assert found.value == pytest.approx([LOG_2PI, LOG_2PI + 45_000])
+
+
 def test_nll_is_a_density() -> None:
     """exp(-NLL) over a grid of 0.25 m that covers both modes adds up to one."""
     side = np.arange(-8, 8, 0.25)

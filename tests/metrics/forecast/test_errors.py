@@ -125,14 +125,14 @@ def test_best_by_mean_error() -> None:
 
 
 def test_inconsistency() -> None:
-    """Forecasts of 4 ticks made one tick apart share 3, off by 0, 1 and 2 m, mean 1.
+    """Forecasts of 4 ticks made one tick apart share 3, off by 0, 1 and 5 m, mean 2.
 
     The earlier one is at 2, 3 and 4 m at the ticks 1, 2 and 3 of the later one.
     """
-    later = np.array([(2.0, 0.0), (3.0, 1.0), (4.0, 2.0), (9.0, 9.0)])
+    later = np.array([(2.0, 0.0), (3.0, 1.0), (4.0, 5.0), (9.0, 9.0)])
     pair = np.stack([ALONG_X] * 2), np.stack([later] * 2)
     found = inconsistency(*pair, np.array([True, False]), apart=1)
-    assert found.value[0] == pytest.approx(1.0)
+    assert found.value[0] == pytest.approx(2.0)
     assert found.valid.tolist() == [True, False]
     assert not inconsistency(*pair, np.array([True, True]), apart=4).valid.any()
 
@@ -219,6 +219,19 @@ def test_errors_over_time(dt_s: float, ticks: int, expected: dict[int, int]) -> 
     for second, tick in expected.items():
         assert found[f"L2@{second}s"].value.tolist() == [tick]
         assert found[f"L2@{second}s"].valid.tolist() == [tick < ticks]
+
+
+@pytest.mark.parametrize(("selection", "away_m"), [("most-probable", 3.0), ("best-of-3", 1.0)])
+def test_errors_over_time_are_those_of_the_selected_mode(
+    selection: Selection, away_m: float
+) -> None:
+    """The most probable of the four modes is off by 3 m, the best of the first three by 1 m."""
+    forecast = (FOUR_MODES[None], np.log(FOUR_PROBABILITIES)[None], ALONG_X[None])
+    found = errors_over_time(*forecast, np.ones((1, 4), bool), selection, dt_s=0.5)
+    assert {name: error.value.tolist() for name, error in found.items()} == {
+        "L2@1s": [away_m],
+        "L2@2s": [away_m],
+    }
 
 
 def test_without_targets_errors_are_empty() -> None:

@@ -60,7 +60,7 @@ def driven(speeds: list[float], headings: list[float]) -> np.ndarray:
         ([-5.0, -5.0, -5.0], [0.0, 0.0, 0.0], True),
     ],
     ids=[
-        *("steady", "10.4 m/s²", "10.5 m/s²", "-10.5 m/s²", "0.3 1/m", "0.31 1/m"),
+        *("steady", "10.4 m/s2", "10.5 m/s2", "-10.5 m/s2", "0.3 1/m", "0.31 1/m"),
         *("-0.31 1/m", "too slow for a curvature", "reversing at once"),
     ],
 )

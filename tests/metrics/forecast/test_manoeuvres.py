@@ -36,6 +36,8 @@ RATE = np.radians(40) / 6.0
         (drive(0.0, (0, 0), (1.5, 0.4)), Manoeuvre.STARTING),
         (drive(6.0, (0, 0), (-2, 0)), Manoeuvre.STOPPING),
         (drive(6.0, (0, 0.4), (-2, 0)), Manoeuvre.STOPPING),
+        (drive(1.0, (0, 0)), Manoeuvre.STARTING),
+        (drive(4.0, (0, 0), (-1, 0)), Manoeuvre.STOPPING),
         (drive(6.0, (0, 0), (-1, 0)), Manoeuvre.STRAIGHT),
         (drive(8.0, (0, RATE)), Manoeuvre.LEFT),
         (drive(8.0, (0, -RATE)), Manoeuvre.RIGHT),
@@ -46,8 +48,16 @@ RATE = np.radians(40) / 6.0
     ],
     ids=[
         *("stands", "creeps 1.8 m", "creeps 2.7 m", "starts", "starts into a turn", "stops"),
-        *("turns, then stops", "brakes to 3 m/s", "left", "right", "left before now"),
-        *("turns and turns back", "28°", "320° on a roundabout"),
+        *(
+            "turns, then stops",
+            "1 m/s, 3 m",
+            "brakes to 1 m/s",
+            "brakes to 3 m/s",
+            "left",
+            "right",
+            "left before now",
+        ),
+        *("turns and turns back", "28 degrees", "320 degrees on a roundabout"),
     ],
 )
 def test_manoeuvres_by_hand(states: np.ndarray, expected: Manoeuvre) -> None:

@@ -1,6 +1,8 @@
 """The study of fine-tuning: folds, shares, and what it writes."""
 
 import csv
+import dataclasses
+import re
 from pathlib import Path
 
 import numpy as np
@@ -9,7 +11,9 @@ import pytest
 from asp_env.data.snippets import SnippetIndex
 from asp_env.errors import AspEnvError
 from predictors.experiments.finetuning import (
+    SHARES_TRIED,
     Finetuning,
+    Study,
     clear_of,
     folds_of_blocks,
     folds_of_recordings,
@@ -100,3 +104,22 @@ def test_single_fold_is_refused(tmp_path: Path) -> None:
     data = write_data(tmp_path / "a", recordings=1)
     with pytest.raises(AspEnvError, match="or --by blocks"):
         Finetuning(data=(data,), out=tmp_path / "out", from_run="ffw-asp:pretrained").run()
+
+
+def test_too_small_share_is_refused_before_training(tmp_path: Path) -> None:
+    """The share that the message suggests can be trained, and the next smaller one cannot."""
+    options = Finetuning(
+        data=(write_data(tmp_path / "a", cars=5),), out=tmp_path / "out", seeds=2, folds=2,
+        from_run="ffw-asp:pretrained", shares=(0.001,),
+    )  # fmt: skip
+    with pytest.raises(AspEnvError, match=r"share 0\.001: with fold 0 held out") as raised:
+        options.run()
+    assert not (tmp_path / "out").exists()
+    found = re.search(r"--shares of at least ([\d.]+)", str(raised.value))
+    assert found is not None
+    enough = float(found[1])
+    Study.open(dataclasses.replace(options, shares=(enough,))).check_shares()
+    smaller = [each for each in SHARES_TRIED if each < enough]
+    for share in smaller[-1:]:
+        with pytest.raises(AspEnvError):
+            Study.open(dataclasses.replace(options, shares=(share,))).check_shares()

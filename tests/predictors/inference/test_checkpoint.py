@@ -69,6 +69,13 @@ def poison(run: Path) -> None:
     save_file(weights, run / "weights.safetensors")
 
 
+def weaken(run: Path) -> None:
+    """Changes a weight a little."""
+    weights = load_file(run / "weights.safetensors")
+    weights["norm.bias"][0] += 0.5
+    save_file(weights, run / "weights.safetensors")
+
+
 FAULTS: dict[str, tuple[Callable[[Path], Any], str]] = {
     "no configuration": (lambda run: (run / "config.json").unlink(), "holds no trained predictor"),
     "no weights": (lambda run: (run / "weights.safetensors").unlink(), "is missing: the run"),
@@ -139,6 +146,18 @@ FAULTS: dict[str, tuple[Callable[[Path], Any], str]] = {
         "does not fit",
     ),
     "weights that are not finite": (poison, "not finite"),
+    "another finite weight": (weaken, "weights.safetensors is damaged or of another run"),
+    "fraction in the place of a number": (
+        lambda run: change_network(run, features=8.0),
+        "features is 8.0, expected a whole number",
+    ),
+    "horizon of a fraction": (lambda run: change(run, horizon=15.5), "horizon is 15.5"),
+    "network of any size": (
+        lambda run: change_network(run, gru_width=10**6),
+        "a network of .* weights, expected at most",
+    ),
+    "deep JSON": (lambda run: (run / "config.json").write_text("[" * 100_000), "nested too"),
+    "very high temperature": (lambda run: change(run, temperature=1e308), "temperature is 1e"),
 }
 
 
@@ -149,6 +168,41 @@ def test_faults_are_refused_in_one_line(fault: str, run: Path) -> None:
     with pytest.raises(CheckpointError, match=message) as caught:
         load_predictor(f"ffw-asp:{run}", horizon=15, dt_s=0.2)
     assert "\n" not in str(caught.value)
+
+
+def test_weights_of_earlier_versions_have_no_hash(run: Path) -> None:
+    """They load; what damage makes of a forecast is refused where it is not finite."""
+    drop(run, "weights_sha256")
+    weaken(run)
+    predictor = load_predictor(f"ffw-asp:{run}", horizon=15, dt_s=0.2)
+    weights = load_file(run / "weights.safetensors")
+    save_file({name: each * 1e30 for name, each in weights.items()}, run / "weights.safetensors")
+    damaged = load_predictor(f"ffw-asp:{run}", horizon=15, dt_s=0.2)
+    recordings = [make_recording()]
+    index = index_snippets(recordings, dt_s=0.2, horizon_s=3.0)
+    scene = gather_scene(recordings, index.select(np.array([0])))
+    assert np.isfinite(predictor.predict(scene).states).all()
+    with pytest.raises(CheckpointError, match="a forecast is not finite"):
+        damaged.predict(scene)
+
+
+@pytest.mark.parametrize(
+    ("field", "value", "message"),
+    [
+        ("lines", 6.4e7, r"lines is 64000000\.0, expected a whole number"),
+        ("lines", 64_000_000, "give at most 1,000, 10,000 and 1,000"),
+        ("agents", True, "agents is True, expected a whole number"),
+        ("own_past", 1, "own_past is 1, expected true or false"),
+    ],
+)
+def test_views_of_other_numbers_are_refused(
+    field: str, value: Any, message: str, tmp_path: Path
+) -> None:
+    run = save_random(tmp_path / "run", "ffw-asp", "vectors")
+    view = json.loads((run / "config.json").read_text())["view"]
+    change(run, view={**view, field: value})
+    with pytest.raises(CheckpointError, match=message):
+        load_predictor(f"ffw-asp:{run}", horizon=15, dt_s=0.2)
 
 
 def test_missing_run_is_refused() -> None:

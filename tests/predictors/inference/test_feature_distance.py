@@ -102,6 +102,7 @@ def test_missing_and_damaged_files_name_the_remedy(tmp_path: Path) -> None:
         {"mean": whole["mean"]},
         {**whole, "threshold": np.array([0.0], dtype=np.float32)},
         {**whole, "whitening": np.full((2, 2), np.nan, dtype=np.float32)},
+        {**whole, "mean": whole["mean"] + 1},  # has another checksum
     )
     for damage in damages:
         save_file(damage, path)

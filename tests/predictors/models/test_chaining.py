@@ -8,6 +8,7 @@ import torch
 from hypothesis import given
 from hypothesis import strategies as st
 
+from asp_env.errors import AspEnvError
 from predictors.models.chaining import (
     MIN_MASS,
     Chains,
@@ -15,6 +16,7 @@ from predictors.models.chaining import (
     extend,
     merge,
     prune,
+    segment_ticks,
     select,
 )
 
@@ -59,6 +61,35 @@ def second() -> Chains:
 def probabilities(chains: Chains) -> list[float]:
     """Probabilities of the target's chains."""
     return chains.log_probs[0].exp().tolist()
+
+
+@pytest.mark.parametrize(
+    ("segment_s", "horizon_s", "dt_s", "ticks"),
+    [(1.0, 3.0, 0.2, 5), (3.0, 3.0, 0.2, 15), (0.2, 3.0, 0.2, 1), (0.6, 6.0, 0.1, 6)],
+)
+def test_segment_ticks(segment_s: float, horizon_s: float, dt_s: float, ticks: int) -> None:
+    assert segment_ticks(segment_s, horizon_s=horizon_s, dt_s=dt_s) == ticks
+
+
+@pytest.mark.parametrize(
+    ("segment_s", "fault"),
+    [
+        (2.0, "the horizon of 3 s is no whole number of them"),
+        (0.5, "they are no whole number of ticks of 0.2 s"),
+        (0.7, "they are no whole number of ticks of 0.2 s"),
+        (0.1, "they are no whole number of ticks of 0.2 s"),
+        (0.0, "they are no whole number of ticks of 0.2 s"),
+        (-1.0, "they are no whole number of ticks of 0.2 s"),
+    ],
+)
+def test_segments_that_do_not_fit_name_those_that_do(segment_s: float, fault: str) -> None:
+    """Of 15 ticks of 0.2 s, segments may have 1, 3, 5 or 15."""
+    with pytest.raises(AspEnvError) as caught:
+        segment_ticks(segment_s, horizon_s=3.0, dt_s=0.2)
+    assert str(caught.value) == (
+        f"ssp-asp chains segments of {segment_s:g} s, {fault}: 3 s can be cut into segments of "
+        "0.2, 0.6, 1, 3 s"
+    )
 
 
 def test_full_has_every_pair_with_the_product(first: Chains, second: Chains) -> None:
@@ -201,6 +232,17 @@ def test_merging_returns_the_requested_number() -> None:
     probabilities = reduced.log_probs.exp()[0]
     assert float(probabilities[0]) > 0.999
     assert float(probabilities.sum()) == pytest.approx(1, abs=1e-6)
+
+
+def test_targets_are_merged_independently() -> None:
+    """The results for two targets together are those for each alone."""
+    one = ending_at([0.0, 2.0, 4.0], [0.4, 0.35, 0.25])
+    other = ending_at([7.0, 1.0, 1.5], [0.5, 0.3, 0.2])
+    both = merge(Chains(*(torch.cat(pair) for pair in zip(one, other, strict=True))), 2, HALF_M)
+    for number, chains in enumerate((one, other)):
+        alone = merge(chains, 2, HALF_M)
+        for found, expected in zip(both, alone, strict=True):
+            torch.testing.assert_close(found[number], expected[0])
 
 
 @given(st.integers(0, 10_000), st.integers(1, 6), st.integers(1, 7))

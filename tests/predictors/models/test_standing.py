@@ -103,6 +103,28 @@ def test_terms_of_the_learned_targets_by_hand() -> None:
     assert float(terms["classification"]) == 0.0
 
 
+def test_terms_without_a_target_to_learn_from_are_zero() -> None:
+    """Both terms are 0 and so are their gradients."""
+    positions = torch.ones(2, 3, 4, 2, requires_grad=True)
+    logits = torch.zeros(2, 3, requires_grad=True)
+    terms = mode_terms(
+        positions,
+        logits,
+        torch.zeros(2, 4, 2),
+        assignment="distance",
+        classification="cross-entropy",
+        share=None,
+        learned=torch.zeros(2, dtype=torch.bool),
+    )
+    assert {name: float(term.detach()) for name, term in terms.items()} == {
+        "regression": 0.0,
+        "classification": 0.0,
+    }
+    for term in terms.values():
+        gradients = torch.autograd.grad(term, (positions, logits), retain_graph=True)
+        assert not any(gradient.any() for gradient in gradients)
+
+
 @given(x=st.floats(-40, 40))
 def test_log_sigmoid(x: float) -> None:
     expected = float(torch.nn.functional.logsigmoid(torch.tensor(x, dtype=torch.float64)))

@@ -165,6 +165,17 @@ def test_finished_run_is_refused(data: str, finished: Path) -> None:
         train(tiny_config(), data, finished)
 
 
+def test_a_run_that_was_killed_after_its_last_file(data: str, tmp_path: Path) -> None:
+    """It is finished; its state is removed."""
+    state = tmp_path / "unfinished"
+    state.mkdir()
+    (state / "run.json").write_text("{}")
+    (tmp_path / "config.json").write_text("{}")
+    with pytest.raises(AspEnvError, match="holds a finished run"):
+        train(tiny_config(), data, tmp_path)
+    assert not state.exists()
+
+
 def test_other_configuration_is_refused(data: str, tmp_path: Path) -> None:
     """An unfinished run is continued only with its own configuration."""
     out = tmp_path / "run"

@@ -152,6 +152,13 @@ def _rows(path: Path) -> np.ndarray:
     return load_history(path).rows
 
 
+def _changed(path: Path, **fields: Any) -> None:
+    rows = _rows(path).copy()
+    for name, value in fields.items():
+        rows[name][0] = value
+    _npz(path, rows=rows)
+
+
 DAMAGE: dict[str, tuple[Callable[[Path], object], str]] = {
     "missing": (Path.unlink, "is missing"),
     "truncated": (_truncate, "is damaged"),
@@ -160,6 +167,14 @@ DAMAGE: dict[str, tuple[Callable[[Path], object], str]] = {
     "pickle": (lambda path: path.write_bytes(pickle.dumps({"rows": []})), "is damaged"),
     "objects": (lambda path: _npz(path, rows=np.array([{}, None])), "is damaged"),
     "array": (_array, "is damaged"),
+    "a lane that is not there": (lambda path: _changed(path, target_lane=999), "is damaged"),
+    "a road that is not there": (
+        lambda path: _changed(path, route=(999, 0), route_length=1),
+        "is damaged",
+    ),
+    "a long route": (lambda path: _changed(path, route_length=17), "is damaged"),
+    "a position that is no number": (lambda path: _changed(path, x=np.nan), "is damaged"),
+    "a speed of light": (lambda path: _changed(path, speed=3e8), "is damaged"),
     "another site": (lambda path: _npz(path, site=np.array("motorway")), "of another version"),
     "other fields": (lambda path: _npz(path, rows=np.zeros(415)), "of another version"),
     "floats": (lambda path: _npz(path, starts=np.zeros(101)), "of another version"),

@@ -1,11 +1,44 @@
-/* Draws maps, boxes and paths on a canvas in metres, y up. Used by pictures.js and replay.js. */
+/* Colours of the theme; maps, boxes and paths on a canvas in metres, y up. */
 const DATA = JSON.parse(document.getElementById("data").textContent);
-const dark = matchMedia("(prefers-color-scheme: dark)");
 const CLASSES = ["car", "heavy", "heavy", "heavy", "heavy", "other", "two-wheeler",
   "vulnerable", "vulnerable", "vulnerable", "other"];
 const CURB = 0, DASHED = 2;
 
-const colour = (name) => getComputedStyle(document.documentElement).getPropertyValue("--" + name);
+/* Colours of the style sheet depend on the theme, which is the system's unless one is chosen. */
+const themeListeners = [];
+const knownColours = new Map();
+const onTheme = (listener) => themeListeners.push(listener);
+
+function colour(name) {
+  if (!knownColours.has(name)) {
+    const probe = document.createElement("i");
+    probe.style.color = `var(--${name})`;
+    document.body.append(probe);
+    knownColours.set(name, getComputedStyle(probe).color);
+    probe.remove();
+  }
+  return knownColours.get(name);
+}
+
+function setTheme(theme) {
+  const root = document.documentElement;
+  if (theme === "auto") delete root.dataset.theme; else root.dataset.theme = theme;
+  knownColours.clear();
+  for (const listener of themeListeners) listener();
+}
+
+matchMedia("(prefers-color-scheme: dark)").addEventListener("change", () => {
+  knownColours.clear();
+  for (const listener of themeListeners) listener();
+});
+
+function download(blob, name) {
+  const link = document.createElement("a");
+  link.href = URL.createObjectURL(blob);
+  link.download = name.replace(/[^\w.-]+/g, "-");
+  link.click();
+  setTimeout(() => URL.revokeObjectURL(link.href), 10000);
+}
 
 /* Points in metres from steps in centimetres, of which the first is a position. */
 function points(steps) {

@@ -1,49 +1,161 @@
-/* Tabs, plots in the colours of the page, and initialisation. */
+/* Theme, tabs, folded columns, the choice of a setting, links to drives, and initialisation. */
+const THEMES = { auto: "◐ auto", light: "☀ light", dark: "☾ dark" };
+
+function listenToTheme() {
+  const button = document.getElementById("theme"), names = Object.keys(THEMES);
+  let stored = null;
+  try { stored = localStorage.getItem("theme"); } catch { /* storage is not allowed */ }
+  let theme = names.includes(stored) ? stored : "auto";
+  const apply = () => {
+    button.textContent = THEMES[theme];
+    setTheme(theme);
+  };
+  button.addEventListener("click", () => {
+    theme = names[(names.indexOf(theme) + 1) % names.length];
+    try { localStorage.setItem("theme", theme); } catch { /* storage is not allowed */ }
+    apply();
+  });
+  apply();
+}
+
 function listenToTabs() {
   for (const tabs of document.querySelectorAll(".tabs")) {
-    const buttons = [...tabs.querySelectorAll("[role=tab]")];
-    const panels = [...tabs.querySelectorAll("[role=tabpanel]")];
-    buttons.forEach((button, selected) => button.addEventListener("click", () => {
-      buttons.forEach((other, n) => other.setAttribute("aria-selected", String(n === selected)));
+    const buttons = [...tabs.querySelectorAll(":scope > [role=tablist] > [role=tab]")];
+    const panels = [...tabs.querySelectorAll(":scope > [role=tabpanel]")];
+    const select = (selected) => {
+      buttons.forEach((button, n) => {
+        button.setAttribute("aria-selected", String(n === selected));
+        button.tabIndex = n === selected ? 0 : -1;
+      });
       panels.forEach((panel, n) => { panel.hidden = n !== selected; });
-    }));
+      foldColumns();
+    };
+    buttons.forEach((button, n) => {
+      button.tabIndex = n ? -1 : 0;
+      button.addEventListener("click", () => select(n));
+      button.addEventListener("keydown", (event) => {
+        const step = { ArrowLeft: -1, ArrowRight: 1 }[event.key];
+        if (!step) return;
+        event.preventDefault();
+        const next = (n + step + buttons.length) % buttons.length;
+        select(next);
+        buttons[next].focus();
+      });
+    });
   }
 }
 
-function themed(layout) {
-  const text = colour("text").trim(), grid = colour("grid").trim();
-  const out = { ...layout, font: { color: text, size: 13,
-    family: "system-ui, -apple-system, 'Segoe UI', Roboto, sans-serif" } };
-  for (const key of Object.keys(layout).filter((name) => /^[xy]axis/.test(name))) {
-    out[key] = { ...layout[key], gridcolor: grid, zerolinecolor: grid, linecolor: grid,
-      tickcolor: grid, automargin: true };
-  }
-  out.annotations = (layout.annotations || []).map((note) => ({ ...note,
-    font: { size: 13, color: colour("muted").trim() } }));
-  out.hoverlabel = { bgcolor: colour("panel").trim(), bordercolor: grid, font: { color: text } };
-  return out;
-}
-
-/* Whiskers of bars contrast with the bars; those of points have the colour of the points. */
-function themedTrace(trace) {
-  if (trace.type !== "bar") return trace;
-  return { ...trace, error_y: { ...trace.error_y, color: colour("text").trim() } };
-}
-
-function showPlots() {
-  const draw = () => {
-    for (const div of document.querySelectorAll("[data-figure]")) {
-      const figure = DATA.figures[div.dataset.figure];
-      div.style.height = `${figure.layout.height}px`;
-      Plotly.react(div, figure.data.map(themedTrace), themed(figure.layout),
-        { displayModeBar: false, responsive: true });
+/* Hides the columns that do not fit; a button below the table shows them. */
+function foldColumns() {
+  for (const box of document.querySelectorAll(".folding")) {
+    const table = box.querySelector("table"), button = box.nextElementSibling;
+    const headings = [...table.querySelectorAll("thead th")];
+    if (!box.clientWidth) continue;
+    const style = getComputedStyle(table);
+    const names = parseFloat(style.getPropertyValue("--names-px"));
+    const one = parseFloat(style.getPropertyValue("--column-px"));
+    const fitting = Math.max(1, Math.floor((box.clientWidth - names) / one));
+    const open = button.getAttribute("aria-expanded") === "true";
+    const hidden = Math.max(0, headings.length - 1 - fitting);
+    for (const row of table.rows) {
+      [...row.cells].forEach((cell, n) => { cell.hidden = !open && n > fitting; });
     }
-  };
-  dark.addEventListener("change", draw);
-  draw();
+    table.style.setProperty("--columns", open ? headings.length - 1 : Math.min(fitting, headings.length - 1));
+    button.hidden = !hidden;
+    button.textContent = open ? "Fewer columns" : `${hidden} more column${hidden === 1 ? "" : "s"}`;
+  }
 }
 
+function listenToFolds() {
+  for (const button of document.querySelectorAll(".more")) {
+    button.addEventListener("click", () => {
+      const open = button.getAttribute("aria-expanded") === "true";
+      button.setAttribute("aria-expanded", String(!open));
+      foldColumns();
+    });
+  }
+  for (const details of document.querySelectorAll("details")) {
+    details.addEventListener("toggle", foldColumns);
+  }
+  new ResizeObserver(foldColumns).observe(document.querySelector("main"));
+}
+
+/* Shows the part of one setting, and links the navigation to its sections. */
+function chooseSetting(number) {
+  for (const part of document.querySelectorAll("[data-part]")) {
+    part.hidden = Number(part.dataset.part) !== number;
+  }
+  const select = document.getElementById("setting");
+  if (select) select.value = String(number);
+  for (const link of document.querySelectorAll("nav a")) {
+    const name = link.dataset.section ??= link.hash.slice(1);
+    const section = document.querySelector(`[data-part="${number}"] [data-section="${name}"]`);
+    const shared = document.querySelector(`main > #${name}`);
+    link.hidden = !section && !shared;
+    link.href = `#${section ? section.id : name}`;
+  }
+  foldColumns();
+}
+
+function listenToSettings() {
+  document.getElementById("setting")?.addEventListener("change", (event) =>
+    chooseSetting(Number(event.target.value)));
+  for (const button of document.querySelectorAll("[data-choose]")) {
+    button.addEventListener("click", () => chooseSetting(Number(button.dataset.choose)));
+  }
+  chooseSetting(0);
+}
+
+function showPlayer() {
+  document.getElementById("player").scrollIntoView({ block: "start" });
+  window.player.stages.focus({ preventScroll: true });
+}
+
+const shownSetting = () =>
+  Number(document.querySelector("[data-part]:not([hidden])")?.dataset.part ?? 0);
+
+/* Opens a drive of a figure, in which only the name of the method is known, beside the reference. */
+function openFromBar(name, label) {
+  const setting = shownSetting();
+  const link = document.querySelector(`[data-part="${setting}"] a.open`);
+  const drivers = DATA.drives.filter((d) => d.name === name && d.setting === setting)
+    .map((d) => d.driver);
+  const a = drivers.find((driver) => driver === label || driver.endsWith(` + ${label}`));
+  window.player.open({ drive: name, a, b: link?.dataset.b, setting }).then(() => {
+    window.player.remember();
+    showPlayer();
+  });
+}
+
+function listenToDrives() {
+  if (!document.getElementById("replay")) return;
+  window.player = new Player();
+  for (const link of document.querySelectorAll("a.open")) {
+    link.addEventListener("click", (event) => {
+      event.preventDefault();
+      window.player.open({ drive: link.dataset.drive, a: link.dataset.a, b: link.dataset.b,
+        setting: shownSetting() }).then(() => {
+        window.player.remember();
+        showPlayer();
+      });
+    });
+  }
+  const follow = async (state) => {
+    if (!state) return;
+    if (state.setting < DATA.settings.length) chooseSetting(state.setting);
+    await window.player.open(state);
+    showPlayer();
+  };
+  addEventListener("hashchange", () => follow(stateOf(location.hash)));
+  const state = stateOf(location.hash), first = document.querySelector("a.open");
+  if (state) follow(state);
+  else window.player.open(first ? { drive: first.dataset.drive, a: first.dataset.a, b: first.dataset.b } : {});
+}
+
+listenToTheme();
 listenToTabs();
-showPlots();
+listenToSettings();
+listenToFolds();
+showCharts();
 showPictures();
-if (document.getElementById("replay")) window.replay = new Replay();
+listenToDrives();

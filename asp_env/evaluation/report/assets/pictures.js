@@ -18,7 +18,7 @@ function drawPicture(canvas, row, predictor) {
   });
   row.targets.forEach((number, index) => {
     const start = pose(row.agents[number]).slice(0, 2);
-    const stroke = DATA.colours[predictor] || colour("muted");
+    const stroke = colour(seriesColour(DATA.colours[predictor]));
     drawModes(ctx, row.forecasts[predictor].modes[index], start, stroke, scale);
     const truth = points(row.truth[index]);
     drawPath(ctx, truth, colour("truth"), 2, 1, scale, [2, 4.5]);
@@ -60,16 +60,19 @@ function showPictures() {
       const figure = document.createElement("figure"), canvas = document.createElement("canvas");
       const caption = document.createElement("figcaption"), name = document.createElement("h3");
       const dot = document.createElement("i");
-      dot.style.background = DATA.colours[predictor] || "var(--muted)";
+      dot.style.background = `var(--${seriesColour(DATA.colours[predictor])})`;
       name.append(dot, predictor.split(":")[0]);
       name.title = predictor;
       caption.append(name, pictureCaption(row, predictor));
       figure.append(canvas, caption);
-      figure.addEventListener("click", () => {
+      figure.tabIndex = 0;
+      const enlarge = () => {
         dialog.showModal();
         drawPicture(large, row, predictor);
         dialog.querySelector("p").textContent = `${predictor.split(":")[0]} · ${row.caption}`;
-      });
+      };
+      figure.addEventListener("click", enlarge);
+      figure.addEventListener("keydown", (event) => { if (event.key === "Enter") enlarge(); });
       grid.append(figure);
       drawings.push(() => drawPicture(canvas, row, predictor));
     }
@@ -81,6 +84,6 @@ function showPictures() {
   ]);
   const redraw = () => drawings.forEach((draw) => draw());
   new ResizeObserver(redraw).observe(grid);
-  dark.addEventListener("change", redraw);
+  onTheme(redraw);
   redraw();
 }

@@ -1,0 +1,1 @@
+"""Campaigns: thousands of damaged inputs, each of which is used or refused."""

@@ -1,0 +1,63 @@
+"""Settings of a study from a TOML file and from options."""
+
+from pathlib import Path
+
+import pytest
+
+from asp_env.errors import AspEnvError
+from asp_env.evaluation.study.settings import StudySettings, read_settings
+
+TOML = """
+data = ["suite:intersection-v1", "karlsruhe"]
+methods = "oracle"
+latency_ticks = [0, 2]
+max_scenarios = 40
+controls = false
+"""
+
+
+def write(folder: Path, text: str) -> Path:
+    path = folder / "study.toml"
+    path.write_text(text)
+    return path
+
+
+def test_options_replace_what_the_file_states(tmp_path: Path) -> None:
+    path = write(tmp_path, TOML)
+    options = {"methods": ("idm",), "max_scenarios": None, "horizon_s": 4.0}
+    assert read_settings(path, options) == StudySettings(
+        data=("suite:intersection-v1", "karlsruhe"),
+        methods=("idm",),
+        latency_ticks=(0, 2),
+        max_scenarios=40,
+        controls=False,
+        horizon_s=4.0,
+    )
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("data = 3\nmethods = ['idm']", "data 3, expected a list of str"),
+        ("data = ['a', 'a']\nmethods = ['idm']", "data has 'a' twice"),
+        ("data = ['a']", "no methods: add them to"),
+        ("data = ['a']\nmethods = []", "no methods given"),
+        ("data = ['a']\nmethod = ['idm']", "unknown key 'method' \\(did you mean 'methods'"),
+        ("data = ['a']\nmethods = ['idm']\nlatency_ticks = [-1]", "latency_ticks -1, expected 0"),
+        ("data = ['a']\nmethods = ['idm']\nlatency_ticks = [1.5]", "expected a list of int"),
+        ("data = ['a']\nmethods = ['idm']\nhorizon_s = 0", "horizon_s 0, expected a number"),
+        ("data = ['a']\nmethods = ['idm']\nrules = 3", "rules 3 has a wrong type"),
+        ("data = ['a'", "not a TOML file"),
+    ],
+)
+def test_bad_files_are_refused_in_one_line(tmp_path: Path, text: str, message: str) -> None:
+    with pytest.raises(AspEnvError, match=message) as raised:
+        read_settings(write(tmp_path, text), {})
+    assert "\n" not in str(raised.value)
+
+
+def test_a_missing_file_and_no_options_are_refused(tmp_path: Path) -> None:
+    with pytest.raises(AspEnvError, match="cannot be read"):
+        read_settings(tmp_path / "none.toml", {})
+    with pytest.raises(AspEnvError, match="no data and no methods: give a TOML file or options"):
+        read_settings(None, {})
