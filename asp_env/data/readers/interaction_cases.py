@@ -147,6 +147,8 @@ def _list_cases(path: Path) -> CacheEntry:
 def _read_cases(path: Path) -> CacheEntry:
     names = ClassNames()
     columns = read_measurements(path, names, _CASES, optional=OPTIONAL_TRACKS)
+    if not len(columns["track_id"]):
+        raise DataError(f"{path}: has a header but no rows; copy it again or remove the recording")
     ids = number_texts(columns["track_id"])
     columns["track_id"] = ids.numbers
     of_table = (*names.repairs(), *ids.repairs)
