@@ -162,12 +162,16 @@ def load_policy(folder: Path) -> TrainedPolicy:
     content = parse_json((folder / CONFIG).read_bytes())
     space = _read_space(content, folder)
     weights = read_tensors(folder / POLICY)
-    policy = algorithm_classes(settings.algorithm).policy(
-        observation_space=space,
-        action_space=action_space(),
-        lr_schedule=_no_learning,
-        **policy_arguments(settings),
-    )
+    kind, arguments = algorithm_classes(settings.algorithm).policy, policy_arguments(settings)
+    try:
+        policy = kind(
+            observation_space=space,
+            action_space=action_space(),
+            lr_schedule=_no_learning,
+            **arguments,
+        )
+    except (KeyError, IndexError, RuntimeError, TypeError, ValueError) as error:
+        raise _other_observation(folder, error) from None
     try:
         policy.load_state_dict(weights)
     except RuntimeError as error:
@@ -190,10 +194,14 @@ def _check_space(policy: BasePolicy, space: spaces.Dict, folder: Path) -> None:
     try:
         policy.predict(zeros, episode_start=np.ones(1, dtype=bool), deterministic=True)
     except (KeyError, IndexError, RuntimeError, TypeError, ValueError) as error:
-        raise AspEnvError(
-            f"{folder / CONFIG}: damaged, its observation is not that of the network "
-            f"({brief(error)}); train the policy again"
-        ) from None
+        raise _other_observation(folder, error) from None
+
+
+def _other_observation(folder: Path, error: Exception) -> AspEnvError:
+    return AspEnvError(
+        f"{folder / CONFIG}: damaged, its observation is not that of the network "
+        f"({type(error).__name__}: {brief(error)}); train the policy again"
+    )
 
 
 def _no_learning(left: float | int) -> float:
