@@ -171,8 +171,8 @@ def load_trained(
     config = read_config(folder)
     if config["predictor"] != spec.name:
         raise CheckpointError(
-            f"{folder} holds the predictor {config['predictor']!r}, not {spec.name!r}: "
-            f"name it as {config['predictor']}:{folder}"
+            f"{folder} holds the predictor {_brief(repr(config['predictor']))}, not "
+            f"{spec.name!r}: name it as {_brief(config['predictor'])}:{folder}"
         )
     try:
         view, network, trained_on = _build(spec, config)
