@@ -291,6 +291,9 @@ def _read_space(content: Any, folder: Path) -> spaces.Dict:
         for name, box in content["observation"].items():
             if not 0 < math.prod(box["shape"]) <= MAX_ENTRY:
                 raise ValueError(f"{name} of shape {box['shape']}")
+            bounds = np.array([box.get("low", 0.0), box.get("high", 0.0)], dtype=np.float64)
+            if not (np.abs(bounds) <= np.finfo(np.float32).max).all():
+                raise ValueError(f"{name} within {bounds.tolist()}")
         return spaces.Dict(
             {
                 name: spaces.Box(
@@ -302,7 +305,7 @@ def _read_space(content: Any, folder: Path) -> spaces.Dict:
                 for name, box in content["observation"].items()
             }
         )
-    except (KeyError, TypeError, ValueError, AttributeError) as error:
+    except (KeyError, TypeError, ValueError, AttributeError, OverflowError) as error:
         raise AspEnvError(
             f"{folder / CONFIG}: damaged ({type(error).__name__}: {brief(error)}); train the "
             "policy again"
