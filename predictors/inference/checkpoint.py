@@ -401,6 +401,6 @@ def write_file(content: bytes, path: Path) -> None:
         partial.write_bytes(content)
 
 
-def _brief(error: BaseException) -> str:
+def _brief(error: object) -> str:
     text = " ".join(str(error).split())
     return text if len(text) <= 200 else text[:197] + "..."
