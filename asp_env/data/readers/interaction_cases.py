@@ -28,6 +28,7 @@ from asp_env.data.readers.measurements import derive_tracks
 from asp_env.data.readers.positions import Origin
 from asp_env.data.readers.tables import Kind, find_line, has_columns, number_texts, read_table
 from asp_env.errors import DataError
+from asp_env.stored import brief
 
 _TABLE = re.compile(r"^(.+?)(?:_(?:train|val|test|obs))?\.csv(?:\.gz)?$", re.IGNORECASE)
 _NEEDED = ("case_id", "track_id", "timestamp_ms", "agent_type", "x", "y")
@@ -164,7 +165,7 @@ def _read_cases(path: Path) -> CacheEntry:
         ) -> str:
             cells = {"case_id": case, "track_id": ids.texts[track]}
             line = find_line(path, {**cells, "timestamp_ms": time_ms}, occurrence=occurrence)
-            text = what.format(track=cells["track_id"], time=f"{time_ms:g}")
+            text = what.format(track=brief(cells["track_id"]), time=f"{time_ms:g}")
             return f"{path}, line {line}: case {case:g}: {text}"
 
         rows = measurements.select(np.arange(begin, end))
