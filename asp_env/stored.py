@@ -84,7 +84,7 @@ def read_arrays(path: Path) -> dict[str, np.ndarray]:
         raise ValueError(brief(error)) from error
 
 
-def check_fields(kind: type, values: Mapping[str, Any]) -> None:
+def check_fields(kind: type, values: Any) -> None:
     """Checks that values have the types of a dataclass's fields, as far as JSON has types.
 
     Lists stand for tuples. Numbers are finite, and whole numbers below `WHOLE_BELOW`. Fields of
@@ -95,8 +95,11 @@ def check_fields(kind: type, values: Mapping[str, Any]) -> None:
         values: values by the name of the field.
 
     Raises:
-        DataError: a value has another type. The message names the field, without the file.
+        DataError: `values` is no mapping, or a value has another type. The message names the
+            field, without the file.
     """
+    if not isinstance(values, Mapping):
+        raise DataError(f"{brief(repr(values))}: expected an object with fields of {kind.__name__}")
     hints = typing.get_type_hints(kind)
     for name, value in values.items():
         if name in hints and not _fits(value, hints[name]):

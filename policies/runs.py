@@ -162,12 +162,16 @@ def load_policy(folder: Path) -> TrainedPolicy:
     content = parse_json((folder / CONFIG).read_bytes())
     space = _read_space(content, folder)
     weights = read_tensors(folder / POLICY)
-    policy = algorithm_classes(settings.algorithm).policy(
-        observation_space=space,
-        action_space=action_space(),
-        lr_schedule=_no_learning,
-        **policy_arguments(settings),
-    )
+    kind, arguments = algorithm_classes(settings.algorithm).policy, policy_arguments(settings)
+    try:
+        policy = kind(
+            observation_space=space,
+            action_space=action_space(),
+            lr_schedule=_no_learning,
+            **arguments,
+        )
+    except (KeyError, IndexError, RuntimeError, TypeError, ValueError) as error:
+        raise _other_observation(folder, error) from None
     try:
         policy.load_state_dict(weights)
     except RuntimeError as error:
@@ -190,10 +194,14 @@ def _check_space(policy: BasePolicy, space: spaces.Dict, folder: Path) -> None:
     try:
         policy.predict(zeros, episode_start=np.ones(1, dtype=bool), deterministic=True)
     except (KeyError, IndexError, RuntimeError, TypeError, ValueError) as error:
-        raise AspEnvError(
-            f"{folder / CONFIG}: damaged, its observation is not that of the network "
-            f"({brief(error)}); train the policy again"
-        ) from None
+        raise _other_observation(folder, error) from None
+
+
+def _other_observation(folder: Path, error: Exception) -> AspEnvError:
+    return AspEnvError(
+        f"{folder / CONFIG}: damaged, its observation is not that of the network "
+        f"({type(error).__name__}: {brief(error)}); train the policy again"
+    )
 
 
 def _no_learning(left: float | int) -> float:
@@ -283,6 +291,9 @@ def _read_space(content: Any, folder: Path) -> spaces.Dict:
         for name, box in content["observation"].items():
             if not 0 < math.prod(box["shape"]) <= MAX_ENTRY:
                 raise ValueError(f"{name} of shape {box['shape']}")
+            bounds = np.array([box.get("low", 0.0), box.get("high", 0.0)], dtype=np.float64)
+            if not (np.abs(bounds) <= np.finfo(np.float32).max).all():
+                raise ValueError(f"{name} within {bounds.tolist()}")
         return spaces.Dict(
             {
                 name: spaces.Box(
@@ -294,7 +305,7 @@ def _read_space(content: Any, folder: Path) -> spaces.Dict:
                 for name, box in content["observation"].items()
             }
         )
-    except (KeyError, TypeError, ValueError, AttributeError) as error:
+    except (KeyError, TypeError, ValueError, AttributeError, OverflowError) as error:
         raise AspEnvError(
             f"{folder / CONFIG}: damaged ({type(error).__name__}: {brief(error)}); train the "
             "policy again"

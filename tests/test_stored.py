@@ -108,6 +108,12 @@ def test_a_flipped_bit_is_found_or_without_effect(
         np.testing.assert_array_equal(array, np.arange(50.0))
 
 
+@pytest.mark.parametrize("values", [None, 3, "left", [], ["count"]])
+def test_fields_of_something_else(values: object) -> None:
+    with pytest.raises(DataError, match="expected an object with fields of Fields"):
+        check_fields(Fields, values)
+
+
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Fields:
     """One field of each kind."""

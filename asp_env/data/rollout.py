@@ -110,7 +110,9 @@ class Rollout:
             arrays = read_arrays(path)
             header = parse_json(arrays.pop("header").tobytes())
             if header["format"] != FORMAT:
-                raise DataError(f"rollout format {header['format']}, expected {FORMAT}")
+                raise DataError(
+                    f"rollout format {brief(repr(header['format']))}, expected {FORMAT}"
+                )
             _check_header(header)
             _check(arrays, header)
             _check_values(arrays)

@@ -171,8 +171,8 @@ def load_trained(
     config = read_config(folder)
     if config["predictor"] != spec.name:
         raise CheckpointError(
-            f"{folder} holds the predictor {config['predictor']!r}, not {spec.name!r}: "
-            f"name it as {config['predictor']}:{folder}"
+            f"{folder} holds the predictor {_brief(repr(config['predictor']))}, not "
+            f"{spec.name!r}: name it as {_brief(config['predictor'])}:{folder}"
         )
     try:
         view, network, trained_on = _build(spec, config)
@@ -401,6 +401,6 @@ def write_file(content: bytes, path: Path) -> None:
         partial.write_bytes(content)
 
 
-def _brief(error: BaseException) -> str:
+def _brief(error: object) -> str:
     text = " ".join(str(error).split())
     return text if len(text) <= 200 else text[:197] + "..."

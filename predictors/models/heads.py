@@ -15,13 +15,29 @@ from jaxtyping import Float
 from torch import Tensor, nn
 from torch.nn import functional
 
+from asp_env.errors import AspEnvError
+
 Decoder = Literal["read", "unrolled"]
 """How γ as a GRU makes actions: `read` reads the past actions, and one linear layer maps its last
 state to the actions of all ticks; `unrolled` goes on over the ticks ahead, and its state after each
 of them is mapped to the actions of that tick."""
 
+MAX_LAYERS = 100
+"""Largest number of layers of a GRU. Chosen by hand; damaged files of runs name thousands."""
+
 HeadOutputs = tuple[Float[Tensor, "n m t 2"], Float[Tensor, "n m"]]
 """Two numbers per mode and tick, and one logit per mode."""
+
+
+def _make_gru(inputs: int, width: int, layers: int) -> nn.GRU:
+    """A GRU with random weights.
+
+    Raises:
+        AspEnvError: It has more than `MAX_LAYERS` layers.
+    """
+    if layers > MAX_LAYERS:
+        raise AspEnvError(f"network: {layers:,} layers of a GRU, expected at most {MAX_LAYERS}")
+    return nn.GRU(inputs, width, layers, batch_first=True)
 
 
 @final
@@ -62,7 +78,7 @@ class RecurrentReader(nn.Module):
             layers: Number of layers.
         """
         super().__init__()
-        self.gru = nn.GRU(context + 2, width, layers, batch_first=True)
+        self.gru = _make_gru(context + 2, width, layers)
 
     def forward(
         self, context: Float[Tensor, "n context"], actions: Float[Tensor, "n t 2"]
@@ -108,7 +124,7 @@ class UnrolledDecoder(nn.Module):
         """
         super().__init__()
         self._modes = modes
-        self.gru = nn.GRU(context + 3, width, layers, batch_first=True)
+        self.gru = _make_gru(context + 3, width, layers)
         first = hidden or 2 * modes
         self.from_state = nn.Linear(width, first)
         self.from_static = nn.Linear(static, first, bias=False) if static else None

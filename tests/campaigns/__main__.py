@@ -83,7 +83,7 @@ def run_outside(name: str, options: Options) -> list[Verdict]:
             done = subprocess.run(
                 [sys.executable, *command.split()],
                 env={**os.environ, "ASP_ENV_CACHE": cache, "OMP_NUM_THREADS": "1"},
-                stdout=subprocess.PIPE,
+                capture_output=True,
                 text=True,
                 check=False,
             )
@@ -91,8 +91,11 @@ def run_outside(name: str, options: Options) -> list[Verdict]:
         verdicts += [Verdict(*json.loads(line)) for line in lines]
         first += len(lines)
         if first < end:
-            verdicts.append(Verdict(first, "", f"process ended by {done.returncode}", ""))
+            last = done.stderr.strip().rpartition("\n")[2]
+            verdicts.append(Verdict(first, "", f"process ended by {done.returncode}", last))
             first += 1
+            if not lines and len(verdicts) > 1 and verdicts[-2].outcome == verdicts[-1].outcome:
+                break  # not one mutant, but every process
     return verdicts
 
 

@@ -118,6 +118,7 @@ def judge(
             warnings.simplefilter("error")
             for category in (RepairWarning, LeftOutWarning):
                 warnings.simplefilter("ignore", category)
+            warnings.filterwarnings("ignore", "data .* no recording lasts")
             kind.use(folder)
     except AspEnvError as error:
         outcome, detail = "refused", str(error)

@@ -154,7 +154,6 @@ def _missing_array(path: Path) -> None:
         _header(scenario=None),
         _header(dt_s=None),
         _header(scenario={"tags": []}),
-        _header(scenario="left"),
         _header(scenario={"tags": [], "colour": "red"}),
     ],
 )
@@ -213,6 +212,11 @@ def test_scenarios_of_other_types_are_rejected(
     scenario = {**dataclasses.asdict(make_rollout().scenario), field: value}
     _header(scenario=scenario)(tmp_path / "0.npz")
     assert message in error_of(tmp_path / "0.npz")
+
+
+def test_a_scenario_that_is_no_object_is_rejected(tmp_path: Path) -> None:
+    _header(scenario="left")(tmp_path / "0.npz")
+    assert "'left': expected an object with fields of Scenario" in error_of(tmp_path / "0.npz")
 
 
 def test_missing_file(tmp_path: Path) -> None:

@@ -28,6 +28,7 @@ from asp_env.data.readers.measurements import derive_tracks
 from asp_env.data.readers.positions import Origin
 from asp_env.data.readers.tables import Kind, find_line, has_columns, number_texts, read_table
 from asp_env.errors import DataError
+from asp_env.stored import brief
 
 _TABLE = re.compile(r"^(.+?)(?:_(?:train|val|test|obs))?\.csv(?:\.gz)?$", re.IGNORECASE)
 _NEEDED = ("case_id", "track_id", "timestamp_ms", "agent_type", "x", "y")
@@ -147,6 +148,8 @@ def _list_cases(path: Path) -> CacheEntry:
 def _read_cases(path: Path) -> CacheEntry:
     names = ClassNames()
     columns = read_measurements(path, names, _CASES, optional=OPTIONAL_TRACKS)
+    if not len(columns["track_id"]):
+        raise DataError(f"{path}: has a header but no rows; copy it again or remove the recording")
     ids = number_texts(columns["track_id"])
     columns["track_id"] = ids.numbers
     of_table = (*names.repairs(), *ids.repairs)
@@ -162,7 +165,7 @@ def _read_cases(path: Path) -> CacheEntry:
         ) -> str:
             cells = {"case_id": case, "track_id": ids.texts[track]}
             line = find_line(path, {**cells, "timestamp_ms": time_ms}, occurrence=occurrence)
-            text = what.format(track=cells["track_id"], time=f"{time_ms:g}")
+            text = what.format(track=brief(cells["track_id"]), time=f"{time_ms:g}")
             return f"{path}, line {line}: case {case:g}: {text}"
 
         rows = measurements.select(np.arange(begin, end))

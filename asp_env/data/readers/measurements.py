@@ -99,6 +99,8 @@ def derive_tracks(
         DataError: a track has two rows at one time, no track is long enough, or no frame rate fits
             the times, or positions or times are implausible.
     """
+    if not len(measurements.track):
+        raise DataError(f"{source}: has no rows; copy it again or remove the recording")
     rows = measurements.select(np.lexsort((measurements.time_ms, measurements.track)))
 
     def line_of(row: int, what: str) -> str:

@@ -235,6 +235,8 @@ def load_scenarios(path: Path, recordings: Recordings, *, dt_s: float, history: 
         )  # fmt: skip
         if not ((table[:, 0] >= 0) & (table[:, 0] < len(contents))).all():
             raise DataError(f"{path}: names a recording that it does not list")
+        if (table[:, _FIELDS.index("seed")] < 0).any():
+            raise DataError(f"{path}: has a negative seed, expected 0 or more")
     except OSError as error:
         raise DataError(f"{path}: cannot be read: {error.strerror}") from error
     except (ValueError, KeyError, TypeError, OverflowError) as error:

@@ -155,6 +155,14 @@ def write_cases(folder: Path) -> Path:
     return path
 
 
+def test_a_table_of_cases_without_rows_is_refused(tmp_path: Path) -> None:
+    """It stands as one recording that cannot be read."""
+    path = write_cases(tmp_path)
+    path.write_text(path.read_text().splitlines(keepends=True)[0])
+    with pytest.raises(DataError, match=rf"{path.name}: has a header but no rows"):
+        open_readable(tmp_path)
+
+
 def test_each_case_of_interaction_1_2_is_a_recording(tmp_path: Path) -> None:
     """40 frames at 10 Hz; the cars drive 8 m/s along +x; empty cells are unknown sizes."""
     write_cases(tmp_path / "cases")

@@ -175,6 +175,7 @@ def test_allowed_ticks(scenarios: ScenarioSet, recordings: Recordings, tmp_path:
         ({"scenarios": [[0, 7, 0, 20, 0]]}, "scenario 00-7-0 does not fit its recording"),
         ({"scenarios": [[0, 7, 15, 9999, 0]]}, "does not fit its recording"),
         ({"scenarios": [[0, 7, 15, 0, 0]]}, "does not fit its recording"),
+        ({"scenarios": [[0, 7, 15, 20, -1]]}, "has a negative seed, expected 0 or more"),
         ({"scenarios": [[0, 1e99, 15, 20, 0]]}, "is not a scenario file"),
     ],
 )

@@ -156,6 +156,10 @@ FAULTS: dict[str, tuple[Callable[[Path], Any], str]] = {
         lambda run: change_network(run, gru_width=10**6),
         "a network of .* weights, expected at most",
     ),
+    "network of any depth": (
+        lambda run: change_network(run, gru_layers=10**6),
+        "1,000,000 layers of a GRU, expected at most 100",
+    ),
     "deep JSON": (lambda run: (run / "config.json").write_text("[" * 100_000), "nested too"),
     "very high temperature": (lambda run: change(run, temperature=1e308), "temperature is 1e"),
 }
