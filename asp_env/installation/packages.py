@@ -21,6 +21,7 @@ EXTRAS: Mapping[str, str] = {
     "report": "asp-env evaluate, drive, study, benchmark, table, demo, which write report.html",
     "highway": "data highway:…, suite highway-v1, asp_env/HighwayIntersection-v0 and the like",
     "ray": "asp-env study --ray",
+    "docs": "make docs, the documentation as a site",
     "render": "asp-env watch; videos and windows of environments",
 }
 """What each extra of this package is needed for."""
