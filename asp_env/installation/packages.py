@@ -26,7 +26,8 @@ EXTRAS: Mapping[str, str] = {
 }
 """What each extra of this package is needed for."""
 
-_REQUIREMENT = re.compile(r"(?P<name>[\w.-]+)(\[[\w,]+\])?\s*(>=(?P<least>[\w.]+))?\s*(;.*)?$")
+_REQUIREMENT = re.compile(r"(?P<name>[\w.-]+)(\[[\w,]+\])?\s*(?P<versions>[^;]*)(;.*)?$")
+_LEAST = re.compile(r">=\s*([\w.]+)")
 _EXTRA = re.compile(r"extra == [\"']([\w-]+)[\"']")
 
 
@@ -140,7 +141,8 @@ def _packages_of(extra: str | None) -> tuple[PackageState, ...]:
             for included in re.findall(r"[\w-]+", (parts[2] or "").strip("[]")):
                 found |= {package.name: package for package in _packages_of(included)}
         else:
-            found[parts["name"]] = _state(parts["name"], parts["least"])
+            least = _LEAST.search(parts["versions"])
+            found[parts["name"]] = _state(parts["name"], least and least[1])
     return tuple(found.values())
 
 

@@ -46,6 +46,8 @@ def test_every_extra_has_a_purpose() -> None:
     by_name = {extra.name: extra for extra in packages.extra_states()}
     names = {package.name for package in by_name["train"].packages}
     assert names == {"lightning", "tensorboard", "safetensors", "torch"}
+    (mkdocs,) = [each for each in by_name["docs"].packages if each.name == "mkdocs"]
+    assert mkdocs.least == "1.6"  # of "<2,>=1.6"
 
 
 def test_an_installation_that_fits(capsys: pytest.CaptureFixture[str]) -> None:
