@@ -49,6 +49,31 @@ def difference_of(metric: str) -> tuple[str, str] | None:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
+class Condition:
+    """What all methods of a comparison have in common."""
+
+    data: str
+    """DATA as given."""
+    traffic: str = ""
+    """Drivers of the other agents; empty in open loop."""
+    latency_ticks: int = 0
+    """Ticks by which forecasts are late."""
+
+    @property
+    def details(self) -> tuple[str, ...]:
+        """The traffic, and the latency if there is one, as text."""
+        parts = [f"traffic {self.traffic}"] if self.traffic else []
+        if self.latency_ticks:
+            parts.append(f"latency {self.latency_ticks} tick{'s' * (self.latency_ticks > 1)}")
+        return tuple(parts)
+
+    @property
+    def label(self) -> str:
+        """All of it as text."""
+        return " · ".join((self.data, *self.details))
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
 class Row:
     """One line of `metrics.csv`, in long form. Fields that do not apply are empty."""
 

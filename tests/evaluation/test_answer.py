@@ -3,7 +3,8 @@
 import pytest
 
 from asp_env.evaluation.report.answer import driving_answer, forecast_answer
-from asp_env.evaluation.report.results import MethodResult, Result, Setting
+from asp_env.evaluation.report.results import MethodResult, Result
+from asp_env.evaluation.results import Condition
 
 SCORE = "score - constant-velocity"
 
@@ -14,7 +15,7 @@ def row(predictor: str, metric: str, value: float | None, **cells: object) -> Re
         "method": MethodResult(
             planner="sampling", predictor=predictor, privileged=predictor == "oracle"
         ),
-        "setting": Setting(data="d", traffic="log", latency_ticks="0"),
+        "condition": Condition(data="d", traffic="log", latency_ticks=0),
         "horizon_s": "3",
         "fixed": (),
         "selection": "",
@@ -26,7 +27,7 @@ def row(predictor: str, metric: str, value: float | None, **cells: object) -> Re
         "high": None,
         "n": 480.0,
     }
-    return Result(**given | cells)  # type: ignore[arg-type]
+    return Result(**given | cells)  # pyright: ignore[reportArgumentType]
 
 
 def test_yes_states_gain_interval_oracle_share_drives_and_places() -> None:

@@ -176,7 +176,7 @@ def test_every_episode_has_the_command_that_drives_it_again(report: Path) -> Non
     )
 
 
-def test_several_settings_have_parts_and_a_summary(tmp_path: Path) -> None:
+def test_several_conditions_have_parts_and_a_summary(tmp_path: Path) -> None:
     """With traffic log the gain of ffw-asp is a tenth, which is not resolved."""
     rows: list[dict[str, object]] = []
     for traffic, share in (("idm", 1.0), ("log", 0.1)):
@@ -190,11 +190,11 @@ def test_several_settings_have_parts_and_a_summary(tmp_path: Path) -> None:
             rows.append(row | numbers | bounds | {"traffic": traffic, "p_holm": 1 - share})
     write_tables(tmp_path, [*metric_rows(), *rows])
     page = write_report(tmp_path, title="x").read_text()
-    assert data_of(page)["settings"] == [
+    assert data_of(page)["conditions"] == [
         "traffic idm",
         "traffic log",
     ]
-    assert "2 settings: yes in 1, not resolved in 1." in page
+    assert "2 conditions: yes in 1, not resolved in 1." in page
     matrix = page[page.index('<table class="matrix">') :].partition("</table>")[0]
     cells = re.findall(r'<td class="(\w+)">([^<]*)', matrix)
     assert cells == [

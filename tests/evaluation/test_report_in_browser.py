@@ -172,7 +172,7 @@ def test_a_link_opens_an_episode_at_a_tick(report: Path, browser: webdriver.Chro
     ]  # fmt: skip
     browser.execute_script(f"location.hash = '#drive={names[2]}&tick=5'")
     wait(browser, f"window.player.rollout.name === '{names[2]}' && window.player.tick === 5")
-    browser.execute_script("location.hash = '#drive=none&a=none&tick=x&setting=7'")
+    browser.execute_script("location.hash = '#drive=none&a=none&tick=x&condition=7'")
     wait(browser, f"window.player.rollout.name === '{names[0]}' && window.player.tick === 0")
     urls = requests(browser)
     assert [url for url in urls if url.startswith(("http", "ws"))] == []
@@ -221,7 +221,7 @@ def test_nothing_is_cut_off_at_any_width_in_both_themes(
     assert [panel.is_displayed() for panel in panels][:3] == [False, True, False]
 
 
-def test_names_from_data_stay_text_and_settings_can_be_chosen(
+def test_names_from_data_stay_text_and_conditions_can_be_chosen(
     tmp_path: Path, recording: Recording, browser: webdriver.Chrome
 ) -> None:
     """Data, traffic, methods and recordings have names that look like scripts."""

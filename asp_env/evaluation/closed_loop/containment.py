@@ -10,6 +10,7 @@ import dataclasses
 import time
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import partial
 from typing import Literal, TypeVar
 
 import numpy as np
@@ -65,7 +66,6 @@ class Containment:
 
     Attributes:
         faults: the first fault of each episode, None for one without.
-        filled: number of ticks of each episode at which something was filled in.
     """
 
     def __init__(self, num_episodes: int, *, budget_ms: float | None = None) -> None:
@@ -78,7 +78,6 @@ class Containment:
                 depend on the machine.
         """
         self.faults: list[Fault | None] = [None] * num_episodes
-        self.filled = np.zeros(num_episodes, dtype=np.int64)
         self._budget_ms = budget_ms
         self._ticks = 0
 
@@ -106,7 +105,7 @@ class Containment:
             "predictor",
             predictor.name,
             running,
-            lambda: _checked_forecast(predictor.predict(scene, future), scene, predictor.horizon),
+            partial(_checked_forecast, predictor, scene, future),
         )
         if usable is None and running.sum() > 1 and not faulty:
             return self._predict_apart(predictor, scene, future, running)
@@ -132,7 +131,7 @@ class Containment:
             "planner",
             planner.name,
             running,
-            lambda: _checked_plan(planner.plan(scene, forecast), len(running)),
+            partial(_checked_plan, planner, scene, forecast),
         )
         if usable is None and running.sum() > 1 and not faulty:
             usable = self._plan_apart(planner, scene, forecast, running)
@@ -213,7 +212,7 @@ class Containment:
             only = np.zeros_like(running)
             only[episode] = True
             alone, own = scene.situation(episode), _rows_of_situation(forecast, episode)
-            call = lambda alone=alone, own=own: _checked_plan(planner.plan(alone, own), 1)  # noqa: E731
+            call = partial(_checked_plan, planner, alone, own)
             found, _ = self._call("planner", planner.name, only, call)
             if found is not None:
                 length = min(steps, found.actions.shape[1])
@@ -266,55 +265,70 @@ class Containment:
         detail: str,
     ) -> None:
         for episode in np.flatnonzero(concerned).tolist():
-            self.filled[episode] += 1
             if self.faults[episode] is None:
                 self.faults[episode] = Fault(
                     socket=socket, name=name, cause=cause, detail=detail, tick=self._ticks
                 )
 
 
-def _checked_forecast(forecast: object, scene: Scene, horizon: int) -> Forecast:
-    """The forecast, whose arrays have the shapes that the scene asks for.
+def _checked_forecast(predictor: Predictor, scene: Scene, future: Future | None) -> Forecast:
+    """A forecast, whose arrays have the shapes and types that the scene asks for.
 
     Raises:
         _FaultyResultError: it is something else.
     """
+    forecast: object = predictor.predict(scene, future)
     if not isinstance(forecast, Forecast):
         raise _FaultyResultError(
             "wrong shapes", f"expected a Forecast, found {type(forecast).__name__}"
         )
     count = len(scene.targets)
     modes = forecast.log_probs.shape[1] if np.ndim(forecast.log_probs) == 2 else 1
-    expected = {
-        "states": (count, modes, horizon, 4),
-        "actions": (count, modes, horizon, 2),
-        "log_probs": (count, modes),
-        "ids": (count,),
-        "targets": (count, 2),
-        "valid": (count,),
-        "actions_valid": (count,),
+    expected: dict[str, tuple[tuple[int, ...], str]] = {
+        "states": ((count, max(modes, 1), predictor.horizon, 4), "f"),
+        "actions": ((count, max(modes, 1), predictor.horizon, 2), "f"),
+        "log_probs": ((count, max(modes, 1)), "f"),
+        "ids": ((count,), "iu"),
+        "targets": ((count, 2), "iu"),
+        "valid": ((count,), "b"),
+        "actions_valid": ((count,), "b"),
     }
-    for name, shape in expected.items():
-        found = np.shape(getattr(forecast, name))
-        if found != shape or modes < 1:
-            raise _FaultyResultError("wrong shapes", f"{name} {found}, expected {shape}")
+    if forecast.fallback is not None:
+        expected["fallback"] = ((count,), "f")
+    for name, (shape, kinds) in expected.items():
+        _check_array(name, getattr(forecast, name), shape, kinds)
     return forecast
 
 
-def _checked_plan(plan: object, num_episodes: int) -> Plan:
-    """The plan, whose arrays have the shapes that the scene asks for.
+def _checked_plan(planner: Planner, scene: Scene, forecast: Forecast) -> Plan:
+    """A plan, whose arrays have the shapes and types that the scene asks for.
 
     Raises:
         _FaultyResultError: it is something else.
     """
+    plan: object = planner.plan(scene, forecast)
     if not isinstance(plan, Plan):
         raise _FaultyResultError("wrong shapes", f"expected a Plan, found {type(plan).__name__}")
     steps = plan.actions.shape[1] if np.ndim(plan.actions) == 3 else 0
     for name, width in (("actions", 2), ("states", 4)):
-        found, shape = np.shape(getattr(plan, name)), (num_episodes, max(steps, 1), width)
-        if found != shape:
-            raise _FaultyResultError("wrong shapes", f"{name} {found}, expected {shape}")
+        _check_array(name, getattr(plan, name), (len(scene.tick), max(steps, 1), width), "f")
     return plan
+
+
+def _check_array(name: str, value: object, shape: tuple[int, ...], kinds: str) -> None:
+    """Checks the shape of an array and the kind of its numbers, as of `numpy.dtype.kind`.
+
+    Raises:
+        _FaultyResultError: they are others.
+    """
+    if not isinstance(value, np.ndarray):
+        found = type(value).__name__
+    elif value.shape == shape and value.dtype.kind in kinds:
+        return
+    else:
+        found = f"{value.shape} of {value.dtype}"
+    kind = {"f": "floating-point", "iu": "whole", "b": "true or false"}[kinds]
+    raise _FaultyResultError("wrong shapes", f"{name} {found}, expected {shape} of {kind} numbers")
 
 
 def _finite(*arrays: np.ndarray) -> Bool[np.ndarray, " n"]:

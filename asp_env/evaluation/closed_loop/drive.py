@@ -39,6 +39,7 @@ from asp_env.evaluation.ladder import BASELINE, is_under_test, missing_controls
 from asp_env.evaluation.report import check_report_possible, write_report
 from asp_env.evaluation.results import (
     SCORE,
+    Condition,
     Row,
     fallback_sentences,
     fallback_shares,
@@ -160,9 +161,7 @@ class ClosedLoopResult:
     def driven(self) -> DrivenScenarios:
         """The scenarios with the scores of all methods."""
         return DrivenScenarios(
-            data=self.manifest["data"],
-            traffic=self.manifest["traffic"],
-            latency_ticks=0,
+            condition=Condition(data=self.manifest["data"], traffic=self.manifest["traffic"]),
             scenarios=self.scenarios,
             methods=self.methods,
         )

@@ -8,6 +8,7 @@ from pathlib import Path
 from asp_env.data.scenarios.scenario import ScenarioSet
 from asp_env.evaluation.closed_loop.comparison import EpisodeScores
 from asp_env.evaluation.closed_loop.summary import MethodScores
+from asp_env.evaluation.results import Condition
 from asp_env.files import atomic_file
 
 COLUMNS = (
@@ -22,12 +23,7 @@ COLUMNS = (
 class DrivenScenarios:
     """Scenarios that some methods have driven in one condition."""
 
-    data: str
-    """DATA as given."""
-    traffic: str
-    """Drivers of the other agents."""
-    latency_ticks: int
-    """Ticks by which forecasts are late."""
+    condition: Condition
     scenarios: ScenarioSet
     methods: Sequence[MethodScores]
     """Scores of all methods in these scenarios."""
@@ -79,9 +75,9 @@ def _rows(
     scenarios = driven.scenarios
     for i, scenario in enumerate(scenarios):
         yield [
-            driven.data,
-            driven.traffic,
-            driven.latency_ticks,
+            driven.condition.data,
+            driven.condition.traffic,
+            driven.condition.latency_ticks,
             scenario.name,
             scenario.recording_name,
             scenarios.locations[scenario.recording],

@@ -8,7 +8,6 @@ from asp_env.evaluation.report.results import (
     MetricNote,
     Result,
     Results,
-    Setting,
     metric_note,
     read_results,
 )
@@ -20,7 +19,6 @@ __all__ = [
     "MetricNote",
     "Result",
     "Results",
-    "Setting",
     "check_report_possible",
     "find_episodes",
     "metric_note",

@@ -47,7 +47,7 @@ def driving_answer(results: Sequence[Result], *, places: int | None = None) -> A
     best.
 
     Args:
-        results: Closed-loop results of one setting.
+        results: Closed-loop results of one condition.
         places: Number of locations of the scenarios, if it is known.
 
     Returns:
@@ -95,7 +95,7 @@ def forecast_answer(results: Sequence[Result]) -> Answer | None:
     """Whether one of the predictors under test forecasts better than constant velocity.
 
     Args:
-        results: Open-loop results of one setting.
+        results: Open-loop results of one condition.
 
     Returns:
         The answer, None if the results contain no ratio to constant velocity.

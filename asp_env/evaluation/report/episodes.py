@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from asp_env.evaluation.report.results import Setting
+from asp_env.evaluation.results import Condition
 from asp_env.evaluation.selection import short_names
 
 OUT = "OUT"
@@ -23,8 +23,8 @@ class Episode:
     planner: str = ""
     predictor: str = ""
     """The predictor as in `metrics.csv`; empty if the planner uses no forecasts."""
-    setting: Setting | None = None
-    """The setting that it was driven in, if it is known."""
+    condition: Condition | None = None
+    """The condition that it was driven in, if it is known."""
     command: str = ""
     """A shell command that drives it again; `OUT` stands for the run folder."""
 
@@ -32,8 +32,8 @@ class Episode:
 def find_episodes(out: Path, manifest: Mapping[str, Any]) -> list[Episode]:
     """The rollouts below `rollouts/` in the order of their paths.
 
-    The name of the folder of a rollout is the label of its method. Commands and settings are known
-    of methods that the manifest of `drive`, `benchmark` or `demo` describes.
+    The name of the folder of a rollout is the label of its method. Commands and conditions are
+    known of methods that the manifest of `drive`, `benchmark` or `demo` describes.
 
     Args:
         out: The run folder.
@@ -82,10 +82,10 @@ class _Method:
             label=label,
             planner=self.planner,
             predictor=self.predictor,
-            setting=Setting(
+            condition=Condition(
                 data=str(drive.get("data", "")),
                 traffic=str(drive.get("traffic") or ""),
-                latency_ticks=str(drive.get("latency_ticks", 0)),
+                latency_ticks=int(drive.get("latency_ticks") or 0),
             ),
             command=shlex.join(map(str, words)),
         )

@@ -33,7 +33,7 @@ def ranking(results: Sequence[Result]) -> Payload | None:
     """Differences of the score by method with intervals, over the rungs of the ladder.
 
     Args:
-        results: Closed-loop results of one setting.
+        results: Closed-loop results of one condition.
 
     Returns:
         The figure, None if there are no differences.
@@ -71,7 +71,7 @@ def other_metrics(results: Sequence[Result]) -> tuple[list[Payload], str]:
     The figures show differences to the reference where there are any, else values.
 
     Args:
-        results: Closed-loop results of one setting.
+        results: Closed-loop results of one condition.
     """
     labels = _labels(results)
     every = [r for r in results if r.subset == "all" and r.value is not None and r.at_s is None]
@@ -105,7 +105,7 @@ def tags(results: Sequence[Result]) -> Payload | None:
     """Differences of the score by tag of the scenarios, with a choice of methods.
 
     Args:
-        results: Closed-loop results of one setting.
+        results: Closed-loop results of one condition.
 
     Returns:
         The figure, None if there are no differences by tag.
@@ -143,8 +143,8 @@ def scenario_differences(
     """The difference of the score in every scenario in which it is not 0, in descending order.
 
     Args:
-        results: Closed-loop results of one setting.
-        values: Scores of the setting by scenario.
+        results: Closed-loop results of one condition.
+        values: Scores of the condition by scenario.
 
     Returns:
         The figure with a choice of methods, None if the scores are not known.
@@ -183,7 +183,7 @@ def forecast_errors(results: Sequence[Result]) -> Iterator[Payload]:
     """FDE by predictor, a figure for each selection of modes.
 
     Args:
-        results: Open-loop results of one setting.
+        results: Open-loop results of one condition.
     """
     labels = _labels(results)
     errors = [r for r in results if r.metric == "FDE" and r.at_s is None and r.value is not None]
@@ -214,7 +214,7 @@ def regret(results: Sequence[Result]) -> Payload | None:
     """Planning regret removed by predictor, over all scenarios.
 
     Args:
-        results: Open-loop results of one setting.
+        results: Open-loop results of one condition.
 
     Returns:
         The figure, None if there is no planning regret.
@@ -242,7 +242,7 @@ def errors_over_time(results: Sequence[Result], colours: Mapping[str, int]) -> I
     """Lines of metrics such as `L2@1s` over the time ahead, a figure for each selection.
 
     Args:
-        results: Open-loop results of one setting.
+        results: Open-loop results of one condition.
         colours: Number of the colour of each predictor.
     """
     labels = _labels(results)

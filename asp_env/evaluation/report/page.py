@@ -1,7 +1,7 @@
 """The report: one file of HTML that shows the results of a run and needs no network.
 
-For every setting, that is data, traffic and latency, the page answers first: one sentence, then the
-ranking of the methods, the forecasts, what decides, and drives to look at.
+For every condition, that is data, traffic and latency, the page answers first: one sentence, then
+the ranking of the methods, the forecasts, what decides, and drives to look at.
 """
 
 from collections.abc import Mapping, Sequence
@@ -34,12 +34,11 @@ from asp_env.evaluation.report.results import (
     MetricNote,
     Result,
     Results,
-    Setting,
+    condition_labels,
     distinct,
     methods_of,
     metric_note,
     read_results,
-    setting_labels,
     short_labels,
 )
 from asp_env.evaluation.report.scenario_values import (
@@ -57,7 +56,7 @@ from asp_env.evaluation.report.tables import (
     difference_figures,
     result_figures,
 )
-from asp_env.evaluation.results import SCORE, difference_of
+from asp_env.evaluation.results import SCORE, Condition, difference_of
 from asp_env.evaluation.selection import split_name
 from asp_env.files import atomic_file
 from asp_env.stored import brief, parse_json
@@ -78,10 +77,10 @@ class DriveList:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Part:
-    """What the page shows of one setting."""
+    """What the page shows of one condition."""
 
     number: int
-    setting: Setting
+    condition: Condition
     answer: Answer | None
     comparison_tables: list[Any]
     driving_tables: list[Any]
@@ -155,8 +154,8 @@ def write_report(
     episodes = find_episodes(out, manifest) if episodes is None else episodes
     colours = {name: i % COLOURS for i, name in enumerate(results.predictors)}
     parts = [
-        _part(number, results, values_in(values, setting), privileged, colours)
-        for number, setting in enumerate(results.settings)
+        _part(number, results, values_in(values, condition), privileged, colours)
+        for number, condition in enumerate(results.conditions)
     ]
     map_table = MapTable()
     data = {
@@ -165,8 +164,8 @@ def write_report(
         },
         "colours": colours | {split_name(name)[0]: number for name, number in colours.items()},
         "pictures": examples_payload(examples, map_table) if examples else [],
-        "drives": rollouts_payload(episodes, maps or {}, map_table, results.settings),
-        "settings": setting_labels(results.settings),
+        "drives": rollouts_payload(episodes, maps or {}, map_table, results.conditions),
+        "conditions": condition_labels(results.conditions),
     }
     data["maps"] = map_table.payloads
     page = _page_template().render(
@@ -175,7 +174,7 @@ def write_report(
         parts=parts,
         summary=_summary(parts, results),
         labels={
-            (each.setting, (each.planner, each.predictor)): each.label
+            (each.condition, (each.planner, each.predictor)): each.label
             for each in reversed(episodes)
         },
         saved={(each.label, each.path.stem) for each in episodes},
@@ -215,11 +214,11 @@ def _part(
     privileged: Sequence[str],
     colours: Mapping[str, int],
 ) -> Part:
-    """What the page shows of a setting."""
-    setting = results.settings[number]
-    driving = [r for r in results.driving if r.setting == setting]
-    first = next(i for i, s in enumerate(results.settings) if s.data == setting.data)
-    forecasts = [r for r in results.open_loop if r.setting.data == setting.data]
+    """What the page shows of a condition."""
+    condition = results.conditions[number]
+    driving = [r for r in results.driving if r.condition == condition]
+    first = next(i for i, s in enumerate(results.conditions) if s.data == condition.data)
+    forecasts = [r for r in results.open_loop if r.condition.data == condition.data]
     shown = forecasts if first == number else []
     answer = driving_answer(driving, places=values.places if values else None)
     others, same = figures.other_metrics(driving)
@@ -237,7 +236,7 @@ def _part(
     }
     return Part(
         number=number,
-        setting=setting,
+        condition=condition,
         answer=answer or (forecast_answer(forecasts) if not driving else None),
         comparison_tables=comparison_figures(driving),
         driving_tables=[*difference_figures(driving), *result_figures(driving)],
@@ -293,9 +292,9 @@ def _names(results: Results) -> dict[tuple[str, str], str]:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Summary:
-    """The differences of the score by method and setting."""
+    """The differences of the score by method and condition."""
 
-    settings: tuple[tuple[int, str], ...]
+    conditions: tuple[tuple[int, str], ...]
     """Number and label of each column."""
     rows: tuple[tuple[str, bool, tuple[tuple[str, str, str] | None, ...]], ...]
     """Name, whether privileged, and text, interval and outcome of each cell."""
@@ -303,8 +302,8 @@ class Summary:
 
 
 def _summary(parts: Sequence[Part], results: Results) -> Summary | None:
-    """The summary of several settings; None if there is one, or no differences."""
-    scores = [score_differences([r for r in results.driving if r.setting == p.setting])
+    """The summary of several conditions; None if there is one, or no differences."""
+    scores = [score_differences([r for r in results.driving if r.condition == p.condition])
               for p in parts]  # fmt: skip
     methods = methods_of(r for each in scores for r in each)
     if len(parts) < 2 or not methods:
@@ -322,9 +321,9 @@ def _summary(parts: Sequence[Part], results: Results) -> Summary | None:
     verdicts = [part.answer.verdict for part in parts if part.answer]
     counts = [f"{verdict} in {verdicts.count(verdict)}" for verdict in distinct(verdicts)]
     return Summary(
-        settings=tuple(enumerate(setting_labels(results.settings))),
+        conditions=tuple(enumerate(condition_labels(results.conditions))),
         rows=tuple(rows),
-        sentence=f"{len(parts)} settings: {', '.join(counts)}.",
+        sentence=f"{len(parts)} conditions: {', '.join(counts)}.",
     )
 
 

@@ -23,7 +23,7 @@ from asp_env.data.scene import Scene
 from asp_env.data.snippets import Future
 from asp_env.errors import AspEnvError, DataError
 from asp_env.evaluation.report.episodes import Episode
-from asp_env.evaluation.report.results import Setting
+from asp_env.evaluation.results import Condition
 
 FORECAST_POINT_S = 0.4
 """Time between the drawn points of a forecast; its last point is always drawn. Chosen by hand: a
@@ -222,7 +222,7 @@ def rollouts_payload(
     episodes: Sequence[Episode],
     road_maps: Mapping[str, RoadMap],
     maps: MapTable,
-    settings: Sequence[Setting],
+    conditions: Sequence[Condition],
 ) -> list[dict[str, Any]]:
     """The rollouts of some episodes, in their order.
 
@@ -230,7 +230,7 @@ def rollouts_payload(
         episodes: The episodes.
         road_maps: Road maps by the name of the recording, or by `DATA/RECORDING`.
         maps: The table that receives the maps.
-        settings: The settings of the page; an episode has the index of its own.
+        conditions: The conditions of the page; an episode has the index of its own.
 
     Raises:
         DataError: A rollout cannot be read, or the map of its recording is missing.
@@ -246,11 +246,11 @@ def rollouts_payload(
             raise DataError(
                 f"{episode.path}: no map of recording {name!r} was given; given were {known}"
             )
-        setting = episode.setting
+        condition = episode.condition
         head = {
             "driver": episode.label,
             "name": episode.path.stem,
-            "setting": settings.index(setting) if setting in settings else 0,
+            "condition": conditions.index(condition) if condition in conditions else 0,
             "command": episode.command,
             "tags": " · ".join(rollout.scenario.tags),
             "ticks": len(rollout.states),

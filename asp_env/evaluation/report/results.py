@@ -3,13 +3,20 @@
 import csv
 import re
 from collections import Counter
-from collections.abc import Collection, Iterable, Sequence
+from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass, fields
 from pathlib import Path, PurePath
 from typing import Literal
 
 from asp_env.errors import DataError
-from asp_env.evaluation.results import ANSWER, HEADROOM, ORACLE_SHARE, Row, difference_of
+from asp_env.evaluation.results import (
+    ANSWER,
+    HEADROOM,
+    ORACLE_SHARE,
+    Condition,
+    Row,
+    difference_of,
+)
 from asp_env.evaluation.selection import split_name
 
 SELECTIONS = ("most-probable", "best-of-3", "")
@@ -64,31 +71,6 @@ class MetricNote:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Setting:
-    """What methods are compared under; every setting is a part of the page."""
-
-    data: str
-    traffic: str = ""
-    """Drivers of the other agents; empty in open loop."""
-    latency_ticks: str = ""
-    """Delay of the plans in ticks; empty in open loop."""
-
-    @property
-    def details(self) -> tuple[str, ...]:
-        """The traffic, and the latency if there is one, as text."""
-        parts = [f"traffic {self.traffic}"] if self.traffic else []
-        if self.latency_ticks not in ("", "0"):
-            ticks = "tick" if self.latency_ticks == "1" else "ticks"
-            parts.append(f"latency {self.latency_ticks} {ticks}")
-        return tuple(parts)
-
-    @property
-    def label(self) -> str:
-        """All of it as text."""
-        return " · ".join((self.data, *self.details))
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
 class MethodResult:
     """The method that a result belongs to: a row of a table, a colour in a plot."""
 
@@ -116,7 +98,7 @@ class Result:
     """One row of `metrics.csv`; a missing number is None."""
 
     method: MethodResult
-    setting: Setting
+    condition: Condition
     horizon_s: str
     fixed: tuple[str, ...]
     """Details that all results of the same kind share, such as the view."""
@@ -149,11 +131,12 @@ class Results:
     driving: tuple[Result, ...]
 
     @property
-    def settings(self) -> list[Setting]:
-        """The settings of the drives, then those of forecasts on data that nobody drives on."""
-        driven = dict.fromkeys(result.setting for result in self.driving)
-        data = {setting.data for setting in driven}
-        forecast = dict.fromkeys(r.setting for r in self.open_loop if r.setting.data not in data)
+    def conditions(self) -> list[Condition]:
+        """The conditions of the drives, then those of forecasts on data without drives."""
+        driven = dict.fromkeys(result.condition for result in self.driving)
+        data = {condition.data for condition in driven}
+        open_loop = [result.condition for result in self.open_loop]
+        forecast = dict.fromkeys(each for each in open_loop if each.data not in data)
         return [*driven, *forecast]
 
     @property
@@ -217,17 +200,28 @@ def short_labels(methods: Sequence[MethodResult]) -> dict[MethodResult, str]:
     return {m: name if counts[name] == 1 else m.label for m, name in names.items()}
 
 
-def setting_labels(settings: Sequence[Setting]) -> list[str]:
-    """Labels of settings: what differs between them; all of it for a single one."""
-    if len(settings) == 1:
-        return [settings[0].label]
+def condition_labels(conditions: Sequence[Condition]) -> list[str]:
+    """Labels of conditions: what differs between them; all of it for a single one."""
+    if len(conditions) == 1:
+        return [conditions[0].label]
     parts = [
-        {setting: setting.data for setting in settings},
-        {setting: f"traffic {setting.traffic}" for setting in settings},
-        {setting: f"latency {setting.latency_ticks or 0}" for setting in settings},
+        {condition: condition.data for condition in conditions},
+        {condition: f"traffic {condition.traffic}" for condition in conditions},
+        {condition: f"latency {condition.latency_ticks}" for condition in conditions},
     ]
     varying = [part for part in parts if len({*part.values()}) > 1]
-    return [" · ".join(part[setting] for part in varying) for setting in settings]
+    return [" · ".join(part[condition] for part in varying) for condition in conditions]
+
+
+def read_condition(row: Mapping[str, str]) -> Condition:
+    """The condition of a row of `metrics.csv` or `scenarios.csv`.
+
+    Raises:
+        ValueError: the latency is no whole number.
+    """
+    return Condition(
+        data=row["data"], traffic=row["traffic"], latency_ticks=int(row["latency_ticks"] or 0)
+    )
 
 
 def best_result(results: Iterable[Result], *, better: str) -> Result | None:
@@ -266,6 +260,7 @@ def _result(
         details.append(f"mean of {row['runs']} runs")
     metric = re.fullmatch(r"(.+)@([0-9.]+) ?s", row["metric"])
     try:
+        condition = read_condition(row)
         numbers = {
             name: float(row[name]) if row[name] not in ("", "nan") else None
             for name in ("value", "low", "high", "n", "mde", "p_holm")
@@ -280,9 +275,7 @@ def _result(
             details=tuple(details),
             privileged=row["planner"] in privileged or row["predictor"] in privileged,
         ),
-        setting=Setting(
-            data=row["data"], traffic=row["traffic"], latency_ticks=row["latency_ticks"]
-        ),
+        condition=condition,
         horizon_s=row["horizon_s"],
         fixed=fixed,
         selection=row["selection"],

@@ -10,11 +10,11 @@ from jaxtyping import Float
 
 from asp_env.errors import DataError
 from asp_env.evaluation.ladder import is_under_test
-from asp_env.evaluation.report.results import Setting
-from asp_env.evaluation.results import SCORE
+from asp_env.evaluation.report.results import read_condition
+from asp_env.evaluation.results import SCORE, Condition
 
-SETTING_COLUMNS = ("data", "traffic", "latency_ticks")
-"""Columns of tables with several settings; without them a table belongs to all settings."""
+CONDITION_COLUMNS = ("data", "traffic", "latency_ticks")
+"""Columns of tables with several conditions; without them a table belongs to all conditions."""
 
 SAME = 0.005
 """Scores that differ by less count as the same. Chosen by hand: half of the last printed digit of
@@ -31,7 +31,7 @@ Key = tuple[str, str]
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class ScenarioValues:
-    """Scores of M methods in S scenarios of one setting, averaged over training runs."""
+    """Scores of M methods in S scenarios of one condition, averaged over training runs."""
 
     names: tuple[str, ...]
     """Name of each scenario."""
@@ -61,15 +61,15 @@ class ListedDrive:
     """Scores of the two methods."""
 
 
-def read_scenario_values(path: Path) -> dict[Setting | None, ScenarioValues]:
+def read_scenario_values(path: Path) -> dict[Condition | None, ScenarioValues]:
     """Reads `scenarios.csv`.
 
     Args:
         path: The file, which may be missing.
 
     Returns:
-        The values by setting; by None where the table has no columns of settings. Empty if there
-        is no file.
+        The values by condition; by None where the table has no columns of conditions. Empty if
+        there is no file.
 
     Raises:
         DataError: The file lacks a column, or holds text for a number.
@@ -87,19 +87,22 @@ def read_scenario_values(path: Path) -> dict[Setting | None, ScenarioValues]:
     missing = [name for name in needed if name not in columns]
     if missing:
         raise DataError(f"{path}: no column {missing[0]!r}, expected {', '.join(needed)}")
-    has_settings = all(name in columns for name in SETTING_COLUMNS)
-    groups: dict[Setting | None, list[dict[str, str]]] = {}
+    has_conditions = all(name in columns for name in CONDITION_COLUMNS)
+    groups: dict[Condition | None, list[dict[str, str]]] = {}
     for row in rows:
-        key = Setting(**{name: row[name] for name in SETTING_COLUMNS}) if has_settings else None
+        try:
+            key = read_condition(row) if has_conditions else None
+        except ValueError as error:
+            raise DataError(f"{path}: latency_ticks: {error}") from error
         groups.setdefault(key, []).append(row)
-    return {setting: _values(path, group) for setting, group in groups.items()}
+    return {condition: _values(path, group) for condition, group in groups.items()}
 
 
 def values_in(
-    tables: Mapping[Setting | None, ScenarioValues], setting: Setting
+    tables: Mapping[Condition | None, ScenarioValues], condition: Condition
 ) -> ScenarioValues | None:
-    """The values of a setting, if there are any."""
-    return tables.get(setting, tables.get(None))
+    """The values of a condition, if there are any."""
+    return tables.get(condition, tables.get(None))
 
 
 def telling_drives(values: ScenarioValues, reference: str, privileged: Sequence[str]) -> tuple[

@@ -121,7 +121,7 @@ def result_figures(results: Sequence[Result]) -> list[Figure]:
     """Metrics by method, without comparisons, metrics over time and kinds of targets.
 
     Args:
-        results: Results of one setting.
+        results: Results of one condition.
     """
     groups: dict[str, list[Result]] = {}
     for result in results:
@@ -145,7 +145,7 @@ def comparison_figures(results: Sequence[Result]) -> list[Figure]:
     """Differences to the reference with verdicts, oracle shares and headroom, a tab per subset.
 
     Args:
-        results: Closed-loop results of one setting.
+        results: Closed-loop results of one condition.
     """
     groups: dict[tuple[str, str], list[Result]] = {}
     for result in results:
@@ -235,7 +235,7 @@ def difference_figures(results: Sequence[Result]) -> list[Figure]:
     """Differences of all metrics except the score to the reference, a tab per subset.
 
     Args:
-        results: Closed-loop results of one setting.
+        results: Closed-loop results of one condition.
     """
     groups: dict[tuple[str, str], list[Result]] = {}
     for result in results:
@@ -280,7 +280,7 @@ def breakdown_figures(results: Sequence[Result]) -> list[Figure]:
     """FDE by manoeuvre and by class, a figure for each and a table for each selection.
 
     Args:
-        results: Open-loop results of one setting.
+        results: Open-loop results of one condition.
     """
     groups: dict[tuple[str, str], list[Result]] = {}
     for result in results:
@@ -301,8 +301,8 @@ def breakdown_figures(results: Sequence[Result]) -> list[Figure]:
 
 def _figure(one: Result, headings: Sequence[str], tabs: Sequence[Tab]) -> Figure:
     horizon = [f"horizon {one.horizon_s} s"] if one.horizon_s else []
-    details = (*headings, *horizon, *one.setting.details, *one.fixed)
-    return Figure(data=one.setting.data, details=details, tabs=tuple(tabs))
+    details = (*headings, *horizon, *one.condition.details, *one.fixed)
+    return Figure(data=one.condition.data, details=details, tabs=tuple(tabs))
 
 
 def _metric_tables(results: Sequence[Result]) -> tuple[Table, ...]:

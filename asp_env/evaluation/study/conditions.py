@@ -14,6 +14,7 @@ from asp_env.evaluation.closed_loop.benchmark import FROZEN, parse_method
 from asp_env.evaluation.closed_loop.comparison import EXPERT, Methods, WorkUnit, work_units
 from asp_env.evaluation.hard import select_scenarios
 from asp_env.evaluation.ladder import ORACLE, missing_controls
+from asp_env.evaluation.results import Condition
 from asp_env.evaluation.selection import (
     expand_runs,
     load_predictors,
@@ -32,19 +33,6 @@ BLIND = "blind"
 
 DELAYED = "delayed"
 """Name of the predictor that states what another one forecast some ticks ago."""
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Condition:
-    """What all methods of a comparison have in common."""
-
-    data: str
-    traffic: str
-    latency_ticks: int
-
-    def __str__(self) -> str:
-        late = f", latency {self.latency_ticks} ticks" if self.latency_ticks else ""
-        return f"{self.data}, traffic {self.traffic}{late}"
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

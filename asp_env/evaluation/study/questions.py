@@ -6,6 +6,7 @@ intervals are over recordings and runs.
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from zlib import crc32
 
 import numpy as np
 from jaxtyping import Bool, Float
@@ -16,7 +17,7 @@ from asp_env.evaluation.closed_loop.scenario_table import DrivenScenarios
 from asp_env.evaluation.closed_loop.summary import MethodScores
 from asp_env.evaluation.ladder import ORACLE
 from asp_env.evaluation.rank_agreement import MetricColumn, RankAgreement, rank_agreement
-from asp_env.evaluation.results import ANSWER, SCORE, Row, difference_name
+from asp_env.evaluation.results import ANSWER, SCORE, Condition, Row, difference_name
 from asp_env.evaluation.statistics import Difference, difference, interval, resampled_means
 
 LOGGED = "logged states"
@@ -54,15 +55,20 @@ class Driven:
         """The planner, and the predictor with which it drives."""
         return "+".join(part for part in (self.method.planner, self.method.predictor) if part)
 
+    @property
+    def condition(self) -> Condition:
+        """What it was driven in."""
+        return self.place.condition
+
     def row(self, metric: str, found: Difference) -> Row:
         """A row of `metrics.csv` for this method."""
         estimate = found.estimate
         return Row(
-            data=self.place.data,
+            data=self.condition.data,
             planner=self.method.planner,
             predictor=self.method.predictor,
-            traffic=self.place.traffic,
-            latency_ticks=self.place.latency_ticks,
+            traffic=self.condition.traffic,
+            latency_ticks=self.condition.latency_ticks,
             runs=len(self.method.runs) if self.method.predictor else None,
             subset=ANSWER,
             metric=metric,
@@ -110,7 +116,7 @@ def oracle_regret(methods: Sequence[Driven]) -> Answer:
             if found is not None:
                 rows.append(each.row(difference_name(SCORE, ORACLE), found))
                 sentences.append(
-                    f"{_where(place)}, {planner}: {each.method.predictor} less the oracle "
+                    f"{place.condition.label}, {planner}: {each.method.predictor} less the oracle "
                     f"{found:+.3f}"
                 )
     return Answer(question="What would a perfect forecast add?", sentences=sentences, rows=rows)
@@ -126,11 +132,11 @@ def latency_slope(methods: Sequence[Driven], privileged: Sequence[str]) -> Answe
     series: dict[tuple[str, str, str, str], list[Driven]] = {}
     for each in methods:
         if each.method.predictor and each.method.planner != EXPERT:
-            key = (each.place.data, each.place.traffic, *_names(each))
+            key = (each.condition.data, each.condition.traffic, *_names(each))
             series.setdefault(key, []).append(each)
     rows, sentences = [], []
     for group in series.values():
-        late = np.array([each.place.latency_ticks for each in group], dtype=np.float64)
+        late = np.array([each.condition.latency_ticks for each in group], dtype=np.float64)
         if len(set(late.tolist())) < 2 or SCORE not in group[0].method.scores[0].metrics:
             continue
         rows_of = np.all([_valid(each, SCORE) for each in group], axis=0)
@@ -139,8 +145,8 @@ def latency_slope(methods: Sequence[Driven], privileged: Sequence[str]) -> Answe
         found = difference(draws @ centred / (centred**2).sum(), n=int(rows_of.sum()))
         rows.append(replace(group[0].row(PER_TICK, found), latency_ticks=None))
         if group[0].method.predictor not in privileged:
-            first = replace(group[0].place, latency_ticks=0)
-            sentences.append(f"{_where(first)}: {group[0].name} {found:+.4f} per tick")
+            first = replace(group[0].condition, latency_ticks=0)
+            sentences.append(f"{first.label}: {group[0].name} {found:+.4f} per tick")
     return Answer(question="What does latency cost?", sentences=sentences, rows=rows)
 
 
@@ -152,13 +158,15 @@ def static_and_dynamic(methods: Sequence[Driven], privileged: Sequence[str]) -> 
         privileged: names of the planners and predictors that use the recorded future.
     """
     static = {
-        (each.place.data, each.place.latency_ticks, each.method.predictor): each
+        (each.condition.data, each.condition.latency_ticks, each.method.predictor): each
         for each in methods
         if each.method.planner == EXPERT and each.method.predictor
     }
     rows, sentences = [], []
     for each in methods:
-        logged = static.get((each.place.data, each.place.latency_ticks, each.method.predictor))
+        logged = static.get(
+            (each.condition.data, each.condition.latency_ticks, each.method.predictor)
+        )
         if logged is None or each.method.planner == EXPERT:
             continue
         for metric in FORECAST_METRICS:
@@ -168,8 +176,8 @@ def static_and_dynamic(methods: Sequence[Driven], privileged: Sequence[str]) -> 
             rows.append(each.row(difference_name(metric, LOGGED), found))
             if metric == "forecast FDE" and each.method.predictor not in privileged:
                 sentences.append(
-                    f"{_where(each.place)}: FDE of {each.method.predictor} on the states that "
-                    f"{each.method.planner} visits less that on logged states, in m: {found:+.2f}"
+                    f"{each.condition.label}: FDE of {each.method.predictor} on the states "
+                    f"that {each.method.planner} visits less that on logged states, in m: {found:+.2f}"
                 )
     return Answer(
         question="Do forecasts hold on the states that the planner visits?",
@@ -203,7 +211,9 @@ def open_to_closed(methods: Sequence[Driven], privileged: Sequence[str]) -> Answ
         for agreement in _agreements(names, columns):
             if agreement.second == SCORE:
                 rows.append(_agreement_row(group[0], agreement, planner=planner, predictor=""))
-                sentences.append(f"{_where(place)}, {planner}: {_agreement_text(agreement)}")
+                sentences.append(
+                    f"{place.condition.label}, {planner}: {_agreement_text(agreement)}"
+                )
     return Answer(
         question="Do open-loop errors rank predictors as driving does?",
         sentences=sentences,
@@ -222,8 +232,8 @@ def traffic_ranking(methods: Sequence[Driven], privileged: Sequence[str]) -> Ans
     places: dict[tuple[str, int], dict[str, dict[tuple[str, str], Driven]]] = {}
     for each in methods:
         if not {*_names(each)} & set(privileged) and SCORE in each.method.scores[0].metrics:
-            by_traffic = places.setdefault((each.place.data, each.place.latency_ticks), {})
-            by_traffic.setdefault(each.place.traffic, {})[_names(each)] = each
+            by_traffic = places.setdefault((each.condition.data, each.condition.latency_ticks), {})
+            by_traffic.setdefault(each.condition.traffic, {})[_names(each)] = each
     rows, sentences = [], []
     for by_traffic in places.values():
         first, *others = by_traffic
@@ -244,8 +254,8 @@ def traffic_ranking(methods: Sequence[Driven], privileged: Sequence[str]) -> Ans
             for agreement in _agreements(labels, columns):
                 of = by_traffic[other][names[0]]
                 rows.append(_agreement_row(of, agreement, planner="", predictor=""))
-                where = _where(replace(of.place, traffic=f"{first} and {other}"))
-                sentences.append(f"{where}: {_agreement_text(agreement)}")
+                both = replace(of.condition, traffic=f"{first} and {other}")
+                sentences.append(f"{both.label}: {_agreement_text(agreement)}")
     return Answer(
         question="Does the ranking hold in traffic that reacts?", sentences=sentences, rows=rows
     )
@@ -270,10 +280,10 @@ def replay_artefacts(methods: Sequence[Driven]) -> Answer:
             draws = 1 - _draws(each, NO_HIT, member)
             found = Difference(estimate=interval(draws, n=int(member.sum())), mde=None, p=None)
             rows.append(each.row("hit from behind", found))
-            key = (each.place.data, each.place.traffic)
+            key = (each.condition.data, each.condition.traffic)
             by_traffic.setdefault(key, []).append(float(draws[0]))
     sentences = [
-        f"{data}, traffic {traffic}: the ego is hit from behind in {np.mean(shares):.1%} of drives"
+        f"{data} · traffic {traffic}: the ego is hit from behind in {np.mean(shares):.1%} of drives"
         for (data, traffic), shares in by_traffic.items()
     ]
     return Answer(question="How much is an artefact of replay?", sentences=sentences, rows=rows)
@@ -281,11 +291,6 @@ def replay_artefacts(methods: Sequence[Driven]) -> Answer:
 
 def _names(each: Driven) -> tuple[str, str]:
     return each.method.planner, each.method.predictor
-
-
-def _where(place: DrivenScenarios) -> str:
-    late = f", latency {place.latency_ticks} ticks" if place.latency_ticks else ""
-    return f"{place.data}, traffic {place.traffic}{late}"
 
 
 def _by_planner(
@@ -302,12 +307,17 @@ def _by_planner(
 
 def _static_of(each: Driven, methods: Sequence[Driven]) -> Driven | None:
     """The forecasts of the same predictor while the expert is replayed."""
-    wanted = (each.place.data, each.place.latency_ticks, EXPERT, each.method.predictor)
+    wanted = (
+        each.condition.data,
+        each.condition.latency_ticks,
+        EXPERT,
+        each.method.predictor,
+    )
     return next(
         (
             other
             for other in methods
-            if (other.place.data, other.place.latency_ticks, *_names(other)) == wanted
+            if (other.condition.data, other.condition.latency_ticks, *_names(other)) == wanted
         ),
         None,
     )
@@ -330,7 +340,7 @@ def _draws(
 
 def _stream(each: Driven) -> int:
     """Methods with the same runs have the same stream, so that their runs are paired."""
-    return sum(each.method.predictor.encode())
+    return crc32(each.method.predictor.encode())
 
 
 def _less(one: Driven, other: Driven, metric: str) -> Difference | None:

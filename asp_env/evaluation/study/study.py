@@ -29,13 +29,12 @@ from asp_env.evaluation.closed_loop.summary import (
     scores_by_method,
 )
 from asp_env.evaluation.ladder import BASELINE, is_under_test
-from asp_env.evaluation.report import Episode, Setting, check_report_possible, write_report
-from asp_env.evaluation.results import SCORE, Row, write_manifest, write_metrics
+from asp_env.evaluation.report import Episode, check_report_possible, write_report
+from asp_env.evaluation.results import SCORE, Condition, Row, write_manifest, write_metrics
 from asp_env.evaluation.selection import PartChoice
 from asp_env.evaluation.study.cells import CellFolder
 from asp_env.evaluation.study.conditions import (
     Cell,
-    Condition,
     DataSet,
     Group,
     late_prefix,
@@ -260,9 +259,7 @@ def _summarized(
         rows += found
         driven.append(
             DrivenScenarios(
-                data=condition.data,
-                traffic=condition.traffic,
-                latency_ticks=condition.latency_ticks,
+                condition=condition,
                 scenarios=data_set.scenarios,
                 methods=by_method,
             )
@@ -493,11 +490,7 @@ def _write_rollouts(result: StudyResult, out: Path, drive: DriveTasks) -> list[E
                     label=shown.label,
                     planner=shown.planner,
                     predictor=shown.predictor,
-                    setting=Setting(
-                        data=condition.data,
-                        traffic=condition.traffic,
-                        latency_ticks=str(condition.latency_ticks),
-                    ),
+                    condition=condition,
                     command=shown.command(
                         result.settings, name, _scenarios_file(result, condition.data)
                     ),
@@ -528,8 +521,8 @@ def _fault_counts(driven: Sequence[DrivenScenarios]) -> dict[str, dict[str, int]
                 if fault is not None
             )
             if causes:
-                place = f"{each.data}, {each.traffic}, {each.latency_ticks} ticks"
-                counts[f"{method.planner}+{method.predictor} ({place})"] = dict(causes)
+                name = f"{method.planner}+{method.predictor}"
+                counts[f"{name} ({each.condition.label})"] = dict(causes)
     return counts
 
 

@@ -103,8 +103,7 @@ def fault_lines(driven: Sequence[DrivenScenarios]) -> Iterator[str]:
             counts = ", ".join(f"{cause} {count}" for cause, count in causes.items())
             first = str(faults[0])
             name = " + ".join(part for part in (method.planner, method.predictor) if part)
-            late = f", latency {each.latency_ticks} ticks" if each.latency_ticks else ""
             yield (
-                f"{name} in {each.data}, traffic {each.traffic}{late}: faults in {len(faults)} of "
+                f"{name}, {each.condition.label}: faults in {len(faults)} of "
                 f"{drives} drives, filled in by constant velocity ({counts}); first: {first}"
             )

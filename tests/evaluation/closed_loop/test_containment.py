@@ -124,6 +124,13 @@ def _short(forecast: Forecast, scene: Scene) -> Forecast:
     )
 
 
+def _objects(forecast: Forecast, scene: Scene) -> Forecast:
+    del scene
+    forecast = dataclasses.replace(forecast)
+    object.__setattr__(forecast, "valid", forecast.valid.astype(object))
+    return forecast
+
+
 def _improbable(forecast: Forecast, scene: Scene) -> Forecast:
     del scene
     return dataclasses.replace(forecast, log_probs=forecast.log_probs + 1)
@@ -143,6 +150,7 @@ def _slow(forecast: Forecast, scene: Scene) -> Forecast:
         (_improbable, "not finite", [0, 1, 2]),
         (_wrong_ids, "wrong ids", [0, 1, 2]),
         (_short, "wrong shapes", [0, 1, 2]),
+        (_objects, "wrong shapes", [0, 1, 2]),
         (lambda *_: None, "wrong shapes", [0, 1, 2]),
     ],
 )

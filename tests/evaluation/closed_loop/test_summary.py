@@ -8,7 +8,7 @@ import pytest
 from asp_env.data.scenarios.scenario import ScenarioSet
 from asp_env.evaluation.closed_loop.scenario_table import DrivenScenarios, write_scenario_table
 from asp_env.evaluation.closed_loop.summary import Comparison, MethodScores, comparison_rows
-from asp_env.evaluation.results import Row
+from asp_env.evaluation.results import Condition, Row
 from tests.evaluation.made_up import made_method as _method
 from tests.evaluation.made_up import made_scenarios as _scenarios
 from tests.evaluation.made_up import made_scores as _scores
@@ -189,7 +189,9 @@ def test_the_scenario_table_has_a_row_for_each_method_run_and_scenario(tmp_path)
     ]
     scenarios = _scenarios(0, 1, left=(0,))
     driven = DrivenScenarios(
-        data="d", traffic="log", latency_ticks=2, scenarios=scenarios, methods=methods
+        condition=Condition(data="d", traffic="log", latency_ticks=2),
+        scenarios=scenarios,
+        methods=methods,
     )
     write_scenario_table(tmp_path, [driven])
     with (tmp_path / "scenarios.csv").open(newline="") as file:

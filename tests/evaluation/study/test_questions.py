@@ -5,7 +5,7 @@ import pytest
 
 from asp_env.evaluation.closed_loop.scenario_table import DrivenScenarios
 from asp_env.evaluation.closed_loop.summary import MethodScores
-from asp_env.evaluation.results import Row
+from asp_env.evaluation.results import Condition, Row
 from asp_env.evaluation.study.questions import LOGGED, PER_TICK, Answer, answers
 from tests.evaluation.made_up import made_method, made_scenarios, made_scores
 
@@ -15,9 +15,7 @@ PRIVILEGED = ("expert", "oracle")
 
 def driven(*methods: MethodScores, traffic: str = "log", latency_ticks: int = 0) -> DrivenScenarios:
     return DrivenScenarios(
-        data="d",
-        traffic=traffic,
-        latency_ticks=latency_ticks,
+        condition=Condition(data="d", traffic=traffic, latency_ticks=latency_ticks),
         scenarios=made_scenarios(*RECORDINGS),
         methods=methods,
     )
@@ -46,7 +44,7 @@ def test_oracle_regret_is_the_difference_to_the_oracle_of_the_same_planner() -> 
     assert row.value == pytest.approx(-(0.5 + 0.3 + 0.4 + 0.1) / 4)
     assert row.low is not None
     assert row.mde is not None
-    assert found[0].sentences[0].startswith("d, traffic log, sampling: a less the oracle -0.325 [")
+    assert found[0].sentences[0].startswith("d · traffic log, sampling: a less the oracle -0.325 [")
 
 
 def test_slope_of_latency_by_hand() -> None:
@@ -121,6 +119,6 @@ def test_hits_from_behind_by_traffic() -> None:
     )
     assert [row.value for row in rows_of(found, "hit from behind")] == [0.25, 0.0]
     assert found[-1].sentences == [
-        "d, traffic log: the ego is hit from behind in 25.0% of drives",
-        "d, traffic idm: the ego is hit from behind in 0.0% of drives",
+        "d · traffic log: the ego is hit from behind in 25.0% of drives",
+        "d · traffic idm: the ego is hit from behind in 0.0% of drives",
     ]

@@ -1,4 +1,4 @@
-/* Theme, tabs, folded columns, the choice of a setting, links to drives, and initialisation. */
+/* Theme, tabs, folded columns, the choice of a condition, links to drives, and initialisation. */
 const THEMES = { auto: "◐ auto", light: "☀ light", dark: "☾ dark" };
 
 function listenToTheme() {
@@ -80,12 +80,12 @@ function listenToFolds() {
   new ResizeObserver(foldColumns).observe(document.querySelector("main"));
 }
 
-/* Shows the part of one setting, and links the navigation to its sections. */
-function chooseSetting(number) {
+/* Shows the part of one condition, and links the navigation to its sections. */
+function chooseCondition(number) {
   for (const part of document.querySelectorAll("[data-part]")) {
     part.hidden = Number(part.dataset.part) !== number;
   }
-  const select = document.getElementById("setting");
+  const select = document.getElementById("condition");
   if (select) select.value = String(number);
   for (const link of document.querySelectorAll("nav a")) {
     const name = link.dataset.section ??= link.hash.slice(1);
@@ -97,13 +97,13 @@ function chooseSetting(number) {
   foldColumns();
 }
 
-function listenToSettings() {
-  document.getElementById("setting")?.addEventListener("change", (event) =>
-    chooseSetting(Number(event.target.value)));
+function listenToConditions() {
+  document.getElementById("condition")?.addEventListener("change", (event) =>
+    chooseCondition(Number(event.target.value)));
   for (const button of document.querySelectorAll("[data-choose]")) {
-    button.addEventListener("click", () => chooseSetting(Number(button.dataset.choose)));
+    button.addEventListener("click", () => chooseCondition(Number(button.dataset.choose)));
   }
-  chooseSetting(0);
+  chooseCondition(0);
 }
 
 function showPlayer() {
@@ -111,17 +111,17 @@ function showPlayer() {
   window.player.stages.focus({ preventScroll: true });
 }
 
-const shownSetting = () =>
+const shownCondition = () =>
   Number(document.querySelector("[data-part]:not([hidden])")?.dataset.part ?? 0);
 
 /* Opens a drive of a figure, in which only the name of the method is known, beside the reference. */
 function openFromBar(name, label) {
-  const setting = shownSetting();
-  const link = document.querySelector(`[data-part="${setting}"] a.open`);
-  const drivers = DATA.drives.filter((d) => d.name === name && d.setting === setting)
+  const condition = shownCondition();
+  const link = document.querySelector(`[data-part="${condition}"] a.open`);
+  const drivers = DATA.drives.filter((d) => d.name === name && d.condition === condition)
     .map((d) => d.driver);
   const a = drivers.find((driver) => driver === label || driver.endsWith(` + ${label}`));
-  window.player.open({ drive: name, a, b: link?.dataset.b, setting }).then(() => {
+  window.player.open({ drive: name, a, b: link?.dataset.b, condition }).then(() => {
     window.player.remember();
     showPlayer();
   });
@@ -134,7 +134,7 @@ function listenToDrives() {
     link.addEventListener("click", (event) => {
       event.preventDefault();
       window.player.open({ drive: link.dataset.drive, a: link.dataset.a, b: link.dataset.b,
-        setting: shownSetting() }).then(() => {
+        condition: shownCondition() }).then(() => {
         window.player.remember();
         showPlayer();
       });
@@ -142,7 +142,7 @@ function listenToDrives() {
   }
   const follow = async (state) => {
     if (!state) return;
-    if (state.setting < DATA.settings.length) chooseSetting(state.setting);
+    if (state.condition < DATA.conditions.length) chooseCondition(state.condition);
     await window.player.open(state);
     showPlayer();
   };
@@ -154,7 +154,7 @@ function listenToDrives() {
 
 listenToTheme();
 listenToTabs();
-listenToSettings();
+listenToConditions();
 listenToFolds();
 showCharts();
 showPictures();

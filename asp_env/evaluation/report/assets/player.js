@@ -12,7 +12,7 @@ class Player {
     this.view = { zoom: 1, offset: [0, 0] };
     this.tick = 0;
     this.playing = false;
-    this.setting = 0;
+    this.condition = 0;
     this.request = 0;
     this.folder = location.protocol === "file:"
       ? decodeURIComponent(location.pathname).replace(/\/[^/]*$/, "") : "OUT";
@@ -21,7 +21,7 @@ class Player {
   }
 
   get drives() {
-    return DATA.drives.filter((drive) => drive.setting === this.setting);
+    return DATA.drives.filter((drive) => drive.condition === this.condition);
   }
 
   get rollout() {
@@ -42,9 +42,9 @@ class Player {
   }
 
   /* Shows a scenario with one or two methods at a tick; what is not given or known is chosen. */
-  async open({ drive, a, b, tick = 0, setting = this.setting } = {}) {
-    this.setting = DATA.drives.some((each) => each.setting === setting) ? setting
-      : DATA.drives[0].setting;
+  async open({ drive, a, b, tick = 0, condition = this.condition } = {}) {
+    this.condition = DATA.drives.some((each) => each.condition === condition) ? condition
+      : DATA.drives[0].condition;
     const names = [...new Set(this.drives.map((each) => each.name))];
     const name = names.includes(drive) ? drive : names[0];
     const methods = this.drives.filter((each) => each.name === name).map((each) => each.driver);
@@ -204,7 +204,7 @@ class Player {
   get fragment() {
     const state = { drive: this.scenario.value, a: this.a.value };
     if (this.b.value) state.b = this.b.value;
-    if (DATA.settings.length > 1) state.setting = this.setting;
+    if (DATA.conditions.length > 1) state.condition = this.condition;
     return "#" + new URLSearchParams({ ...state, tick: Math.floor(this.tick) });
   }
 
@@ -330,5 +330,5 @@ function stateOf(hash) {
   if (!state.has("drive")) return null;
   const number = (name) => Number(state.get(name) ?? 0);
   return { drive: state.get("drive"), a: state.get("a"), b: state.get("b"), tick: number("tick"),
-    setting: number("setting") };
+    condition: number("condition") };
 }
