@@ -6,7 +6,7 @@ compiled anew in each process; one line says so.
 
 The files are pickles, and whoever writes a pickle decides what a program does that reads it. A file
 counts as absent, too, unless it belongs to this user, to root or to the owner of the function's
-source, and nobody else may write it.
+source, and no other user may write it.
 """
 
 import hashlib
@@ -70,10 +70,10 @@ class _CheckedFiles(IndexDataCacheFile):
             return _checked(file.read())
 
     def _check(self, file: IO[bytes]) -> None:
-        """Refuses a file that somebody else could have written.
+        """Refuses a file that another user could have written.
 
         Raises:
-            PermissionError: somebody else could.
+            PermissionError: another user could.
         """
         status = os.fstat(file.fileno())
         if status.st_uid not in self._owners or status.st_mode & _WRITABLE_BY_OTHERS:

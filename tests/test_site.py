@@ -1,4 +1,4 @@
-"""The documentation site is built without warnings, and its pages ask nobody else for anything."""
+"""The documentation site is built without warnings, and its pages request no other server."""
 
 import re
 import subprocess

@@ -14,7 +14,7 @@ by the publisher's description, or nothing, since there is no reader."""
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class PublicDataset:
-    """A data set that anybody can get, at least for research."""
+    """A public data set, available at least for research."""
 
     name: str
     """Its name in commands, also that of the suggested folder."""

@@ -9,7 +9,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 
 from asp_env.compiled import njit
-from asp_env.data.map_cache import MapCache
+from asp_env.data.bounded_cache import MapCache
 from asp_env.data.road_map import RoadMap
 from asp_env.errors import DataError
 from asp_env.geometry import route_coordinates

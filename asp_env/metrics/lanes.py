@@ -14,7 +14,7 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 from asp_env.compiled import njit
-from asp_env.data.map_cache import MapCache
+from asp_env.data.bounded_cache import MapCache
 from asp_env.data.road_map import RoadMap
 from asp_env.geometry import box_corners, path_length
 from asp_env.metrics.masked import Masked

@@ -37,7 +37,7 @@ from typing import Any, ClassVar, final
 import numpy as np
 from jaxtyping import UInt8
 
-from asp_env.data.map_cache import MapCache
+from asp_env.data.bounded_cache import MapCache
 from asp_env.errors import AspEnvError
 from asp_env.stored import check_fields
 from asp_env.views.draw import draw_agents, draw_boundaries

@@ -38,8 +38,8 @@ import numpy as np
 from jaxtyping import Int64, UInt8, UInt32
 
 from asp_env.compiled import njit
+from asp_env.data.bounded_cache import MapCache
 from asp_env.data.classes import VULNERABLE, AgentClass
-from asp_env.data.map_cache import MapCache
 from asp_env.data.road_map import LineType, RoadMap
 from asp_env.errors import AspEnvError
 from asp_env.stored import check_fields

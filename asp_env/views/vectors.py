@@ -29,8 +29,8 @@ import numpy as np
 from jaxtyping import Bool, Float, Float32, Int, Int64
 
 from asp_env.compiled import njit
+from asp_env.data.bounded_cache import MapCache
 from asp_env.data.classes import AgentClass
-from asp_env.data.map_cache import MapCache
 from asp_env.data.road_map import LineType, RoadMap
 from asp_env.errors import AspEnvError
 from asp_env.geometry import arc_lengths, points_at

@@ -4,6 +4,7 @@ Each mutation takes a generator and the content of a file, and returns other con
 chooses one that fits the kind of file. The same generator gives the same content.
 """
 
+import itertools
 import re
 import struct
 import zlib
@@ -214,7 +215,7 @@ def _number(rng: np.random.Generator, content: bytes) -> bytes:
 
 BOMB = (
     '<!DOCTYPE osm [<!ENTITY a "aaaaaaaaaaaaaaaa">'
-    + "".join(f'<!ENTITY {b} "{f"&{a};" * 16}">' for a, b in zip("abcdefgh", "bcdefghi"))  # noqa: B905
+    + "".join(f'<!ENTITY {b} "{f"&{a};" * 16}">' for a, b in itertools.pairwise("abcdefghi"))
     + "]>"
 ).encode()
 """Stands for 64 GiB of text."""

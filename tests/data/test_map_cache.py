@@ -7,7 +7,7 @@ from typing import Any, NamedTuple
 import numpy as np
 import pytest
 
-from asp_env.data.map_cache import MapCache
+from asp_env.data.bounded_cache import MapCache
 from asp_env.data.road_map import RoadMap
 from tests.builders import make_map
 

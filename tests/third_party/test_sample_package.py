@@ -1,4 +1,4 @@
-"""A package of somebody else, installed by pip: each of its plugs is found and used by its name."""
+"""A package of third parties, installed by pip: each of its plugs is found and used by its name."""
 
 import csv
 import importlib.util

@@ -331,22 +331,36 @@ class ComparisonScores:
 
     def of(self, method: int) -> EpisodeScores:
         """Scores of a method in all scenarios, in their order, with the rollouts of `saved`."""
-        order = np.argsort(np.concatenate(self._numbers))
         parts = [by_method[method] for by_method in self._complete]
-        endings = [ending for part in parts for ending in part.endings]
-        faults = [fault for part in parts for fault in part.faults]
-        return EpisodeScores(
-            metrics={
-                name: Masked(
-                    value=np.concatenate([part.metrics[name].value for part in parts])[order],
-                    valid=np.concatenate([part.metrics[name].valid for part in parts])[order],
-                )
-                for name in parts[0].metrics
-            },
-            endings=tuple(endings[i] for i in order.tolist()),
-            faults=tuple(faults[i] for i in order.tolist()),
+        return dataclasses.replace(
+            joined_scores([*zip(self._numbers, parts, strict=True)]),
             rollouts=tuple(rollouts[method] for rollouts in self._saved().values()),
         )
+
+
+def joined_scores(
+    parts: Sequence[tuple[Int[np.ndarray, " b"], EpisodeScores]],
+) -> EpisodeScores:
+    """The scores of one method in several work units, in the order of the scenarios.
+
+    Args:
+        parts: the indices of the scenarios of each unit, and their scores; rollouts are left out.
+    """
+    order = np.argsort(np.concatenate([numbers for numbers, _ in parts]))
+    endings = [ending for _, scores in parts for ending in scores.endings]
+    faults = [fault for _, scores in parts for fault in scores.faults]
+    return EpisodeScores(
+        metrics={
+            name: Masked(
+                value=np.concatenate([scores.metrics[name].value for _, scores in parts])[order],
+                valid=np.concatenate([scores.metrics[name].valid for _, scores in parts])[order],
+            )
+            for name in parts[0][1].metrics
+        },
+        endings=tuple(endings[i] for i in order.tolist()),
+        faults=tuple(faults[i] for i in order.tolist()),
+        rollouts=(),
+    )
 
 
 _Ranked = tuple[float, int, tuple[Rollout, ...]]

@@ -24,6 +24,9 @@ from asp_env.files import atomic_file, remove_abandoned
 from asp_env.metrics.masked import Masked
 from asp_env.sim.world import Ending
 
+CELLS = "cells"
+"""Folder of the cells in that of a study."""
+
 FORMAT = 1
 """Version of the file format; part of every key."""
 
@@ -49,7 +52,7 @@ class CellFolder:
         Args:
             out: folder of the study.
         """
-        self._folder = out / "cells"
+        self._folder = out / CELLS
 
     def path(self, key: str) -> Path:
         """The file of a cell."""

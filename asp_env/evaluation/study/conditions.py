@@ -22,7 +22,13 @@ from asp_env.evaluation.selection import (
     ticks_to_evaluate,
 )
 from asp_env.evaluation.study.cells import key_of
-from asp_env.evaluation.study.identity import CORE, identity, package_hash, versions
+from asp_env.evaluation.study.identity import (
+    CORE,
+    identity,
+    package_hash,
+    registered_code,
+    versions,
+)
 from asp_env.evaluation.study.settings import StudySettings
 from asp_env.planning.planner import load_planner
 from asp_env.sim.traffic.log import LogDriver
@@ -230,20 +236,27 @@ def _data_set(settings: StudySettings, data: str, predictors: Sequence[Predictor
     return DataSet(recordings=recordings, scenarios=chosen, part=part)
 
 
-def make_cells(groups: Sequence[Group], data_sets: Mapping[str, DataSet]) -> list[Cell]:
+def make_cells(
+    groups: Sequence[Group], loaded: Sequence[Methods], data_sets: Mapping[str, DataSet]
+) -> list[Cell]:
     """All cells of a study; those of one group are next to each other.
 
     Cells of the expert, and of other methods that do not differ between groups, have the same key.
 
     Args:
         groups: the groups.
+        loaded: the methods of each group.
         data_sets: DATA by name.
     """
-    shared = {"versions": versions(), "code": package_hash(CORE)}
+    shared = {
+        "versions": versions(),
+        "code": package_hash(CORE),
+        "readers' and views' code": registered_code("readers", "views"),
+    }
     hashes = {name: each.recordings.hashes() for name, each in data_sets.items()}
     cells = []
     for number, group in enumerate(groups):
-        methods = group.methods()
+        methods = loaded[number]
         data = group.condition.data
         world = methods.settings.world
         common = {

@@ -51,6 +51,14 @@ def package_hash(package: str) -> str:
     return _hash_of(files)
 
 
+def registered_code(*groups: Group) -> list[str]:
+    """Hashes of all packages that register something in some groups."""
+    packages = {
+        registry.module_of(group, name) for group in groups for name in registry.names(group)
+    }
+    return sorted(package_hash(each) for each in packages if each is not None)
+
+
 def identity(name: str, groups: Iterable[Group]) -> list[str]:
     """What the results of a plug depend on besides its name.
 

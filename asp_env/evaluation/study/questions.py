@@ -177,7 +177,8 @@ def static_and_dynamic(methods: Sequence[Driven], privileged: Sequence[str]) -> 
             if metric == "forecast FDE" and each.method.predictor not in privileged:
                 sentences.append(
                     f"{each.condition.label}: FDE of {each.method.predictor} on the states "
-                    f"that {each.method.planner} visits less that on logged states, in m: {found:+.2f}"
+                    f"that {each.method.planner} visits less that on logged states, in m: "
+                    f"{found:+.2f}"
                 )
     return Answer(
         question="Do forecasts hold on the states that the planner visits?",

@@ -6,11 +6,11 @@ import os
 import shlex
 from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass, fields, replace
 from functools import partial
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated
 
 import numpy as np
 import tyro
@@ -19,7 +19,7 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, T
 
 from asp_env.data.scenarios.selection import save_scenarios
 from asp_env.errors import AspEnvError
-from asp_env.evaluation.closed_loop.comparison import EXPERT, EpisodeScores, Methods
+from asp_env.evaluation.closed_loop.comparison import EXPERT, EpisodeScores, Methods, joined_scores
 from asp_env.evaluation.closed_loop.forecast_quality import open_loop_rows
 from asp_env.evaluation.closed_loop.scenario_table import DrivenScenarios, write_scenario_table
 from asp_env.evaluation.closed_loop.summary import (
@@ -32,7 +32,7 @@ from asp_env.evaluation.ladder import BASELINE, is_under_test
 from asp_env.evaluation.report import Episode, check_report_possible, write_report
 from asp_env.evaluation.results import SCORE, Condition, Row, write_manifest, write_metrics
 from asp_env.evaluation.selection import PartChoice
-from asp_env.evaluation.study.cells import CellFolder
+from asp_env.evaluation.study.cells import CELLS, CellFolder
 from asp_env.evaluation.study.conditions import (
     Cell,
     DataSet,
@@ -208,7 +208,8 @@ def run_study(
     """
     groups = make_groups(settings)
     data_sets = open_data_sets(settings, groups)
-    cells = make_cells(groups, data_sets)
+    methods = [group.methods() for group in groups]
+    cells = make_cells(groups, methods, data_sets)
     folder = CellFolder(out)
     folder.remove_leftovers()
     missing = {cell.key: Task(cell=cell) for cell in cells if cell.key not in folder}
@@ -220,12 +221,13 @@ def run_study(
         for task, scores in drive(groups, settings.dt_s, tasks) if tasks else ():
             folder.save(task.cell.key, scores)
             progress.advance(bar)
-    return _summarized(settings, groups, data_sets, cells, folder)
+    return _summarized(settings, groups, methods, data_sets, cells, folder)
 
 
 def _summarized(
     settings: StudySettings,
     groups: list[Group],
+    by_group: Sequence[Methods],
     data_sets: Mapping[str, DataSet],
     cells: Sequence[Cell],
     folder: CellFolder,
@@ -237,7 +239,7 @@ def _summarized(
     shown: list[ShownCell] = []
     with_expert: set[Condition] = set()
     for number, group in enumerate(groups):
-        methods, condition = group.methods(), group.condition
+        methods, condition = by_group[number], group.condition
         data_set = data_sets[condition.data]
         own = [cell for cell in cells if cell.group == number]
         by_run = _scores(own, methods, folder)
@@ -307,27 +309,7 @@ def _scores(cells: Sequence[Cell], methods: Methods, folder: CellFolder) -> list
     parts: list[list[tuple[np.ndarray, EpisodeScores]]] = [[] for _ in methods.all]
     for cell in cells:
         parts[cell.unit.method].append((cell.unit.numbers, folder.load(cell.key)))
-    return [_joined(each) for each in parts]
-
-
-def _joined(parts: Sequence[tuple[np.ndarray, EpisodeScores]]) -> EpisodeScores:
-    order = np.argsort(np.concatenate([numbers for numbers, _ in parts]))
-    endings = [ending for _, scores in parts for ending in scores.endings]
-    faults = [fault for _, scores in parts for fault in scores.faults]
-    names = parts[0][1].metrics
-    return EpisodeScores(
-        metrics={
-            name: replace(
-                names[name],
-                value=np.concatenate([scores.metrics[name].value for _, scores in parts])[order],
-                valid=np.concatenate([scores.metrics[name].valid for _, scores in parts])[order],
-            )
-            for name in names
-        },
-        endings=tuple(endings[i] for i in order.tolist()),
-        faults=tuple(faults[i] for i in order.tolist()),
-        rollouts=(),
-    )
+    return [joined_scores(each) for each in parts]
 
 
 def _comparison(
@@ -528,17 +510,17 @@ def _fault_counts(driven: Sequence[DrivenScenarios]) -> dict[str, dict[str, int]
 
 @contextmanager
 def _locked(out: Path) -> Iterator[None]:
-    """Reserves the folder of a study for this process.
+    """Reserves the folder of a study for this process; removes it if nothing was written.
 
     Raises:
         AspEnvError: it is not a folder of a study, or another process writes to it.
     """
     if out.exists() and not out.is_dir():
         raise AspEnvError(f"{out} is a file; choose another --out")
-    names: list[Any] = [each.name for each in out.iterdir()] if out.exists() else []
-    if names and not {SETTINGS, "cells"} & set(names):
+    names = {each.name for each in out.iterdir()} if out.exists() else set[str]()
+    if names and not {SETTINGS, CELLS} & names:
         raise AspEnvError(f"{out} exists and is not the folder of a study; choose another --out")
-    (out / "cells").mkdir(parents=True, exist_ok=True)
+    (out / CELLS).mkdir(parents=True, exist_ok=True)
     descriptor = os.open(out, os.O_RDONLY)
     try:
         try:
@@ -549,4 +531,7 @@ def _locked(out: Path) -> Iterator[None]:
             ) from error
         yield
     finally:
+        for folder in (out / CELLS, out):
+            with suppress(OSError):  # it is not empty
+                folder.rmdir()
         os.close(descriptor)

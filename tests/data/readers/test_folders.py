@@ -229,7 +229,7 @@ def test_a_bad_case_blocks_only_itself(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("empty", ["vehicle", "pedestrian"])
-def test_a_table_without_rows_is_nobody(tmp_path: Path, empty: str) -> None:
+def test_a_table_without_rows_has_no_tracks(tmp_path: Path, empty: str) -> None:
     data = write_interaction(tmp_path / "other")
     tracks = next(data.rglob("vehicle_tracks_000.csv"))
     header = tracks.read_text().splitlines()[0] + "\n"

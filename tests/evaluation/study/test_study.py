@@ -173,7 +173,9 @@ def test_keys_depend_on_what_the_result_depends_on(data: str) -> None:
     for change in changes:
         given = settings(data, methods=("constant-turn-rate",), traffic=("log",), **change)
         groups = make_groups(given)
-        keys = {cell.key for cell in make_cells(groups, open_data_sets(given, groups))}
+        methods = [group.methods() for group in groups]
+        cells = make_cells(groups, methods, open_data_sets(given, groups))
+        keys = {cell.key for cell in cells}
         assert not keys & seen
         seen |= keys
 
@@ -258,3 +260,10 @@ def test_cells_of_a_killed_process_leave_nothing(tmp_path: Path) -> None:
     partial.touch()
     folder.remove_leftovers()
     assert not partial.exists()
+
+
+def test_bad_input_leaves_no_folder(data: str, tmp_path: Path) -> None:
+    for method, scenarios in (("nothing", ""), ("idm", "length>=900")):
+        with pytest.raises(AspEnvError):
+            Study(out=tmp_path / "out", data=(data,), methods=(method,), scenarios=scenarios).run()
+        assert not (tmp_path / "out").exists()
