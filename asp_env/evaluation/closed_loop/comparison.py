@@ -339,7 +339,7 @@ class ComparisonScores:
 
 
 def joined_scores(
-    parts: Sequence[tuple[Int[np.ndarray, " b"], EpisodeScores]],
+    parts: Sequence[tuple[Int[np.ndarray, " _"], EpisodeScores]],
 ) -> EpisodeScores:
     """The scores of one method in several work units, in the order of the scenarios.
 
