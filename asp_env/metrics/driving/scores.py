@@ -229,9 +229,8 @@ def _continuous(
         weights=DrivingCostWeights(),
     )
     near = record.near_miss & active
-    horizon_s = BOUNDED_TTC.horizon_s
-    min_ttc_s = np.where(active, record.bounded_ttc_s, horizon_s).min(axis=1, initial=horizon_s)
-    braking = np.where(active, record.required_mps2, 0.0).max(axis=1, initial=0.0)
+    min_ttc_s = np.where(active, record.bounded_ttc_s, BOUNDED_TTC.horizon_s).min(axis=1)
+    braking = np.where(active, record.required_mps2, 0.0).max(axis=1)
     values = {
         "no near miss": 1.0 - near.any(axis=1),
         "near misses": _mean_over_ticks(near, active),
@@ -266,7 +265,7 @@ def _progress(record: EpisodeRecord, rules: Rules) -> Float[np.ndarray, " b"]:
 
 
 def _direction(record: EpisodeRecord) -> Masked:
-    worst = against_traffic_in_window_m(record).max(axis=1, initial=0.0)
+    worst = against_traffic_in_window_m(record).max(axis=1)
     known = record.map_context.against_traffic_m.valid & record.active
     return Masked(
         value=np.select([worst <= COMPLIANT_M, worst <= VIOLATION_M], [1.0, 0.5], 0.0),
