@@ -285,7 +285,7 @@ def holm(p_values: Sequence[float]) -> list[float]:
     Returns:
         The adjusted values in the same order.
     """
-    order = np.argsort(p_values, kind="stable")
+    order = np.argsort(p_values)
     factors = len(p_values) - np.arange(len(p_values))
     adjusted = np.minimum(np.maximum.accumulate(factors * np.asarray(p_values)[order]), 1.0)
     back = np.empty(len(p_values))

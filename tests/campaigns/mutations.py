@@ -135,18 +135,37 @@ BYTES: Sequence[Mutation] = (
 )
 
 
-def _rows(rng: np.random.Generator, content: bytes) -> bytes:
-    """Removes, repeats, exchanges, shuffles or cuts rows."""
-    lines = content.splitlines(keepends=True) or [b""]
-    a, b = (int(rng.integers(0, len(lines))) for _ in range(2))
-    kind = int(rng.integers(8))
+def _move_line(
+    rng: np.random.Generator, lines: list[bytes], first: int, last: int, *, kinds: int
+) -> tuple[int, int]:
+    """Draws a line and a kind of change; kinds 0 to 2 remove, repeat or exchange it in place.
+
+    Args:
+        rng: generator.
+        lines: the lines of a file, changed.
+        first: index of the first line that may be drawn.
+        last: index behind the last one.
+        kinds: number of kinds of change.
+
+    Returns:
+        The index of the line, and the kind.
+    """
+    a, b = (int(rng.integers(first, last)) for _ in range(2))
+    kind = int(rng.integers(kinds))
     if kind == 0:
         del lines[a]
     elif kind == 1:
         lines.insert(b, lines[a])
     elif kind == 2:
         lines[a], lines[b] = lines[b], lines[a]
-    elif kind == 3:
+    return a, kind
+
+
+def _rows(rng: np.random.Generator, content: bytes) -> bytes:
+    """Removes, repeats, exchanges, shuffles or cuts rows."""
+    lines = content.splitlines(keepends=True) or [b""]
+    a, kind = _move_line(rng, lines, 0, len(lines), kinds=8)
+    if kind == 3:
         lines[1:] = [lines[1:][i] for i in rng.permutation(len(lines) - 1)]
     elif kind == 4:
         lines[a] = lines[a][: len(lines[a]) // 2] + b"\n"
@@ -154,7 +173,7 @@ def _rows(rng: np.random.Generator, content: bytes) -> bytes:
         del lines[1:]
     elif kind == 6:
         lines = lines[: 1 + len(lines) // 2] * 2
-    else:
+    elif kind == 7:
         lines[a] = lines[a].rstrip(b"\n") + pick(rng, (b",", b",1,2", b'"', b"\t")) + b"\n"
     return b"".join(lines)
 
@@ -263,21 +282,14 @@ def _elements(rng: np.random.Generator, content: bytes) -> bytes:
     lines = content.splitlines(keepends=True)
     if len(lines) < 5:
         return _lose(rng, content)
-    a, b = (int(rng.integers(2, len(lines) - 1)) for _ in range(2))
-    kind = int(rng.integers(7))
-    if kind == 0:
-        del lines[a]
-    elif kind == 1:
-        lines.insert(b, lines[a])
-    elif kind == 2:
-        lines[a], lines[b] = lines[b], lines[a]
-    elif kind == 3:
+    a, kind = _move_line(rng, lines, 2, len(lines) - 1, kinds=7)
+    if kind == 3:
         lines.insert(a, b"<x>" * 20_000 + b"</x>" * 20_000)
     elif kind == 4:
         lines[a] = re.sub(rb"ref='\d+'", lambda _: b"ref='%d'" % rng.integers(1, 99), lines[a])
     elif kind == 5:
         lines[a] = re.sub(rb"(<nd [^>]*>)(.*)(<nd [^>]*>)", rb"\3\2\1", lines[a])
-    else:
+    elif kind == 6:
         lines[a] = re.sub(rb"(<nd [^>]*>|<member [^>]*>)", b"", lines[a], count=2)
     return b"".join(lines)
 

@@ -256,6 +256,7 @@ def test_holm_by_hand():
     """Of four tests, in order of size: 4 · 0.005, 3 · 0.01, 2 · 0.03, then at least as much."""
     assert holm([0.01, 0.04, 0.03, 0.005]) == pytest.approx([0.03, 0.06, 0.06, 0.02])
     assert holm([0.9, 0.8]) == [1.0, 1.0]
+    assert holm([0.5, 0.125, 0.125]) == [0.5, 0.375, 0.375]  # equal values stay equal
     assert holm([]) == []
 
 

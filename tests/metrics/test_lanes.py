@@ -230,6 +230,11 @@ def test_speed_limit(state: np.ndarray, limit: float | None) -> None:
     assert (found.value[0] if found.valid[0] else None) == limit
 
 
+def test_a_speed_limit_below_walking_pace_is_returned_as_it_is() -> None:
+    slow = replace(STREET, limits_mps=np.full(6, 0.5))
+    assert speed_limits(slow, at(10, 0)).value.tolist() == [0.5]
+
+
 def test_reachable_lanes() -> None:
     """From `EAST` its successors; nothing from a point without a lane or heading against it."""
     assert set(np.flatnonzero(reachable_lanes(STREET, at(10, 0)[0]))) == {EAST, ONWARDS, LEFT}

@@ -146,7 +146,7 @@ def driving_metrics(record: EpisodeRecord, rules: Rules) -> dict[str, Masked]:
         "direction": _direction(record),
         "speed": _speed(record),
         "comfort": Masked(
-            value=np.asarray(1.0 - uncomfortable.value.any(axis=1)), valid=share_of_bound.valid
+            value=np.asarray(1.0 - uncomfortable.any(axis=1)), valid=share_of_bound.valid
         ),
         "feasible": _feasible(record),
     }
@@ -204,7 +204,7 @@ def _score(
 
 
 def _continuous(
-    record: EpisodeRecord, uncomfortable: Masked, share_of_bound: Masked
+    record: EpisodeRecord, uncomfortable: Bool[np.ndarray, "b t"], share_of_bound: Masked
 ) -> dict[str, Masked]:
     """The continuous measures, which do not depend on the rules.
 
@@ -222,16 +222,15 @@ def _continuous(
     cost_s = driving_cost_s(
         time_lost_s=lost_s,
         ttc_s=record.bounded_ttc_s,
-        uncomfortable=uncomfortable.value > 0,
+        uncomfortable=uncomfortable,
         fault=np.asarray((at_fault(record, NUPLAN) | off_road).any(axis=1)),
         active=active,
         dt_s=record.dt_s,
         weights=DrivingCostWeights(),
     )
     near = record.near_miss & active
-    horizon_s = BOUNDED_TTC.horizon_s
-    min_ttc_s = np.where(active, record.bounded_ttc_s, horizon_s).min(axis=1, initial=horizon_s)
-    braking = np.where(active, record.required_mps2, 0.0).max(axis=1, initial=0.0)
+    min_ttc_s = np.where(active, record.bounded_ttc_s, BOUNDED_TTC.horizon_s).min(axis=1)
+    braking = np.where(active, record.required_mps2, 0.0).max(axis=1)
     values = {
         "no near miss": 1.0 - near.any(axis=1),
         "near misses": _mean_over_ticks(near, active),
@@ -242,7 +241,7 @@ def _continuous(
         "driving cost": cost_s,
     }
     by_comfort = {
-        "uncomfortable ticks": _mean_over_ticks(uncomfortable.value, active),
+        "uncomfortable ticks": _mean_over_ticks(uncomfortable, active),
         "smoothness": np.asarray(np.clip(1.5 - share_of_bound.value, 0.0, 1.0)),
     }
     has_ticks = np.asarray(count > 0)
@@ -266,7 +265,7 @@ def _progress(record: EpisodeRecord, rules: Rules) -> Float[np.ndarray, " b"]:
 
 
 def _direction(record: EpisodeRecord) -> Masked:
-    worst = against_traffic_in_window_m(record).max(axis=1, initial=0.0)
+    worst = against_traffic_in_window_m(record).max(axis=1)
     known = record.map_context.against_traffic_m.valid & record.active
     return Masked(
         value=np.select([worst <= COMPLIANT_M, worst <= VIOLATION_M], [1.0, 0.5], 0.0),
@@ -282,22 +281,18 @@ def _speed(record: EpisodeRecord) -> Masked:
     return Masked(value=value, valid=np.asarray(count > 0))
 
 
-def _comfort_over_ticks(record: EpisodeRecord) -> tuple[Masked, Masked]:
-    """Ticks (b, t) beyond a comfort bound, 1 or 0, and the largest share (b,) of any bound.
+def _comfort_over_ticks(record: EpisodeRecord) -> tuple[Bool[np.ndarray, "b t"], Masked]:
+    """Ticks (b, t) beyond a comfort bound, and the largest share (b,) of any bound.
 
-    Both are missing for short episodes, and the ticks after the end.
+    For short episodes the ticks are false and the share is missing; ticks after the end are false.
     """
     ticks, needed = record.active.sum(axis=1), window_ticks(record.dt_s)
-    beyond, share = np.zeros(record.active.shape), np.zeros(len(ticks))
+    beyond, share = np.zeros(record.active.shape, dtype=bool), np.zeros(len(ticks))
     for b in np.flatnonzero(ticks >= needed).tolist():
         signals = comfort_signals(record.states[b, : ticks[b]], record.dt_s)
         beyond[b, : ticks[b]] = ~within_bounds(signals)
         share[b] = share_of_bounds(signals).max()
-    long_enough = np.asarray(ticks >= needed)
-    return (
-        Masked(value=beyond, valid=record.active & long_enough[:, None]),
-        Masked(value=share, valid=long_enough),
-    )
+    return beyond, Masked(value=share, valid=np.asarray(ticks >= needed))
 
 
 def _feasible(record: EpisodeRecord) -> Masked:

@@ -7,6 +7,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from asp_env.metrics.forecast import calibration
 from asp_env.metrics.forecast.calibration import (
     brier,
     calibration_error,
@@ -51,8 +52,10 @@ def test_nll_of_a_target_does_not_depend_on_the_others() -> None:
     assert found.value == pytest.approx([LOG_2PI, LOG_2PI + 45_000])
 
 
-def test_nll_is_a_density() -> None:
+@pytest.mark.parametrize("sigma_m", [1.0, 0.5])
+def test_nll_is_a_density(sigma_m: float, monkeypatch: pytest.MonkeyPatch) -> None:
     """exp(-NLL) over a grid of 0.25 m that covers both modes adds up to one."""
+    monkeypatch.setattr(calibration, "NLL_SIGMA_M", sigma_m)
     side = np.arange(-8, 8, 0.25)
     truth = np.stack(np.meshgrid(side, side), axis=-1).reshape(-1, 2)
     ends = np.tile([[(-1.0, 0.5), (2.0, -1.0)]], (len(truth), 1, 1))

@@ -9,6 +9,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from asp_env.geometry import from_frame
+from predictors.models import losses
 from predictors.models.losses import (
     Assignment,
     Classification,
@@ -114,6 +115,19 @@ def test_annealing_ends_with_only_the_best_mode(share: float) -> None:
     assert torch.equal(annealed_loss(positions, label, best, share), expected)
 
 
+def test_both_regression_losses_have_the_same_cut_off(monkeypatch: pytest.MonkeyPatch) -> None:
+    """With h = 2 m, offsets of 1 m cost 0.5, of 3 m 2 (3 - 1) = 4, and of 4 m 2 (4 - 1) = 6.
+
+    The modes cost (0.5 + 0) / 2 = 0.25 and (4 + 6) / 2 = 5, and at 4 m the nearer one has the
+    weight 1 / (1 + 1/e) = 0.731059.
+    """
+    monkeypatch.setattr(losses, "HUBER_M", 2.0)
+    positions, label = two_modes()
+    assert float(regression_loss(positions, label, torch.tensor([1]))) == pytest.approx(5.0)
+    loss = annealed_loss(positions, label, torch.tensor([0]), 0.25)
+    assert float(loss) == pytest.approx(0.731059 * 0.25 + 0.268941 * 5, abs=1e-5)
+
+
 def test_annealing_trains_every_mode_at_first() -> None:
     """At the start the farther mode gets a gradient; without annealing it gets none."""
     for share, learns in ((0.0, True), (None, False)):
@@ -182,6 +196,18 @@ def test_random_mode_only_where_none_is_within_5_degrees() -> None:
     assert torch.equal(best_or_random_mode(positions, near), best_mode(positions, near))
     standing = torch.tensor([straight_line(polar(1, 120))]).repeat(count, 1, 1)
     assert torch.equal(best_or_random_mode(positions, standing), best_mode(positions, standing))
+
+
+def test_random_mode_by_hand() -> None:
+    """Modes 2, 3 and 1 m beside the label are hashed to 0, 0x4000 and 0x8000.
+
+    The bits of these float32 are 128 · 2²³, 257 · 2²² and 127 · 2²³. The factor of the hash is 1
+    modulo 4, so the products are 0, 2²² and 2²³ modulo 2²⁴, of which bits 8 to 23 are compared.
+    """
+    positions = torch.tensor([[[[10.0, 2.0]], [[10.0, 3.0]], [[10.0, 1.0]]]])
+    label = torch.tensor([[[10.0, 0.0]]])
+    assert best_or_random_mode(positions, label).tolist() == [2]
+    assert best_or_random_mode(positions[:, :2], label).tolist() == [1]
 
 
 def test_only_losses_choose_random_modes() -> None:
