@@ -58,11 +58,13 @@ def test_damage_is_an_error_of_one_line(
         whole[flip % len(whole)] ^= 1 << flip % 8
     path = tmp_path_factory.mktemp("damaged") / f"a.csv{suffix}"
     path.write_bytes(whole)
+    message = ""
     try:
         assert read(path) == [i * i for i in range(ROWS)]
     except DataError as error:
-        assert "\n" not in str(error)
-        assert str(error).startswith(str(path))
+        message = str(error)
+    assert message.startswith(str(path)) or not message
+    assert "\n" not in message
 
 
 @each_suffix
