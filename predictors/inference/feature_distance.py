@@ -172,7 +172,7 @@ def _moments(z: Float[np.ndarray, "n z"]) -> dict[str, np.ndarray]:
     shrunk = (1 - SHRINKAGE) * covariance + SHRINKAGE * variance * np.eye(len(covariance))
     values, vectors = np.linalg.eigh(shrunk)
     # A rotation of W changes no distance; this one makes half of it zero.
-    return {"mean": mean, "whitening": np.linalg.qr((vectors / np.sqrt(values)).T, mode="r")}
+    return {"mean": mean, "whitening": np.linalg.qr((vectors / np.sqrt(values)).T).R}
 
 
 def round_significant(

@@ -10,6 +10,7 @@ from asp_env.data.predictor import load_predictor
 from asp_env.data.snippets import gather_scene, index_snippets
 from predictors.experiments.pretrained import ship
 from predictors.inference.checkpoint import weights_hash
+from predictors.inference.trained import TrainedPredictor
 from tests.builders import make_recording
 from tests.predictors.tiny import save_random
 
@@ -43,12 +44,13 @@ def test_weights_that_only_training_uses_have_four_bits(tmp_path: Path) -> None:
         fractions, _ = np.frexp(after[name].astype(np.float32))
         assert not (np.ldexp(fractions, bits) % 1).any(), name
         np.testing.assert_allclose(after[name], weights, rtol=2.0**-bits, atol=2.0**-24)
-    network = load_predictor(f"ssp-asp:{shipped}", horizon=15, dt_s=0.2)
+    predictor = load_predictor(f"ssp-asp:{shipped}", horizon=15, dt_s=0.2)
+    assert isinstance(predictor, TrainedPredictor)
     recordings = [make_recording()]
     scene = gather_scene(recordings, index_snippets(recordings, dt_s=0.2, horizon_s=3.0))
-    expected = network.predict(scene).states
-    torch.nn.init.zeros_(network.network.reconstructor[0].weight)
-    np.testing.assert_array_equal(network.predict(scene).states, expected)
+    expected = predictor.predict(scene).states
+    torch.nn.init.zeros_(predictor.network.get_parameter("reconstructor.0.weight"))
+    np.testing.assert_array_equal(predictor.predict(scene).states, expected)
 
 
 def test_card_of_shipped_weights_has_their_hash(tmp_path: Path) -> None:
