@@ -15,7 +15,6 @@ from typing import Annotated, Any
 
 import torch
 import tyro
-from torch import Tensor
 
 from asp_env import registry
 from asp_env.evaluation.open_loop.evaluate import RATIO, Evaluate, evaluate
@@ -31,7 +30,6 @@ from predictors.inference.checkpoint import (
     weights_hash,
     write_json,
 )
-from predictors.inference.feature_distance import round_significant
 from predictors.inference.fit_features import add_feature_distance
 from predictors.inference.pretrained import PRETRAINED
 from predictors.training.command import Train
@@ -93,14 +91,6 @@ SOURCE = "synthetic traffic"
 EPOCHS = 24
 """Epochs of each predictor, instead of the recipe's eight. Chosen by hand: the errors on the
 validation data still fall, and a run takes a few minutes."""
-
-TRAINING_ONLY = "reconstructor."
-"""Prefix of the weights that no forecast uses: those of ξ of SSP-ASP, from which fine-tuning
-starts."""
-
-TRAINING_BITS = 4
-"""Significant bits of these weights. Chosen by hand: a package that holds them compressed is
-0.14 MB smaller than with the 11 of half precision."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -171,8 +161,7 @@ _TERMS = "license: other\nlicense_name: terms-of-the-training-data\n"
 def ship(run: Path, shipped: Path, *, made_in: Path) -> None:
     """Copies a finished run with its weights in half precision, which halves their size.
 
-    Weights that only training uses are rounded to `TRAINING_BITS` significant bits. The name of
-    the training data becomes `SOURCE`, and the folder that all was made in `OUT`.
+    The name of the training data becomes `SOURCE`, and the folder that all was made in `OUT`.
 
     Args:
         run: The folder of the run.
@@ -187,16 +176,10 @@ def ship(run: Path, shipped: Path, *, made_in: Path) -> None:
         config["provenance"]["trained_on"]["source"] = SOURCE
         config = json.loads(json.dumps(config).replace(f"{made_in}/", "OUT/"))
         weights = read_weights(run / WEIGHTS)
-        save_weights({n: _halved(n, each) for n, each in weights.items()}, folder / WEIGHTS)
+        save_weights({n: each.to(torch.float16) for n, each in weights.items()}, folder / WEIGHTS)
         write_json({**config, "weights_sha256": hash_of(folder / WEIGHTS)}, folder / CONFIG)
         card = (run / CARD).read_text().replace(f"{made_in}/", "OUT/")
         (folder / CARD).write_text(card.replace(weights_hash(run), weights_hash(folder)))
-
-
-def _halved(name: str, weight: Tensor) -> Tensor:
-    if name.startswith(TRAINING_ONLY):
-        weight = torch.from_numpy(round_significant(weight.numpy(), bits=TRAINING_BITS))
-    return weight.to(torch.float16)
 
 
 def _errors(name: str, shipped: Path, data: str, note: str) -> str:
@@ -234,8 +217,7 @@ def _section(name: str, held_out: Sequence[str], rows: Sequence[str]) -> str:
         "",
         "makes this folder (`OUT/pretrained`): it generates normal, dense and varied traffic of "
         "SUMO with measurement errors, trains with augmentation, and rounds the weights to half "
-        f"precision (those that no forecast uses, ξ of SSP-ASP, to {TRAINING_BITS} significant "
-        "bits); the network computes in single precision. The epoch, the probabilities and the "
+        "precision; the network computes in single precision. The epoch, the probabilities and the "
         "factor on accelerations were chosen on varied traffic at other locations and on traffic "
         "of highway-env. All traffic is generated, so no terms of recordings apply.",
         "",
