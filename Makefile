@@ -90,7 +90,7 @@ sbom: $(AUDIT)/.installed
 	$(AUDIT)/bin/cyclonedx-py environment --output-reproducible --pyproject pyproject.toml \
 	--output-file sbom.json $(BIN)/python
 
-# Compares the pinned packages with the known vulnerabilities, which needs a network.
+# Compares the pinned packages with the known vulnerabilities; needs pypi.org, not a mirror of it.
 audit: $(AUDIT)/.installed
 	$(AUDIT)/bin/pip-audit --requirement constraints.txt --no-deps --disable-pip --strict
 

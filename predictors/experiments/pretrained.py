@@ -2,9 +2,8 @@
 
 The command generates traffic of SUMO with measurement errors, trains a predictor on it, selects
 the epoch and calibrates on other locations and on traffic of highway-env, and rounds the weights to
-half precision. The content of
-`OUT/pretrained` belongs in `predictors/pretrained`. The same OUT can be given again, and what is
-finished is not made again.
+half precision. The content of `OUT/pretrained` belongs in `predictors/pretrained`. The same OUT can
+be given again, and what is finished is not made again.
 """
 
 import json

@@ -360,7 +360,7 @@ def synthesize(
             `truth/XX_trueTracks.csv`, which readers ignore.
         locations: number of locations; by default one for three recordings.
         traffic: `normal`, `dense` or `varied`.
-        compress: whether to write tracks as `.csv.gz`.
+        compress: whether to write tracks as `.csv.xz`.
         jobs: number of processes; the bytes do not depend on it.
         progress: whether to show a progress bar.
 
@@ -404,7 +404,7 @@ def _write_recording(
     tracker: Tracker | None,
 ) -> None:
     folder = content.folder
-    suffix = ".csv.gz" if content.compress else ".csv"
+    suffix = ".csv.xz" if content.compress else ".csv"
     rate_hz = FRAME_RATE_HZ if tracker is None else tracker.frame_rate_hz
     num_frames = round(content.minutes * 60.0 * rate_hz)
     motions, users = record(rng, place, num_frames=num_frames, frame_rate_hz=rate_hz)

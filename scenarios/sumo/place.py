@@ -175,8 +175,8 @@ def _zebra(image: np.ndarray, lanelet: Lanelet) -> None:
 
 def write_picture(path: Path, image: UInt8[np.ndarray, "h w 3"]) -> None:
     """Writes a small PNG: the number of shades is reduced."""
-    settings = (cv2.IMWRITE_PNG_COMPRESSION, 9)
-    strategy = (cv2.IMWRITE_PNG_STRATEGY, cv2.IMWRITE_PNG_STRATEGY_DEFAULT)
+    settings = (cv2.IMWRITE_PNG_COMPRESSION, 9, cv2.IMWRITE_PNG_FILTER, cv2.IMWRITE_PNG_FILTER_NONE)
+    strategy = (cv2.IMWRITE_PNG_STRATEGY, cv2.IMWRITE_PNG_STRATEGY_FILTERED)
     encoded = cv2.imencode(".png", image // _SHADES * _SHADES, [*settings, *strategy])[1]
     path.write_bytes(encoded.tobytes())
 

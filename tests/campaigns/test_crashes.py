@@ -1,13 +1,13 @@
 """The short form of the crash campaign: some kills and full disks on tiny data."""
 
-import subprocess
-import sys
+import resource
 from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
 import pytest
 
+from asp_env.cli import main
 from tests.campaigns import crashes
 
 
@@ -35,21 +35,20 @@ def test_a_rerun_after_a_kill_writes_the_same(
     assert outcome.faults == []
 
 
-def test_a_file_that_is_too_large_is_one_line(tmp_path: Path) -> None:
+def test_a_file_that_is_too_large_is_one_line(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
     """As on a full disk or over a quota: the line names the file, and nothing remains."""
-    code = (
-        "import resource, sys; resource.setrlimit(resource.RLIMIT_FSIZE, (4096, 4096)); "
-        "from asp_env.cli import main; sys.exit(main())"
-    )
-    done = subprocess.run(
-        [
-            *(sys.executable, "-c", code, "synthesize", "out"),
-            *("--site", "highway:intersection", "--recordings", "1", "--minutes", "0.05"),
-        ],
-        cwd=tmp_path, capture_output=True, text=True, check=False,
-    )  # fmt: skip
-    errors = [line for line in done.stderr.splitlines() if line.startswith("asp-env: ")]
-    assert done.returncode == 2
+    monkeypatch.chdir(tmp_path)
+    soft, hard = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (4096, hard))
+    try:
+        options = ("--site", "highway:intersection", "--recordings", "1", "--minutes", "0.05")
+        assert main(["synthesize", "out", *options]) == 2
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))
+    lines = capsys.readouterr().err.splitlines()
+    errors = [line for line in lines if line.startswith("asp-env: ")]
     assert len(errors) == 1
     assert errors[0].startswith("asp-env: out")
     assert "cannot be written (File too large); free some space" in errors[0]

@@ -130,7 +130,7 @@ def write_recording(
 ) -> Path:
     """Writes one recording's three tables into `folder/data` and returns that folder.
 
-    `tracks` replaces the default rows; `suffix` may be `.gz`.
+    `tracks` replaces the default rows; `suffix` may be `.gz` or `.xz`.
     """
     data = folder / "data"
     data.mkdir(parents=True, exist_ok=True)

@@ -12,6 +12,7 @@ from pathlib import Path
 import numpy as np
 import pandas as pd
 
+from asp_env.data.readers.compressed import CSV
 from asp_env.data.readers.found import FoundRecording, RecordingTables
 from asp_env.data.readers.layout import ClassNames, walk
 from asp_env.data.readers.measurements import Measurements
@@ -46,7 +47,7 @@ def find_recordings(folder: Path) -> Iterator[FoundRecording]:
     """The tables in and below a folder; a recording is named after its file."""
     for place, names in walk(folder):
         for name in names:
-            if re.search(r"\.csv(\.gz)?$", name, re.IGNORECASE):
+            if re.search(rf"{CSV}$", name, re.IGNORECASE):
                 path = place / name
                 if has_columns(path, _COLUMNS):
                     title = (place.relative_to(folder) / name.split(".")[0]).as_posix()

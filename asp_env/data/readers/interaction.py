@@ -20,6 +20,7 @@ from pathlib import Path
 import numpy as np
 import pandas as pd
 
+from asp_env.data.readers.compressed import CSV
 from asp_env.data.readers.layout import (
     MAP_SUFFIXES,
     ClassNames,
@@ -40,7 +41,7 @@ from asp_env.errors import DataError
 META = "meta_data.csv"
 KMH_PER_MPS = 3.6
 
-_PART = re.compile(r"^(vehicle|pedestrian)_tracks_([^.]+)\.csv(?:\.gz)?$", re.IGNORECASE)
+_PART = re.compile(rf"^(vehicle|pedestrian)_tracks_([^.]+){CSV}$", re.IGNORECASE)
 _META_COLUMNS: dict[str, Kind] = {
     "id": "text",
     "originLat": "number",

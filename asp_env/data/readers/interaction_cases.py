@@ -15,6 +15,7 @@ from typing import Any
 import numpy as np
 
 from asp_env.data.readers.caching import CacheEntry, cached
+from asp_env.data.readers.compressed import CSV
 from asp_env.data.readers.interaction import (
     OPTIONAL_TRACKS,
     TRACKS,
@@ -30,7 +31,7 @@ from asp_env.data.readers.tables import Kind, find_line, has_columns, number_tex
 from asp_env.errors import DataError
 from asp_env.stored import brief
 
-_TABLE = re.compile(r"^(.+?)(?:_(?:train|val|test|obs))?\.csv(?:\.gz)?$", re.IGNORECASE)
+_TABLE = re.compile(rf"^(.+?)(?:_(?:train|val|test|obs))?{CSV}$", re.IGNORECASE)
 _NEEDED = ("case_id", "track_id", "timestamp_ms", "agent_type", "x", "y")
 _CASES: Mapping[str, Kind] = {"case_id": "number", **TRACKS, "track_id": "text"}
 _COLUMNS = ("track_ids", "classes", "sizes", "first_frames")
@@ -87,7 +88,7 @@ def find_recordings(root: Path) -> tuple[CaseFiles, ...]:
             match = _TABLE.match(name)
             if match is None or not has_columns(folder / name, _NEEDED):
                 continue
-            path, prefix = folder / name, re.sub(r"\.csv(\.gz)?$", "", name, flags=re.IGNORECASE)
+            path, prefix = folder / name, re.sub(rf"{CSV}$", "", name, flags=re.IGNORECASE)
             try:
                 _, arrays = cached(path, [path], lambda path=path: _list_cases(path), "case ids")
                 cases: list[float | None] = arrays["case_ids"].tolist()

@@ -1,8 +1,9 @@
 """The inD/rounD layout: recordings of three CSV tables each, their maps, and background images.
 
 Recording `XX` consists of `XX_recordingMeta.csv`, `XX_tracksMeta.csv`, `XX_tracks.csv` (or
-`.csv.gz`) and optionally `XX_background.png`, all in one folder, at any depth. Metadata are read
-for each recording, not for each location: the origin differs between recordings of one location.
+`.csv.gz`, `.csv.xz`) and optionally `XX_background.png`, all in one folder, at any depth. Metadata
+are read for each recording, not for each location: the origin differs between recordings of one
+location.
 """
 
 import math
@@ -16,6 +17,7 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from asp_env.data.classes import FOOTPRINTS_M, VULNERABLE
+from asp_env.data.readers.compressed import CSV
 from asp_env.data.readers.layout import (
     COURSE_ABOVE_MPS,
     ClassNames,
@@ -73,7 +75,7 @@ MARGIN_PX = 5.0
 Chosen by hand."""
 
 _PART = re.compile(
-    r"^(.+)_(recordingMeta\.csv|tracksMeta\.csv|tracks\.csv(?:\.gz)?|background\.png)$",
+    rf"^(.+)_(recordingMeta\.csv|tracksMeta\.csv|tracks{CSV}|background\.png)$",
     re.IGNORECASE,
 )
 _TIME = re.compile(r"^(\d{1,2}(?:\.\d*)?)(?::([0-5]\d)(?::[0-5]\d)?)?$", re.ASCII)

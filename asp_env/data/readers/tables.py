@@ -1,8 +1,6 @@
 """CSV tables: columns by name, the exact line of every fault, and frames from time stamps."""
 
 import csv
-import gzip
-import io
 import itertools
 import math
 import zlib
@@ -16,6 +14,7 @@ import numpy as np
 import pandas as pd
 from jaxtyping import Float, Int
 
+from asp_env.data.readers.compressed import open_table
 from asp_env.data.readers.ranges import Limit
 from asp_env.errors import DataError
 from asp_env.stored import brief
@@ -81,7 +80,7 @@ def read_columns(
     limits: Mapping[str, Limit] = {},
     may_be_empty: bool = False,
 ) -> Iterator[dict[str, np.ndarray]]:
-    """Reads columns of a CSV file (plain or `.gz`), a chunk of rows at a time.
+    """Reads columns of a CSV file (plain, `.gz` or `.xz`), a chunk of rows at a time.
 
     Args:
         path: the file. Its first line names the columns, in any order, in upper or lower case.
@@ -318,10 +317,6 @@ def read_clock(
     )
 
 
-def _open(path: Path) -> io.BufferedIOBase:
-    return gzip.GzipFile(path) if path.suffix.lower() == ".gz" else path.open("rb")
-
-
 def header_of(path: Path) -> list[str]:
     """The names of a table's columns, without spaces around them.
 
@@ -371,7 +366,7 @@ def _has_even_rows(path: Path, num_columns: int) -> bool:
     """Whether the number of commas fits the number of lines. Much faster than parsing."""
     commas = lines = 0
     last = b"\n"
-    with _open(path) as file:
+    with open_table(path) as file:
         while block := file.read(_BLOCK_BYTES):
             commas += block.count(b",")
             lines += block.count(b"\n")
@@ -406,20 +401,24 @@ def _frames(
     """The parsed chunks of a file: texts as they are, all else in double precision."""
     kinds = dict(columns.values())
     names = [columns[i][0] if i in columns else f"column {i + 1}" for i in range(len(header))]
-    reader = pd.read_csv(
-        path,
-        header=0,
-        names=names,
-        usecols=list(columns),
-        dtype={name: str if kind == "text" else np.float64 for name, kind in kinds.items()},
-        chunksize=ROWS_PER_CHUNK,
-        index_col=False,
-        encoding="utf-8-sig",
-        encoding_errors="replace",
-        keep_default_na="text" not in kinds.values(),
-        na_values={name: list(EMPTY) for name, kind in kinds.items() if kind == "number or empty"},
-    )
-    with reader:
+    with (
+        open_table(path) as file,
+        pd.read_csv(
+            file,
+            header=0,
+            names=names,
+            usecols=list(columns),
+            dtype={name: str if kind == "text" else np.float64 for name, kind in kinds.items()},
+            chunksize=ROWS_PER_CHUNK,
+            index_col=False,
+            encoding="utf-8-sig",
+            encoding_errors="replace",
+            keep_default_na="text" not in kinds.values(),
+            na_values={
+                name: list(EMPTY) for name, kind in kinds.items() if kind == "number or empty"
+            },
+        ) as reader,
+    ):
         yield from reader
 
 
@@ -507,7 +506,7 @@ def _count_beyond(path: Path, index: int, limit: Limit | None) -> str:
 
 def _lines(path: Path) -> Iterator[tuple[int, list[str]]]:
     """Number, from 1, and cells of every line that is not blank."""
-    with _open(path) as file:
+    with open_table(path) as file:
         for number, line in enumerate(file, start=1):
             text = line.decode("utf-8-sig", "replace").rstrip("\r\n")
             try:  # line by line, so that an unclosed quote affects no other line

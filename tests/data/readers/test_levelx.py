@@ -150,14 +150,14 @@ def test_sizes_in_the_metadata(tmp_path: Path) -> None:
     np.testing.assert_allclose(read(tmp_path).sizes, [(4.5, 1.8)])
 
 
-@pytest.mark.parametrize("change", ["columns", "rows", "gzip", "chunks", "crlf", "spaces"])
+@pytest.mark.parametrize("change", ["columns", "rows", ".gz", ".xz", "chunks", "crlf", "spaces"])
 def test_equivalent_files_give_equal_tracks(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, change: str
 ) -> None:
     """Order of columns and rows, compression, chunk size, line ends and spaces."""
     plain = read(write_folder(tmp_path / "plain"))
     other = tmp_path / "other"
-    path = write_recording(other, suffix=".gz" if change == "gzip" else "") / "00_tracks.csv"
+    path = write_recording(other, suffix=change if change.startswith(".") else "") / "00_tracks.csv"
     if change == "columns":
         rows = pd.read_csv(path)
         rows[rows.columns[::-1]].assign(note="a, b").to_csv(path, index=False)

@@ -109,20 +109,19 @@ def test_physical_predictors_have_no_features() -> None:
 
 
 def test_the_file_has_them_as_a_last_output_if_asked_for(run: str, tmp_path: Path) -> None:
-    """Equal to the network's to 1e-4; without the option the outputs are as before."""
+    """Equal to the network's to 1e-4. `test_export` has the outputs without the option."""
     predictor = load(run)
     inputs = inputs_of(make_batch(scene(), predictor.view, predictor.history))
     named = {
         name: tensor.numpy() for name, tensor in zip(input_names(predictor), inputs, strict=True)
     }
-    found = {}
-    for features in (False, True):
-        path = tmp_path / f"{features}.onnx"
-        write_onnx(run, path, features=features)
-        session = onnxruntime.InferenceSession(path, providers=["CPUExecutionProvider"])
-        found[features] = [output.name for output in session.get_outputs()]
-    assert found[True] == [*found[False], "features"]
-    (value,) = session.run(["features"], named)  # pyright: ignore[reportPossiblyUnboundVariable]
-    expected = predictor.predict(scene()).features
-    assert expected is not None
-    np.testing.assert_allclose(np.asarray(value), expected, atol=1e-4)
+    path = tmp_path / "file.onnx"
+    write_onnx(run, path, features=True)
+    session = onnxruntime.InferenceSession(path, providers=["CPUExecutionProvider"])
+    forecast = predictor.predict(scene())
+    actions = ["actions"] * bool(forecast.actions_valid.all())
+    names = [output.name for output in session.get_outputs()]
+    assert names == ["states", "log_probs", *actions, "features"]
+    (value,) = session.run(["features"], named)
+    assert forecast.features is not None
+    np.testing.assert_allclose(np.asarray(value), forecast.features, atol=1e-4)
