@@ -254,7 +254,72 @@ function drawBars(spec, width, chosen = 0) {
   return svg;
 }
 
-const KINDS = { rows: drawRows, lines: drawLines, bars: drawBars };
+/* Points in metres as the text of a path, y down. */
+function pathText(xy) {
+  const out = [];
+  for (let i = 0; i < xy.length; i += 2) {
+    out.push(`${i ? "L" : "M"}${xy[i].toFixed(2)} ${(-xy[i + 1]).toFixed(2)}`);
+  }
+  return out.join("");
+}
+
+/* Where two methods part: their paths, the agents at that tick, and forecasts made there. */
+function drawParting(spec, width) {
+  const [left, bottom, metres, high] = spec.window, top = 20 * spec.methods.length + 16;
+  const height = Math.min(Math.max(width * high / metres, 240), 440);
+  const scale = Math.min(width / metres, height / high), whole = top + height;
+  const svg = element("svg", { viewBox: `0 0 ${width} ${whole}`, width, height: whole, role: "img" });
+  const colours = ["ego", "second"], paint = (name) => `var(--${name})`;
+  svg.append(element("title", {}, spec.title));
+  spec.methods.forEach(({ label }, i) => {
+    const y = TOP + 20 * i + 4;
+    svg.append(element("line", { class: "series", style: `stroke: ${paint(colours[i])}`, x1: 4, x2: 26, y1: y, y2: y }));
+    svg.append(element("text", { class: "name", x: 32, y: y + 4 }, shortened(label, width - 40)));
+  });
+  const clip = `picture-${pictures++}`, frame = { x: 0, y: top, width, height };
+  const mask = element("clipPath", { id: clip });
+  mask.append(element("rect", frame));
+  const view = element("g", { "clip-path": `url(#${clip})` });
+  const world = element("g", { transform: `translate(${width / 2} ${top + height / 2}) scale(${scale}) ` +
+    `translate(${-(left + metres / 2)} ${bottom + high / 2})` });
+  const line = (xy, className, px, colour = null) => {
+    world.append(element("path", { class: className, d: pathText(xy), "stroke-width": px / scale,
+      ...(colour && { style: `stroke: ${paint(colour)}` }) }));
+  };
+  drawGround(world, spec.map, line);
+  spec.methods.forEach(({ forecasts }, i) => {
+    for (const each of forecasts) line(points(each), "path forecast", 1.2, colours[i]);
+  });
+  spec.methods.forEach(({ path }, i) => {
+    const xy = points(path);
+    line(xy, "path", i ? 2.5 : 6, colours[i]);
+    for (let n = spec.tick; n < xy.length / 2; n += spec.ticks_per_s) {
+      world.append(element("circle", { class: "second", style: `fill: ${paint(colours[i])}`,
+        cx: xy[2 * n], cy: -xy[2 * n + 1], r: (i ? 3 : 4.5) / scale, "stroke-width": 1 / scale }));
+    }
+  });
+  for (const [kind, length, breadth, x, y, heading] of spec.agents) {
+    world.append(element("rect", { class: "agent", x: -length / 200, y: -breadth / 200, width: length / 100,
+      height: breadth / 100, rx: 0.3, "stroke-width": 1.2 / scale,
+      style: `fill: ${paint(kind < 0 ? colours[-1 - kind] : CLASSES[kind])}`,
+      transform: `translate(${x / 100} ${-y / 100}) rotate(${-heading / 1000 * 180 / Math.PI})` }));
+  }
+  view.append(element("rect", { class: "ground", ...frame }), world);
+  svg.append(mask, view);
+  return svg;
+}
+
+let pictures = 0;
+
+function drawGround(world, number, line) {
+  const map = DATA.maps[number];
+  world.append(element("path", { class: "road", d: map.drivable.map((ring) => `${pathText(points(ring))}Z`).join("") }));
+  for (const [kind, each] of map.lines) {
+    line(points(each), kind === CURB ? "curb" : kind === DASHED ? "marking dashed" : "marking", 1);
+  }
+}
+
+const KINDS = { rows: drawRows, lines: drawLines, bars: drawBars, parting: drawParting };
 
 /* Draws all figures, and again for another width, theme or choice. */
 function showCharts() {
@@ -274,10 +339,24 @@ function showCharts() {
       before = width;
     }).observe(plot);
     draw();
+    if (spec.open) addPlay(figure, spec);
     for (const button of figure.querySelectorAll(".save")) {
       button.addEventListener("click", () => saveChart(figure, spec, button.dataset.format));
     }
   }
+}
+
+/* A button that shows the drives of a picture in the player, at its tick. */
+function addPlay(figure, spec) {
+  const button = document.createElement("button");
+  button.className = "save open";
+  button.textContent = "Play";
+  button.setAttribute("aria-label", `Play: ${spec.title}`);
+  button.addEventListener("click", () => window.player.open(spec.open).then(() => {
+    window.player.remember();
+    showPlayer();
+  }));
+  figure.querySelector("figcaption .grow").after(button);
 }
 
 function choiceOf(figure, spec) {
@@ -289,7 +368,7 @@ function choiceOf(figure, spec) {
 }
 
 const KEPT = ["fill", "stroke", "stroke-width", "stroke-dasharray", "stroke-linecap", "stroke-linejoin",
-  "opacity", "fill-opacity", "paint-order", "font-family", "font-size", "font-weight"];
+  "opacity", "fill-opacity", "fill-rule", "paint-order", "font-family", "font-size", "font-weight"];
 
 /* A figure as the text of an SVG file, in the light theme, with its title. */
 function chartText(figure, spec) {
