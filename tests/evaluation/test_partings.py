@@ -61,10 +61,12 @@ def test_a_picture_has_both_paths_and_the_agents_when_they_part(
         for name, a, b in (("s", first, second), ("s", first, first), ("other", first, second))
     ]
     maps = {recording.name: recording.road_map}
-    (figure,) = parting_figures(drives, episodes, maps, MapTable(), condition=3)
+    (figure,) = parting_figures(drives, episodes, maps, MapTable(), condition=3, most=2)
+    twice = [drives[0], drives[0]]
+    assert len(parting_figures(twice, episodes, maps, MapTable(), condition=3, most=1)) == 1
     assert figure["title"] == "s: the methods part after 1.0 s"
-    labels = [each["label"] for each in figure["methods"]]
-    assert labels == ["pdm + constant-velocity: score 0.250", "pdm + ffw-asp: score 0.500"]
+    labels = [(each["label"], each["score"]) for each in figure["methods"]]
+    assert labels == [("pdm + constant-velocity", 0.25), ("pdm + ffw-asp", 0.5)]
     ends = [np.cumsum(np.reshape(each["path"], (-1, 2)), axis=0) for each in figure["methods"]]
     assert (ends[1] - ends[0])[[0, 5, 20]].tolist() == [[0, 0], [55, 0], [220, 0]]
     expected = np.cumsum(np.full(20, 11))

@@ -33,7 +33,8 @@ def rankings(results: Sequence[Result]) -> list[Payload]:
     """Differences of the score by method with intervals, over the rungs of the ladder.
 
     Each planner has a figure with its own ladder, as the reference and the oracle are others with
-    each planner. With several planners the first figure compares all methods by their score.
+    each planner. With several planners the first figure compares all methods by their score, the
+    expert among them.
 
     Args:
         results: Closed-loop results of one condition.
@@ -42,13 +43,13 @@ def rankings(results: Sequence[Result]) -> list[Payload]:
         The figures; none if there are no differences.
     """
     scores = score_differences(results)
-    planners = distinct(r.method.planner for r in scores)
+    planners = [p for p in distinct(r.method.planner for r in scores) if p not in APART]
+    if len(planners) < 2:
+        return [_ranking(scores)] if scores else []
     found = [_ranking([r for r in scores if r.method.planner == each]) for each in planners]
-    if len(planners) > 1:
-        for planner, figure in zip(planners, found, strict=True):
-            figure["title"] = f"{planner}: {figure['title'][0].lower()}{figure['title'][1:]}"
-        found.insert(0, _all_scores(results))
-    return found
+    for planner, figure in zip(planners, found, strict=True):
+        figure["title"] = f"{planner}: {figure['title'][0].lower()}{figure['title'][1:]}"
+    return [_all_scores(results), *found]
 
 
 def _ranking(scores: Sequence[Result]) -> Payload:
@@ -204,7 +205,6 @@ def scenario_differences(
     return {
         "kind": "bars",
         "title": f"Score less that with {reference}, by scenario",
-        "axis": f"score less that with {reference}",
         "choices": choices,
     }
 

@@ -274,8 +274,14 @@ def _partings(
         for each in reversed(episodes)
         if each.condition == part.condition
     }
-    drives = [drive for each in part.drives if each.is_telling for drive in each.drives[:PICTURED]]
-    return parting_figures(drives, saved, maps, table, condition=part.number)
+    return [
+        figure
+        for each in part.drives
+        if each.is_telling
+        for figure in parting_figures(
+            each.drives, saved, maps, table, condition=part.number, most=PICTURED
+        )
+    ]
 
 
 def _drive_lists(

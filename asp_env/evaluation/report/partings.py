@@ -45,6 +45,7 @@ def parting_figures(
     maps: MapTable,
     *,
     condition: int,
+    most: int,
 ) -> list[dict[str, Any]]:
     """A figure for each drive of two methods that part.
 
@@ -54,12 +55,15 @@ def parting_figures(
         road_maps: road maps as for `rollouts_payload`.
         maps: the table that receives the maps.
         condition: number of the condition, for the link to the player.
+        most: largest number of figures; they are those of the first drives that part.
 
     Raises:
         DataError: a rollout cannot be read, or the map of its recording is missing.
     """
     figures = []
     for drive in drives:
+        if len(figures) == most:
+            break
         pair = [episodes.get((drive.name, method)) for method in (drive.first, drive.second)]
         first, second = pair
         if first is None or second is None or first.path == second.path:
@@ -79,7 +83,8 @@ def parting_figures(
                 "ticks_per_s": max(1, round(1 / rollouts[0].dt_s)),
                 "methods": [
                     {
-                        "label": f"{episode.label}: score {score:.3f}",
+                        "label": episode.label,
+                        "score": round(score, 4),
                         "path": points_payload(rollout.states[rollout.valid[:, 0], 0, :2]),
                         "forecasts": _forecasts_at(rollout, tick),
                     }
