@@ -138,7 +138,9 @@ def test_each_planner_has_a_ranking_on_its_own_ladder(tmp_path: Path) -> None:
     rows = [row for row in metric_rows() if row["planner"]]
     rows += [row | {"planner": "pdm"} for row in rows if row["planner"] == "sampling"]
     differences = difference_rows()
-    differences += [row | {"planner": "pdm", "value": row["value"] / 2} for row in differences]
+    differences += [
+        row | {"planner": "pdm", "value": float(str(row["value"])) / 2} for row in differences
+    ]
     write_tables(tmp_path, [*rows, *differences])
     page = write_report(tmp_path, title="x").read_text()
     both, first, second = data_of(page)["figures"]["ranking"]
