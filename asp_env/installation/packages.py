@@ -20,6 +20,7 @@ EXTRAS: Mapping[str, str] = {
     "synthetic": "data synthetic:…, other suites than highway-v1; asp-env synthesize, demo",
     "report": "asp-env evaluate, drive, study, benchmark, table, demo, which write report.html",
     "highway": "data highway:…, suite highway-v1, asp_env/HighwayIntersection-v0 and the like",
+    "parquet": "asp-env study --parquet",
     "ray": "asp-env study --ray",
     "docs": "make docs, the documentation as a site",
     "render": "asp-env watch; videos and windows of environments",

@@ -134,14 +134,16 @@ class Model(NamedTuple):
 def cost_key(config: TrainingConfig) -> str:
     """The name of a configuration in a file of costs.
 
-    It has the recipe with the variant, the view and the horizon, and the length of the segments and
-    of the history where they are not the default.
+    It has the recipe with the variant, the view and the horizon, the length of the segments and of
+    the history where they are not the default, and whether parked vehicles are targets, too.
     """
     parts = [f"{config.predictor}:{config.preset}", config.view, f"{config.horizon_s:g}s"]
     if config.segment_s not in (None, SEGMENT_S):
         parts.append(f"segments-{config.segment_s:g}s")
     if config.history_s != HISTORY_S:
         parts.append(f"history-{config.history_s:g}s")
+    if config.parked:
+        parts.append("parked")
     return "/".join(parts)
 
 

@@ -11,6 +11,9 @@ command may go on, and nothing may block the rerun.
 On a full disk (a tmpfs of a fraction of the size that is needed, mounted by root), the command must
 end with one line that names a file, and leave nothing half written; once there is space, the rerun
 must write the same bytes.
+
+A study on Ray, where that is installed, runs on two nodes of this machine. In turn the command, a
+worker and a node are killed; without a worker or a node the command must go on.
 """
 
 import argparse
@@ -23,9 +26,10 @@ import subprocess
 import sys
 import tempfile
 import time
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
+from importlib.util import find_spec
 from pathlib import Path
 
 import numpy as np
@@ -33,6 +37,7 @@ from rich.console import Console
 from rich.table import Table
 
 from tests.crossing_files import ON_ROAD, write_crossing
+from tests.evaluation.study.ray_nodes import TwoNodes, two_nodes
 
 POLL_S = 0.005
 END_S = 20.0
@@ -59,6 +64,7 @@ class Case:
         state: patterns of what an interrupted run keeps for its continuation.
         ignored: patterns of files whose bytes differ between undisturbed runs.
         own_cache: whether the cache folder is empty at the start, and compared.
+        on_ray: whether the command runs on a cluster, whose address ADDRESS stands for.
         on_full_disk: exit statuses on a full disk; 0 where it works nevertheless, and 1 where it
             goes on with other parts and states what failed at the end.
     """
@@ -69,11 +75,17 @@ class Case:
     state: tuple[str, ...] = ()
     ignored: tuple[str, ...] = ()
     own_cache: bool = False
+    on_ray: bool = False
     on_full_disk: tuple[int, ...] = (2,)
 
 
 _REPORT = ("*/report.html", "*/manifest.json")
 """They state versions and times."""
+
+_STUDY = (
+    *("study", "--out", "out", "--data", "DATA", "--methods", "constant-velocity", "idm"),
+    *("--no-controls", "--max-scenarios", "3"),
+)
 
 CASES: Mapping[str, Case] = {
     "read": Case(command=("inspect", "DATA"), own_cache=True, on_full_disk=(0,)),
@@ -122,6 +134,9 @@ CASES: Mapping[str, Case] = {
         begun="out/config.json",
         state=("out/config.json",),
     ),
+    "study": Case(command=_STUDY),
+    "study --jobs 2": Case(command=(*_STUDY, "--jobs", "2")),
+    "study --ray": Case(command=(*_STUDY, "--ray", "ADDRESS"), on_ray=True),
 }
 
 
@@ -143,17 +158,21 @@ class Bench:
         folder: scratch folder, removed by the caller.
         data: the data that DATA stands for.
         cache: a cache folder that is filled, for cases without one of their own.
+        address: address of the Ray cluster that ADDRESS stands for.
     """
 
     folder: Path
     data: Path
     cache: Path
+    address: str = ""
 
     def start(self, case: Case, where: Path, *, again: bool = False) -> subprocess.Popen[str]:
         """Starts the command of a case in a session of its own, in the folder `where`."""
         (where / "tmp").mkdir(parents=True, exist_ok=True)
         rerun = case.rerun if again and (where / case.begun).is_file() else ()
-        arguments = [str(self.data) if each == "DATA" else each for each in case.command]
+        given = {"DATA": str(self.data), "ADDRESS": self.address}
+        arguments = [given.get(each, each) for each in case.command]
+        path = [str(Path(__file__).parents[2]), os.environ.get("PYTHONPATH", "")]
         return subprocess.Popen(
             [sys.executable, "-m", "asp_env.cli", *arguments, *rerun],
             cwd=where,
@@ -162,7 +181,7 @@ class Bench:
                 "ASP_ENV_CACHE": str(where / "cache" if case.own_cache else self.cache),
                 "TMPDIR": str(where / "tmp"),
                 "OMP_NUM_THREADS": "1",
-                "PYTHONPATH": str(Path(__file__).parents[2]),
+                "PYTHONPATH": os.pathsep.join(filter(None, path)),
             },
             stdin=subprocess.DEVNULL,
             stdout=subprocess.DEVNULL,
@@ -241,6 +260,41 @@ def kill_once(
     return was_killed, difference(expected, content(where, case))
 
 
+def lose_once(
+    bench: Bench,
+    case: Case,
+    where: Path,
+    expected: Mapping[str, str],
+    moment: int,
+    lose: Callable[[], bool],
+) -> tuple[bool, str]:
+    """Loses a part of the cluster at a moment or as soon after it as there is one, and compares.
+
+    Args:
+        bench: where commands run.
+        case: the case.
+        where: a new folder.
+        expected: content of the folder after an undisturbed run.
+        moment: number of the change from which on the part is lost.
+        lose: kills a part of the cluster; returns whether there was one.
+
+    Returns:
+        Whether a part was lost before the end, and the fault; empty if there is none.
+    """
+    process = bench.start(case, where)
+    for number, _ in enumerate(_changes(where, process)):
+        if number == moment:
+            break
+    lost = False
+    while process.poll() is None and not lost:
+        lost = lose()
+        time.sleep(POLL_S)
+    _, stderr = process.communicate(timeout=LIMIT_S)
+    if process.returncode != 0:
+        return lost, f"ends with {process.returncode}: {_brief(stderr)}"
+    return lost, difference(expected, content(where, case))
+
+
 def fill_disk(bench: Bench, case: Case, where: Path, expected: Mapping[str, str], size: int) -> str:
     """Runs a case on a disk of `size` bytes, and again with enough space.
 
@@ -309,6 +363,16 @@ def difference(expected: Mapping[str, str], found: Mapping[str, str]) -> str:
 
 def run_case(bench: Bench, name: str, kills: int, rng: np.random.Generator) -> Outcome:
     """Runs a case once undisturbed and kills it `kills` times."""
+    case = CASES[name]
+    if not case.on_ray:
+        return _run_case(bench, name, kills, rng, None)
+    with two_nodes() as cluster:
+        return _run_case(replace(bench, address=cluster.address), name, kills, rng, cluster)
+
+
+def _run_case(
+    bench: Bench, name: str, kills: int, rng: np.random.Generator, cluster: TwoNodes | None
+) -> Outcome:
     case, outcome = CASES[name], Outcome()
     folder = bench.folder / name.replace(" ", "-")
     outcome.moments = undisturbed(bench, case, folder / "undisturbed")
@@ -316,7 +380,15 @@ def run_case(bench: Bench, name: str, kills: int, rng: np.random.Generator) -> O
     for number in range(kills):
         moment = int(rng.integers(outcome.moments))
         where = folder / str(number)
-        killed, fault = kill_once(bench, case, where, expected, moment)
+        if cluster is None or number % 3 == 0:
+            killed, fault = kill_once(bench, case, where, expected, moment)
+        elif number % 3 == 1:
+            lose = cluster.kill_worker
+            killed, fault = lose_once(bench, case, where, expected, moment, lose)
+        else:
+            lose = cluster.kill_second_node
+            killed, fault = lose_once(bench, case, where, expected, moment, lose)
+            cluster.add_second_node()
         outcome.killed += killed
         outcome.ended_before += not killed
         if fault:
@@ -427,6 +499,9 @@ def main(argv: Sequence[str] | None = None) -> int:
         bench_with_data(Path(folder)) as bench,
     ):
         for number, name in enumerate(options.cases):
+            if CASES[name].on_ray and find_spec("ray") is None:
+                console.print(f"{name}: left out, as Ray is not installed")
+                continue
             rng = np.random.default_rng([options.seed, number])
             outcome = run_case(bench, name, options.kills, rng)
             disks = full_disks(bench, name, outcome)
@@ -452,6 +527,8 @@ def full_disks(bench: Bench, name: str, outcome: Outcome) -> int:
     The sizes are fractions of what an undisturbed run leaves. Without root there are none.
     """
     case, folder = CASES[name], bench.folder / name.replace(" ", "-")
+    if case.on_ray:
+        return 0
     where = folder / "undisturbed"
     expected = content(where, case)
     needed = sum(path.stat().st_size for path in where.rglob("*") if path.is_file())

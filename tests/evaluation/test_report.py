@@ -133,6 +133,29 @@ def test_differences_have_their_own_range_and_the_ladder(report: Path) -> None:
     assert ranking["rungs"] == [{"label": "CV", "value": 0.0}, {"label": "oracle", "value": 0.2}]
 
 
+def test_each_planner_has_a_ranking_on_its_own_ladder(tmp_path: Path) -> None:
+    """The oracle gains 0.2 with one planner and 0.1 with the other; a figure compares both."""
+    rows = [row for row in metric_rows() if row["planner"]]
+    rows += [row | {"planner": "pdm"} for row in rows if row["planner"] == "sampling"]
+    differences = difference_rows()
+    differences += [
+        row | {"planner": "pdm", "value": float(str(row["value"])) / 2} for row in differences
+    ]
+    write_tables(tmp_path, [*rows, *differences])
+    page = write_report(tmp_path, title="x").read_text()
+    both, first, second = data_of(page)["figures"]["ranking"]
+    assert both["title"] == "Score of all methods"
+    assert len(both["rows"]) == 2 + 2 * 3
+    assert "rungs" not in both
+    assert [row["control"] for row in both["rows"] if "ffw-asp" in row["label"]] == [False, False]
+    title = "score less that with constant-velocity"
+    assert [first["title"], second["title"]] == [f"sampling: {title}", f"pdm: {title}"]
+    assert [rung["value"] for rung in first["rungs"]] == [0.0, 0.2]
+    assert [rung["value"] for rung in second["rungs"]] == [0.0, 0.1]
+    for figure in (first, second):
+        assert [row["label"] for row in figure["rows"]] == ["oracle", "ffw-asp", "blind"]
+
+
 def test_metrics_that_do_not_vary_are_named_and_not_drawn(tmp_path: Path) -> None:
     rows = [row for row in metric_rows() if row["planner"]]
     for row in rows:

@@ -2,12 +2,14 @@
 
 import csv
 import importlib.util
+import json
 import os
 import shutil
 import subprocess
 import sys
 from collections.abc import Iterator
 from pathlib import Path
+from types import SimpleNamespace
 
 import gymnasium as gym
 import numpy as np
@@ -16,6 +18,7 @@ import pytest
 from asp_env import AspEnvError, registry
 from asp_env.cli import main
 from asp_env.data.predictor import load_predictor
+from asp_env.evaluation.closed_loop import containment
 
 PACKAGE = Path(__file__).parent / "asp_env_sample"
 OF_PACKAGE = "of the package asp-env-sample 1.0"
@@ -186,3 +189,58 @@ def _value(out: Path, predictor: str, metric: str) -> float:
     }
     (value,) = values
     return value
+
+
+@pytest.mark.usefixtures("installed")
+def test_a_study_goes_on_with_faulty_predictors(
+    data: str,
+    tmp_path: Path,
+    capsys: pytest.CaptureFixture[str],
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """Each fault is counted by its cause, and the rows of other methods stay the same bytes.
+
+    What is filled in is constant velocity: it scores the same as that predictor. The clock of the
+    budget goes on only while the slow predictor sleeps, so that a busy machine is not over budget.
+    """
+    slept_s = [0.0]
+    clock = SimpleNamespace(perf_counter=lambda: sum(slept_s), sleep=slept_s.append)
+    monkeypatch.setattr(containment, "time", clock)
+    monkeypatch.setattr("asp_env_sample.faulty.time", clock)
+    causes = {
+        "raises": "raised",
+        "not-finite": "not finite",
+        "shapes": "wrong shapes",
+        "ids": "wrong ids",
+        "slow": "over budget",
+    }
+    options = ["--data", data, "--traffic", "log", "--no-controls", "--max-scenarios", "2"]
+    options += ["--budget-ms", "1000"]
+    good = ["constant-turn-rate", "sample-standing"]
+    faulty = [f"sample-faulty:{name}" for name in causes]
+    for name, methods in (("sound", good), ("faulty", [*good, *faulty])):
+        arguments = ["study", "--out", str(tmp_path / name), *options, "--methods", *methods]
+        assert main(arguments) == 0
+    lines = capsys.readouterr().out
+    texts = [(tmp_path / name / "scenarios.csv").read_text() for name in ("sound", "faulty")]
+    others = [line for line in texts[1].splitlines() if "sample-faulty" not in line]
+    assert others == texts[0].splitlines()
+    counts = json.loads((tmp_path / "faulty" / "manifest.json").read_text())["faults"]
+    rows = [*csv.DictReader(texts[1].splitlines())]
+    scores: dict[str, list[str]] = {}
+    for row in rows:
+        if row["planner"] == "contingency":
+            scores.setdefault(row["predictor"], []).append(row["score"])
+    for name, cause in causes.items():
+        drives = [row for row in rows if row["predictor"] == f"sample-faulty:{name}"
+                  and row["planner"] == "contingency"]  # fmt: skip
+        marked = [row for row in drives if cause in row["fault"]]
+        assert len(marked) == len(drives) == len({row["scenario"] for row in rows})
+        (count,) = [
+            each for method, each in counts.items()
+            if method.startswith(f"contingency+sample-faulty:{name} ")
+        ]  # fmt: skip
+        assert count == {f"predictor {cause}": len(drives)}
+        assert f"faulty:{name}" in lines
+        assert scores[f"sample-faulty:{name}"] == scores["constant-velocity"]
+    assert all("sample-faulty" in method for method in counts)

@@ -26,6 +26,7 @@ from asp_env.errors import AspEnvError
 from asp_env.evaluation.closed_loop.comparison import EXPERT
 from asp_env.evaluation.closed_loop.drive import ClosedLoopResult, Drive, drive, save_rollouts
 from asp_env.evaluation.closed_loop.scenario_table import write_scenario_table
+from asp_env.evaluation.closed_loop.tidy_table import check_parquet_possible, write_tidy_table
 from asp_env.evaluation.ladder import BASELINE, ORACLE
 from asp_env.evaluation.report import check_report_possible, write_report
 from asp_env.evaluation.results import (
@@ -90,6 +91,9 @@ class Benchmark:
     """Guard every trained predictor: where a scene lies outside
     of what it learned, its forecast is blended to constant
     velocity. As naming it guarded:NAME:RUN."""
+    parquet: bool = False
+    """Also write scenarios.parquet, with a row per scenario, method, run and
+    metric; needs the extra parquet."""
     jobs: int = 1
     """Number of processes that drive. The results do not depend on it."""
 
@@ -100,6 +104,8 @@ class Benchmark:
             AspEnvError: an option or the data are bad, or a package is missing.
         """
         check_report_possible()
+        if self.parquet:
+            check_parquet_possible()
         with atomic_folder(self.out) as folder:
             rows, privileged = _write(self, folder)
         console = Console()
@@ -306,6 +312,8 @@ def _write(config: Benchmark, folder: Path) -> tuple[list[BenchmarkRow], list[st
         drives={each.manifest["planner"]: each.manifest for each in results},
     )
     write_scenario_table(folder, [each.driven for each in written])
+    if config.parquet:
+        write_tidy_table(folder, [each.driven for each in written])
     for each in written:
         save_rollouts(folder, each)
     maps = {name: road_map for each in results for name, road_map in each.maps.items()}

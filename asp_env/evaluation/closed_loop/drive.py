@@ -34,6 +34,7 @@ from asp_env.evaluation.closed_loop.summary import (
     comparison_rows,
     scores_by_method,
 )
+from asp_env.evaluation.closed_loop.tidy_table import check_parquet_possible, write_tidy_table
 from asp_env.evaluation.hard import HARD_NOTE, is_hard, select_scenarios
 from asp_env.evaluation.ladder import BASELINE, is_under_test, missing_controls
 from asp_env.evaluation.report import check_report_possible, write_report
@@ -106,6 +107,9 @@ class Drive:
     """Guard every trained predictor: where a scene lies outside
     of what it learned, its forecast is blended to constant
     velocity. As naming it guarded:NAME:RUN."""
+    parquet: bool = False
+    """Also write scenarios.parquet, with a row per scenario, method, run and
+    metric; needs the extra parquet."""
     jobs: int = 1
     """Number of processes that drive. The results do not depend on it."""
 
@@ -116,6 +120,8 @@ class Drive:
             AspEnvError: an option or the data are bad, or a package is missing.
         """
         check_report_possible()
+        if self.parquet:
+            check_parquet_possible()
         note = HARD_NOTE if is_hard(self.scenarios) else ""
         if note:
             Console().print(note)
@@ -125,6 +131,8 @@ class Drive:
             write_manifest(folder, "drive", **result.manifest)
             save_scenarios(folder / "scenarios.json", result.scenarios, result.recordings)
             write_scenario_table(folder, [result.driven])
+            if self.parquet:
+                write_tidy_table(folder, [result.driven])
             save_rollouts(folder, result)
             title = f"Driving on {Path(self.data).name}"
             write_report(folder, title=title, lead=note, maps=result.maps)

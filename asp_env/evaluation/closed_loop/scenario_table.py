@@ -41,16 +41,7 @@ def write_scenario_table(folder: Path, driven: Sequence[DrivenScenarios]) -> Non
         folder: an existing folder.
         driven: the scenarios by condition.
     """
-    metrics = list(
-        dict.fromkeys(
-            name
-            for each in driven
-            for method in each.methods
-            for scores in method.scores
-            for name, metric in scores.metrics.items()
-            if metric.valid.any()
-        )
-    )
+    metrics = defined_metrics(driven)
     with (
         atomic_file(folder / "scenarios.csv") as partial,
         partial.open("w", newline="") as file,
@@ -61,6 +52,24 @@ def write_scenario_table(folder: Path, driven: Sequence[DrivenScenarios]) -> Non
             for method in each.methods:
                 for run, scores in zip(method.runs, method.scores, strict=True):
                     writer.writerows(_rows(each, method, run, scores, metrics))
+
+
+def defined_metrics(driven: Sequence[DrivenScenarios]) -> list[str]:
+    """The names of the metrics that are defined in any scenario.
+
+    Args:
+        driven: the scenarios by condition.
+    """
+    return list(
+        dict.fromkeys(
+            name
+            for each in driven
+            for method in each.methods
+            for scores in method.scores
+            for name, metric in scores.metrics.items()
+            if metric.valid.any()
+        )
+    )
 
 
 def _rows(

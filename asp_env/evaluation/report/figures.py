@@ -29,39 +29,70 @@ whether a metric varies."""
 Payload = dict[str, Any]
 
 
-def ranking(results: Sequence[Result]) -> Payload | None:
+def rankings(results: Sequence[Result]) -> list[Payload]:
     """Differences of the score by method with intervals, over the rungs of the ladder.
+
+    Each planner has a figure with its own ladder, as the reference and the oracle are others with
+    each planner. With several planners the first figure compares all methods by their score, the
+    expert among them.
 
     Args:
         results: Closed-loop results of one condition.
 
     Returns:
-        The figure, None if there are no differences.
+        The figures; none if there are no differences.
     """
     scores = score_differences(results)
-    if not scores:
-        return None
-    labels = _labels(results)
+    planners = [p for p in distinct(r.method.planner for r in scores) if p not in APART]
+    if len(planners) < 2:
+        return [_ranking(scores)] if scores else []
+    found = [_ranking([r for r in scores if r.method.planner == each]) for each in planners]
+    for planner, figure in zip(planners, found, strict=True):
+        figure["title"] = f"{planner}: {figure['title'][0].lower()}{figure['title'][1:]}"
+    return [_all_scores(results), *found]
+
+
+def _ranking(scores: Sequence[Result]) -> Payload:
+    """The figure of one planner."""
+    labels = _labels(scores)
     reference = _reference(scores[0])
     note = metric_note(scores[0].metric)
-    ladders = [r for r in scores if rung(r.method.predictor) is not None]
-    planners = distinct(r.method.planner for r in ladders)
     rungs = [
         {"label": _rung_label(share), "value": _number(r.value, note.scale)}
-        for r in ladders
-        if r.method.planner == planners[0] and (share := rung(r.method.predictor)) is not None
+        for r in scores
+        if (share := rung(r.method.predictor)) is not None
     ]
     if reference == BASELINE and rungs:
         rungs.insert(0, {"label": _rung_label(0.0), "value": 0.0})
-    scale = f", over the ladder of {planners[0]}" if len(planners) > 1 else ""
     return {
         "kind": "rows",
-        "title": f"Score less that with {reference}{scale}",
+        "title": f"Score less that with {reference}",
         "axis": _axis(f"score less that with {reference}", note.unit),
         "rows": [_row(r, labels[r.method]) for r in scores],
         "rungs": rungs,
         "zero": reference,
         "decimals": 3,
+    }
+
+
+def _all_scores(results: Sequence[Result]) -> Payload:
+    """The scores of all methods of several planners, the highest first."""
+    scores = [r for r in results if (r.metric, r.subset) == (SCORE, "all") and r.value is not None]
+    scores.sort(key=lambda r: -(r.value or 0.0))
+    labels = _labels(scores)
+    note = metric_note(SCORE)
+    controls = {r.method for r in score_differences(results) if not under_test(r)}
+    return {
+        "kind": "rows",
+        "title": "Score of all methods",
+        "axis": _axis(note.label, note.unit),
+        "rows": [
+            row | {"control": row["control"] or r.method in controls}
+            for r in scores
+            for row in [_row(r, labels[r.method])]
+        ],
+        "zero": None,
+        "decimals": 1 if note.unit == "%" else 3,
     }
 
 
@@ -174,7 +205,6 @@ def scenario_differences(
     return {
         "kind": "bars",
         "title": f"Score less that with {reference}, by scenario",
-        "axis": f"score less that with {reference}",
         "choices": choices,
     }
 

@@ -24,6 +24,7 @@ from asp_env.evaluation.report.answer import (
     score_differences,
 )
 from asp_env.evaluation.report.episodes import Episode, find_episodes
+from asp_env.evaluation.report.partings import PARTED_M, parting_figures
 from asp_env.evaluation.report.payload import (
     ForecastExamples,
     MapTable,
@@ -63,6 +64,9 @@ from asp_env.stored import brief, parse_json
 
 ASSETS = files("asp_env.evaluation.report") / "assets"
 SCRIPTS = ("draw.js", "charts.js", "pictures.js", "stage.js", "player.js", "page.js")
+PICTURED = 2
+"""Number of the largest gains, and of the largest losses, that are drawn. Chosen by hand: they fit
+one screen."""
 COLOURS = 8
 """Number of colours of predictors in the style sheet."""
 
@@ -73,6 +77,8 @@ class DriveList:
 
     heading: str
     drives: tuple[ListedDrive, ...]
+    is_telling: bool
+    """Whether these are drives with the largest gains or losses."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -93,7 +99,7 @@ class Part:
     breakdown_tables: list[Any]
     forecasts_at: int | None
     """Number of the part that shows the forecasts on these data, if it is another one."""
-    figures: dict[str, list[figures.Payload]]
+    figures: dict[str, list[dict[str, Any]]]
     """Figures by section."""
 
     def anchor(self, section: str) -> str:
@@ -158,13 +164,17 @@ def write_report(
         for number, condition in enumerate(results.conditions)
     ]
     map_table = MapTable()
+    for part in parts:
+        if found := _partings(part, episodes, maps or {}, map_table):
+            part.figures["partings"] = found
     data = {
         "figures": {
             part.anchor(section): each for part in parts for section, each in part.figures.items()
         },
         "colours": colours | {split_name(name)[0]: number for name, number in colours.items()},
         "pictures": examples_payload(examples, map_table) if examples else [],
-        "drives": rollouts_payload(episodes, maps or {}, map_table, results.conditions),
+        "drives": rollouts_payload(out, episodes, maps or {}, map_table, results.conditions),
+        "parted_cm": round(100 * PARTED_M),
         "conditions": condition_labels(results.conditions),
     }
     data["maps"] = map_table.payloads
@@ -224,7 +234,7 @@ def _part(
     others, same = figures.other_metrics(driving)
     by_tag = figures.tags(driving)
     drawn = {
-        "ranking": [figures.ranking(driving)],
+        "ranking": figures.rankings(driving),
         "others": others,
         "forecasts": [
             *figures.forecast_errors(shown),
@@ -255,6 +265,25 @@ def _part(
     )
 
 
+def _partings(
+    part: Part, episodes: Sequence[Episode], maps: Mapping[str, RoadMap], table: MapTable
+) -> list[dict[str, Any]]:
+    """Pictures of the drives with the largest gains and losses."""
+    saved = {
+        (each.path.stem, (each.planner, each.predictor)): each
+        for each in reversed(episodes)
+        if each.condition == part.condition
+    }
+    return [
+        figure
+        for each in part.drives
+        if each.is_telling
+        for figure in parting_figures(
+            each.drives, saved, maps, table, condition=part.number, most=PICTURED
+        )
+    ]
+
+
 def _drive_lists(
     driving: Sequence[Result],
     values: ScenarioValues | None,
@@ -266,18 +295,23 @@ def _drive_lists(
         return []
     scores = score_differences(driving)
     pair = difference_of(scores[0].metric) if scores else None
-    lists = []
+    lists: list[tuple[str, Sequence[ListedDrive], bool]] = []
     if pair is not None:
         gains, losses = telling_drives(values, pair[1], privileged)
-        lists = [("Largest gains", gains), ("Largest losses", losses)]
+        lists = [("Largest gains", gains, True), ("Largest losses", losses, True)]
     methods = [m for m in values.scores if m[0] != EXPERT]
     if methods:
         best = answer.method if answer else None
         key = (best.planner, best.predictor) if best else methods[-1]
         reference = (key[0], pair[1]) if pair else methods[0]
         worst = worst_drives(values, key, reference)
-        lists.append((f"Lowest scores of {' + '.join(filter(None, _short(key)))}", worst))
-    return [DriveList(heading=heading, drives=tuple(each)) for heading, each in lists if each]
+        heading = f"Lowest scores of {' + '.join(filter(None, _short(key)))}"
+        lists.append((heading, worst, False))
+    return [
+        DriveList(heading=heading, drives=tuple(each), is_telling=is_telling)
+        for heading, each, is_telling in lists
+        if each
+    ]
 
 
 def _short(method: tuple[str, str]) -> tuple[str, str]:

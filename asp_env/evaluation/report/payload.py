@@ -10,6 +10,7 @@ import gzip
 import json
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -80,21 +81,26 @@ class MapTable:
         return self._numbers[key]
 
 
-def _steps(points: Float[np.ndarray, "n 2"]) -> list[int]:
+def points_payload(points: Float[np.ndarray, "n 2"]) -> list[int]:
+    """Points in centimetres: the first one, then the steps from point to point.
+
+    Args:
+        points: the points, m.
+    """
     cm = np.rint(100 * points).astype(np.int64)
     return np.diff(cm, axis=0, prepend=0).reshape(-1).tolist()
 
 
 def _map_payload(road_map: RoadMap) -> dict[str, Any]:
     lines = [
-        [int(kind), _steps(road_map.lines[number])]
+        [int(kind), points_payload(road_map.lines[number])]
         for number, kind in enumerate(road_map.line_types)
         if kind != LineType.VIRTUAL
     ]
     return {
         "name": road_map.name,
         "extent": [round(side, 1) for side in road_map.extent_m],
-        "drivable": [_steps(ring) for ring in _anticlockwise(road_map.drivable)],
+        "drivable": [points_payload(ring) for ring in _anticlockwise(road_map.drivable)],
         "lines": lines,
     }
 
@@ -107,6 +113,15 @@ def _anticlockwise(rings: Ragged) -> list[np.ndarray]:
         area = np.sum(x * np.roll(y, -1) - np.roll(x, -1) * y)
         turned.append(rings[number] if area >= 0 else rings[number][::-1])
     return turned
+
+
+def poses_payload(states: Float[np.ndarray, "... 4"]) -> list[Any]:
+    """Positions in centimetres and headings in thousandths of a radian.
+
+    Args:
+        states: states [x m, y m, heading rad, speed m/s].
+    """
+    return _poses(states).tolist()
 
 
 def _poses(states: Float[np.ndarray, "... 4"]) -> np.ndarray:
@@ -122,7 +137,7 @@ def _modes(
     states: Float[np.ndarray, "m steps n"], log_probs: Float[np.ndarray, " m"], dt_s: float
 ) -> list:
     return [
-        [round(float(np.exp(log_prob)), 3), _steps(mode)]
+        [round(float(np.exp(log_prob)), 3), points_payload(mode)]
         for log_prob, mode in zip(log_probs, _thinned(states, dt_s), strict=True)
     ]
 
@@ -156,13 +171,13 @@ def _picture_row(examples: ForecastExamples, number: int, maps: MapTable) -> dic
                 int(scene.classes[number, slot]),
                 *_box(scene.sizes[number, slot]),
                 *_poses(states[slot, -1]).tolist(),
-                _steps(states[slot, scene.valid[number, slot], :2]),
+                points_payload(states[slot, scene.valid[number, slot], :2]),
             ]
             for slot in present
         ],
         "targets": [int(np.flatnonzero(present == scene.targets[t, 1])[0]) for t in targets],
         "truth": [
-            _steps(
+            points_payload(
                 np.concatenate(
                     [states[scene.targets[t, 1], -1:, :2], future.states[t, future.valid[t], :2]]
                 )
@@ -219,6 +234,7 @@ def _box(size: Float[np.ndarray, " 2"]) -> list[int]:
 
 
 def rollouts_payload(
+    out: Path,
     episodes: Sequence[Episode],
     road_maps: Mapping[str, RoadMap],
     maps: MapTable,
@@ -227,6 +243,7 @@ def rollouts_payload(
     """The rollouts of some episodes, in their order.
 
     Args:
+        out: The run folder.
         episodes: The episodes.
         road_maps: Road maps by the name of the recording, or by `DATA/RECORDING`.
         maps: The table that receives the maps.
@@ -238,27 +255,41 @@ def rollouts_payload(
     rollouts = []
     for episode in episodes:
         rollout = Rollout.load(episode.path)
-        name = rollout.scenario.recording_name
-        own = f"{rollout.scenario.source}/{name}"
-        name = own if own in road_maps else name
-        if name not in road_maps:
-            known = ", ".join(sorted(road_maps)) or "none"
-            raise DataError(
-                f"{episode.path}: no map of recording {name!r} was given; given were {known}"
-            )
+        road_map = map_of(rollout, episode.path, road_maps)
         condition = episode.condition
         head = {
             "driver": episode.label,
             "name": episode.path.stem,
             "condition": conditions.index(condition) if condition in conditions else 0,
             "command": episode.command,
+            "file": episode.path.relative_to(out).as_posix(),
             "tags": " · ".join(rollout.scenario.tags),
             "ticks": len(rollout.states),
             "dt": round(rollout.dt_s, 4),
         }
-        body = _rollout(rollout, maps.number(road_maps[name]))
+        body = _rollout(rollout, maps.number(road_map))
         rollouts.append(head | {"body": _compressed(body)})
     return rollouts
+
+
+def map_of(rollout: Rollout, path: Path, road_maps: Mapping[str, RoadMap]) -> RoadMap:
+    """The road map of a rollout.
+
+    Args:
+        rollout: The rollout.
+        path: Its file, for the error.
+        road_maps: Road maps by the name of the recording, or by `DATA/RECORDING`.
+
+    Raises:
+        DataError: The map of its recording is missing.
+    """
+    name = rollout.scenario.recording_name
+    own = f"{rollout.scenario.source}/{name}"
+    name = own if own in road_maps else name
+    if name not in road_maps:
+        known = ", ".join(sorted(road_maps)) or "none"
+        raise DataError(f"{path}: no map of recording {name!r} was given; given were {known}")
+    return road_maps[name]
 
 
 def _compressed(value: object) -> str:
@@ -279,8 +310,8 @@ def _rollout(rollout: Rollout, map_number: int) -> dict[str, Any]:
         ],
         "speed": _speeds(rollout.states[:, 0, 3], rollout.valid[:, 0]),
         "log_speed": _speeds(rollout.log_states[:, 0, 3], rollout.log_valid[:, 0]),
-        "route": _steps(rollout.route),
-        "plans": [_steps(plan) for plan in rollout.plans],
+        "route": points_payload(rollout.route),
+        "plans": [points_payload(plan) for plan in rollout.plans],
         "forecasts": _forecasts(rollout),
         "events": _event_intervals(rollout),
     }

@@ -8,6 +8,7 @@ pickles what it sends: use a cluster to which only trusted processes have access
 
 import logging
 import os
+import socket
 import warnings
 from collections.abc import Iterator, Mapping, Sequence
 from hashlib import sha256
@@ -28,6 +29,12 @@ MAX_RETRIES = 10
 AHEAD = 4
 """Number of tasks per core of the cluster that are submitted at a time, so that the object store
 holds few results."""
+
+CONNECT_S = 10.0
+"""Longest time that a connection to the address of a cluster may take."""
+
+CONNECT_ATTEMPTS = "2"
+"""How often Ray tries to connect, which takes it up to 45 s each time."""
 
 Files = Mapping[str, bytes]
 """Content of the files of a folder by their path in it."""
@@ -125,11 +132,13 @@ def _connected(address: str) -> Any:
         AspEnvError: there is no cluster at the address.
     """
     os.environ.setdefault("RAY_ACCEL_ENV_VAR_OVERRIDE_ON_ZERO", "0")
+    os.environ.setdefault("RAY_NUM_REDIS_GET_RETRIES", CONNECT_ATTEMPTS)
     try:
         import ray  # pyright: ignore[reportMissingImports]
     except ModuleNotFoundError as error:
         raise MissingExtraError("ray", "ray", "--ray") from error
     try:
+        _check_reachable(address)
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")
             ray.init(
@@ -138,13 +147,24 @@ def _connected(address: str) -> Any:
                 logging_level=logging.ERROR,
                 runtime_env={"env_vars": {"OMP_NUM_THREADS": "1", "NUMBA_NUM_THREADS": "1"}},
             )
-    except (ConnectionError, ValueError, RuntimeError) as error:
+    except (OSError, ValueError, RuntimeError) as error:
         reason = " ".join(str(error).split())
         raise AspEnvError(
             f"--ray {address}: no cluster ({reason}); start one by `ray start --head`, or leave "
             "--ray out"
         ) from error
     return ray
+
+
+def _check_reachable(address: str) -> None:
+    """Connects to HOST:PORT and disconnects; Ray itself would try for a quarter of an hour.
+
+    Raises:
+        OSError: nothing answers at the address.
+    """
+    host, _, port = address.rpartition(":")
+    if host and port.isdecimal() and "://" not in host:
+        socket.create_connection((host.strip("[]"), int(port)), timeout=CONNECT_S).close()
 
 
 def _result(ray: Any, reference: Any) -> EpisodeScores:

@@ -28,6 +28,7 @@ from asp_env.evaluation.closed_loop.summary import (
     comparison_rows,
     scores_by_method,
 )
+from asp_env.evaluation.closed_loop.tidy_table import check_parquet_possible, write_tidy_table
 from asp_env.evaluation.ladder import BASELINE, is_under_test
 from asp_env.evaluation.report import Episode, check_report_possible, write_report
 from asp_env.evaluation.results import SCORE, Condition, Row, write_manifest, write_metrics
@@ -88,7 +89,7 @@ class Study:
     the data, or all."""
     max_scenarios: int | None = None
     """Largest number of scenarios of each DATA, at even spacing."""
-    controls: bool | None = None
+    controls: tyro.conf.DisallowNone[bool | None] = None
     """Whether the whole ladder of controls drives in replayed traffic
     without latency. The default is yes."""
     reference: Annotated[str | None, tyro.conf.arg(metavar="NAME[:RUN]")] = None
@@ -105,6 +106,9 @@ class Study:
     """Largest wall time of a forecast, and of a plan, in an episode at a
     tick; what takes longer counts as a fault. Results then depend on
     the machine."""
+    parquet: bool = False
+    """Also write scenarios.parquet, with a row per scenario, method, run and
+    metric; needs the extra parquet."""
     jobs: int = 1
     """Number of processes that drive. The results do not depend on it."""
     ray: Annotated[str | None, tyro.conf.arg(metavar="ADDRESS|auto")] = None
@@ -127,6 +131,8 @@ class Study:
         names = [field.name for field in fields(StudySettings)]
         settings = read_settings(self.config, {name: getattr(self, name) for name in names})
         check_report_possible()
+        if self.parquet:
+            check_parquet_possible()
         console = Console()
         drive = partial(drive_tasks, jobs=self.jobs)
         if self.ray is not None:
@@ -134,6 +140,7 @@ class Study:
         with _locked(self.out):
             result = run_study(settings, self.out, drive=drive, console=console)
             write_study(result, self.out, drive=drive)
+            _write_or_remove_tidy_table(self.out, result, wanted=self.parquet)
         for table in condition_tables(result.rows, result.privileged):
             console.print(table)
         for line in (*answer_lines(result.answers), *fault_lines(result.driven)):
@@ -437,6 +444,14 @@ def write_study(result: StudyResult, out: Path, *, drive: DriveTasks = IN_THIS_P
         answers={each.question: each.sentences for each in result.answers if each.sentences},
     )
     write_text(out / SETTINGS, json.dumps(settings.as_json(), indent=1) + "\n")
+
+
+def _write_or_remove_tidy_table(out: Path, result: StudyResult, *, wanted: bool) -> None:
+    """Writes `scenarios.parquet`; if it is not wanted, removes that of a study before."""
+    if wanted:
+        write_tidy_table(out, result.driven)
+    else:
+        (out / "scenarios.parquet").unlink(missing_ok=True)
 
 
 def _scenarios_file(result: StudyResult, data: str) -> str:

@@ -1,11 +1,15 @@
 """Rows of a comparison, from scores by hand."""
 
 import numpy as np
+import pandas as pd
 import pytest
 
 from asp_env.data.scenarios.scenario import ScenarioSet
+from asp_env.errors import MissingExtraError
+from asp_env.evaluation.closed_loop import tidy_table
 from asp_env.evaluation.closed_loop.scenario_table import DrivenScenarios, write_scenario_table
 from asp_env.evaluation.closed_loop.summary import Comparison, MethodScores, comparison_rows
+from asp_env.evaluation.closed_loop.tidy_table import write_tidy_table
 from asp_env.evaluation.results import Condition, Row
 from tests.evaluation.made_up import made_method as _method
 from tests.evaluation.made_up import made_scenarios as _scenarios
@@ -202,3 +206,46 @@ def test_the_scenario_table_has_a_row_for_each_method_run_and_scenario(tmp_path)
         "d,log,2,r0-0-15,r0,here,left,sampling,m:*,m:* 1,GOAL,,0.5,",
         "d,log,2,r1-1-15,r1,here,,sampling,m:*,m:* 1,GOAL,,1,",
     ]
+
+
+def test_the_tidy_table_is_the_scenario_table_with_a_row_per_metric(tmp_path):
+    """Turned back into columns and rounded, its values are those of `scenarios.csv`."""
+    pytest.importorskip("pyarrow")
+    methods = [
+        _method("", _scores([1, 1], comfort=[1, np.nan]), planner="expert"),
+        _method("m:*", _scores([1 / 3, 1]), _scores([0.5, 1])),
+    ]
+    driven = [
+        DrivenScenarios(
+            condition=Condition(data="d", traffic=traffic, latency_ticks=2),
+            scenarios=_scenarios(0, 1, left=(0,)),
+            methods=methods,
+        )
+        for traffic in ("log", "idm")
+    ]
+    write_scenario_table(tmp_path, driven)
+    write_tidy_table(tmp_path, driven)
+    tidy = pd.read_parquet(tmp_path / "scenarios.parquet")
+    # 2 traffics, 3 runs, 2 scenarios and 2 metrics, of which the second has one value per traffic.
+    assert len(tidy) == 2 * 3 * 2 * 2
+    valid = tidy["valid"].to_numpy()
+    assert valid.sum() == 2 * 3 * 2 + 2
+    assert (np.isfinite(tidy["value"].to_numpy()) == valid).all()
+    wide = pd.read_csv(tmp_path / "scenarios.csv", dtype=str, keep_default_na=False)
+    keys = [
+        *("data", "traffic", "latency_ticks", "planner", "predictor", "run"),
+        *("scenario", "recording", "location"),
+    ]
+    texts = tidy.astype(dict.fromkeys([*keys, "metric"], str))
+    texts["value"] = [
+        f"{v:.6g}" if ok else "" for v, ok in zip(tidy.value, tidy.valid, strict=True)
+    ]
+    back = texts.pivot(index=keys, columns="metric", values="value")
+    for metric in ("score", "comfort"):
+        assert back[metric].to_dict() == wide.set_index(keys)[metric].to_dict()
+
+
+def test_without_pyarrow_one_line_names_the_extra(tmp_path, monkeypatch):
+    monkeypatch.setattr(tidy_table, "find_spec", lambda _name: None)
+    with pytest.raises(MissingExtraError, match=r"--parquet needs .* 'asp-env\[parquet\]'"):
+        write_tidy_table(tmp_path, [])

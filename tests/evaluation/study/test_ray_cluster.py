@@ -11,6 +11,7 @@ from asp_env.errors import AspEnvError, MissingExtraError
 from asp_env.evaluation.study.ray_cluster import _written, drive_on_ray
 from asp_env.evaluation.study.study import Study
 from tests.crossing_files import ON_ROAD, write_crossing
+from tests.evaluation.study.ray_nodes import two_nodes
 from tests.sim.worlds import car
 
 
@@ -24,13 +25,13 @@ def bytes_of(folder: Path) -> dict[str, str]:
 
 
 def test_two_nodes_and_lost_workers_give_the_bytes_of_one_process(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    tmp_path: Path,
 ) -> None:
-    """With data from the file system and from the object store; one node is killed on the way."""
-    pytest.importorskip("ray")
-    from ray.cluster_utils import Cluster  # pyright: ignore[reportMissingImports]
+    """With data from the file system and from the object store.
 
-    monkeypatch.setenv("RAY_ENABLE_UV_RUN_RUNTIME_ENV", "0")
+    Two workers are killed while they drive, after the first cell, and then a node.
+    """
+    pytest.importorskip("ray")
     drives = ((*ON_ROAD, car(-60, 8)), (ON_ROAD[1], car(-95, 8), car(-40, 7)))
     data = str(write_crossing(tmp_path / "data", drives=drives))
     config = tmp_path / "study.toml"
@@ -39,29 +40,30 @@ def test_two_nodes_and_lost_workers_give_the_bytes_of_one_process(
         'traffic = ["log", "idm"]\nlatency_ticks = [0, 1]\nmax_scenarios = 3\n'
     )
     Study(config=config, out=tmp_path / "alone").run()
-    cluster = Cluster(
-        initialize_head=True, head_node_args={"num_cpus": 1, "node_ip_address": "127.0.0.1"}
-    )
-    try:
-        second = cluster.add_node(num_cpus=1, node_ip_address="127.0.0.1")
-        address = cluster.address
-        Study(config=config, out=tmp_path / "ray", ray=address, ray_send_data=True).run()
+    with two_nodes() as cluster:
+        Study(config=config, out=tmp_path / "sent", ray=cluster.address, ray_send_data=True).run()
         ended = threading.Event()
+        killed: list[str] = []
 
         def kill() -> None:
-            while not list((tmp_path / "killed").rglob("*.npz")) and not ended.is_set():
+            while not ended.is_set() and not list((tmp_path / "killed").rglob("*.npz")):
                 time.sleep(0.01)
-            cluster.remove_node(second, allow_graceful=False)
+            while not ended.is_set() and len(killed) < 2:
+                if cluster.kill_worker():
+                    killed.append("worker")
+                time.sleep(0.01)
+            cluster.kill_second_node()
 
         killer = threading.Thread(target=kill)
         killer.start()
-        Study(config=config, out=tmp_path / "killed", ray=address).run()
-        ended.set()
-        killer.join()
-    finally:
-        cluster.shutdown()
+        try:
+            Study(config=config, out=tmp_path / "killed", ray=cluster.address).run()
+        finally:
+            ended.set()
+            killer.join()
+    assert killed == ["worker"] * 2
     expected = bytes_of(tmp_path / "alone")
-    assert bytes_of(tmp_path / "ray") == expected
+    assert bytes_of(tmp_path / "sent") == expected
     assert bytes_of(tmp_path / "killed") == expected
 
 
@@ -82,5 +84,6 @@ def test_without_a_cluster_or_without_ray_one_line_says_so() -> None:
         with pytest.raises(MissingExtraError, match=r"pip install 'asp-env\[ray\]'"):
             next(drive_on_ray([], 0.2, [], "auto"))
         return
-    with pytest.raises(AspEnvError, match=r"--ray auto: no cluster .*`ray start --head`"):
-        next(drive_on_ray([], 0.2, [], "auto"))
+    for address in ("auto", "127.0.0.1:9"):
+        with pytest.raises(AspEnvError, match=rf"--ray {address}: no cluster .*`ray start --head`"):
+            next(drive_on_ray([], 0.2, [], address))

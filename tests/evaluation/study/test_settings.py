@@ -3,9 +3,11 @@
 from pathlib import Path
 
 import pytest
+import tyro
 
 from asp_env.errors import AspEnvError
 from asp_env.evaluation.study.settings import StudySettings, read_settings
+from asp_env.evaluation.study.study import Study
 
 TOML = """
 data = ["suite:intersection-v1", "karlsruhe"]
@@ -61,3 +63,14 @@ def test_a_missing_file_and_no_options_are_refused(tmp_path: Path) -> None:
         read_settings(tmp_path / "none.toml", {})
     with pytest.raises(AspEnvError, match="no data and no methods: give a TOML file or options"):
         read_settings(None, {})
+
+
+@pytest.mark.parametrize(
+    ("given", "controls"), [([], False), (["--no-controls"], False), (["--controls"], True)]
+)
+def test_controls_is_a_flag_that_replaces_what_the_file_states(
+    tmp_path: Path, given: list[str], controls: bool
+) -> None:
+    path = write(tmp_path, TOML)
+    study = tyro.cli(Study, args=[str(path), "--out", "out", *given])
+    assert read_settings(path, {"controls": study.controls}).controls is controls

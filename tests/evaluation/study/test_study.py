@@ -155,6 +155,16 @@ def test_a_folder_that_another_process_drives_or_that_is_no_study_is_refused(
         Study(out=tmp_path / "other", data=(data,), methods=("idm",)).run()
 
 
+def test_tidy_values_are_of_the_last_study(data: str, tmp_path: Path) -> None:
+    """A study without `--parquet` removes the file of one before, which may be of other methods."""
+    pytest.importorskip("pyarrow")
+    options = {"out": tmp_path, "data": (data,), "methods": ("idm",), "controls": False}
+    Study(**options, parquet=True).run()
+    assert (tmp_path / "scenarios.parquet").is_file()
+    Study(**options).run()
+    assert not (tmp_path / "scenarios.parquet").exists()
+
+
 def test_a_damaged_cell_is_named(data: str, tmp_path: Path) -> None:
     given = settings(data, traffic=("log",), methods=("idm",))
     run_study(given, tmp_path)

@@ -118,6 +118,14 @@ def test_needed_costs_are_those_of_both_stages() -> None:
     ]
 
 
+def test_parked_targets_have_costs_of_their_own(costs: Path) -> None:
+    """With them an epoch has more snippets, so that the costs without them do not apply."""
+    keys = [cost_key(each) for each in command("dkm", parked=True).costly_configs()]
+    assert keys == ["ssp-asp:cpu/vectors/3s/parked", "dkm:cpu/vectors/3s/parked"]
+    with pytest.raises(AspEnvError, match="ssp-asp:cpu/vectors/3s/parked is not measured"):
+        command("dkm", parked=True, costs=costs).config_for(3.0)
+
+
 def test_known_costs_stay_and_new_ones_are_scaled(tmp_path: Path) -> None:
     """A machine that takes 25 s for the reference's 20 s takes 10 s for what costs 8 s."""
     path = tmp_path / "costs.json"

@@ -1,6 +1,6 @@
 /* Figures as SVG, drawn for the width of their box, and saved as SVG or PNG. */
 const SVG = "http://www.w3.org/2000/svg";
-const NARROW = 430, ROW = 26, NARROW_ROW = 40, TOP = 10, BOTTOM = 44;
+const NARROW = 430, ROW = 26, NARROW_ROW = 40, LEAST_PLOT = 140, TOP = 10, BOTTOM = 44;
 const measure = document.createElement("canvas").getContext("2d");
 const seriesColour = (number) => Number.isInteger(number) && number >= 0 ? `series-${number}` : "muted";
 
@@ -21,6 +21,28 @@ function shortened(text, width) {
   let end = text.length;
   while (end > 1 && textWidth(text.slice(0, end) + "…") > width) end--;
   return text.slice(0, end) + "…";
+}
+
+/* A name with a number behind it: where both do not fit, the name is shortened. */
+function labelled(name, tail, width) {
+  return shortened(name, Math.max(40, width - textWidth(tail))) + tail;
+}
+
+/* Text as lines of at most a width. */
+function wrapped(text, width) {
+  const lines = [""];
+  for (const word of text.split(" ")) {
+    const longer = `${lines.at(-1)} ${word}`.trim();
+    if (textWidth(longer) <= width || !lines.at(-1)) lines[lines.length - 1] = longer;
+    else lines.push(word);
+  }
+  return lines;
+}
+
+/* The text of an axis; where it does not fit, without what the title states as well. */
+function axisText(text, width) {
+  const short = text.slice(text.indexOf(", ") + 2);
+  return shortened(textWidth(text) <= width ? text : short, width);
 }
 
 /* Round numbers within a range. */
@@ -74,8 +96,9 @@ function drawRows(spec, width, chosen = 0) {
   const difference = spec.zero !== null;
   const texts = rows.map((row) => valueText(row, spec.decimals, difference));
   const narrow = width < NARROW;
-  const left = narrow ? 12 : Math.min(Math.max(...rows.map((r) => textWidth(r.label))) + 18, width * 0.34);
   const right = narrow ? 12 : Math.max(...texts.map((text) => textWidth(text))) + 22;
+  const most = Math.max(width * 0.34, Math.min(width / 2, width - right - LEAST_PLOT));
+  const left = narrow ? 12 : Math.min(Math.max(...rows.map((r) => textWidth(r.label))) + 18, most);
   const rowHeight = narrow ? NARROW_ROW : ROW;
   const rungs = spec.rungs || [];
   const [low, high] = rangeOf(spec, rows);
@@ -89,7 +112,7 @@ function drawRows(spec, width, chosen = 0) {
   rows.forEach((row, i) => {
     const y = top + (i + 0.5) * rowHeight + (narrow ? 8 : 0);
     const group = element("g", { class: `row ${row.class}${row.control ? " control" : ""}` });
-    const label = narrow ? `${row.label}   ${texts[i]}` : row.label;
+    const label = narrow ? labelled(row.label, `   ${texts[i]}`, width - 24) : row.label;
     const name = element("text", { class: "name", x: narrow ? left : left - 12, y: narrow ? y - 12 : y + 4,
       "text-anchor": narrow ? "start" : "end" }, shortened(label, narrow ? width - 24 : left - 14));
     group.append(element("title", {}, `${row.label}: ${texts[i]}`));
@@ -134,7 +157,7 @@ function drawAxis(svg, spec, { low, high, x, top, bottom, left, right, width }) 
     svg.append(element("line", { class: "zero", x1: x(0), x2: x(0), y1: top, y2: bottom }));
   }
   svg.append(element("text", { class: "axis", x: width < NARROW ? width / 2 : (left + right) / 2, y: bottom + 36, "text-anchor": "middle" },
-    shortened(spec.axis, width - 16)));
+    axisText(spec.axis, width - 16)));
 }
 
 /* Gives every rung a line of text on which it overlaps no other; rungs at nearly the same place share
@@ -226,10 +249,11 @@ function drawLines(spec, width) {
 /* A bar for each scenario; those with a rollout open it. */
 function drawBars(spec, width, chosen = 0) {
   const { bars, text, label } = spec.choices[chosen];
-  const left = 52, right = 14, top = TOP + 24, bottom = top + 180, height = bottom + 34;
+  const lines = wrapped(text, width - 8);
+  const left = 52, right = 14, top = TOP + 6 + 18 * lines.length, bottom = top + 180, height = bottom + 34;
   const svg = element("svg", { viewBox: `0 0 ${width} ${height}`, width, height, role: "img" });
   svg.append(element("title", {}, spec.title));
-  svg.append(element("text", { class: "name", x: 4, y: 16 }, shortened(text, width - 8)));
+  lines.forEach((line, i) => svg.append(element("text", { class: "name", x: 4, y: 16 + 18 * i }, line)));
   const values = bars.map(([value]) => value);
   const low = Math.min(0, ...values), high = Math.max(0, ...values), extent = high - low || 1;
   const y = (v) => bottom - (v - low) / extent * (bottom - top);
@@ -250,11 +274,76 @@ function drawBars(spec, width, chosen = 0) {
   });
   svg.append(element("line", { class: "zero", x1: left, x2: width - right, y1: y(0), y2: y(0) }));
   svg.append(element("text", { class: "axis", x: (left + width - right) / 2, y: height - 10, "text-anchor": "middle" },
-    shortened(`scenarios in the order of ${spec.axis}; full bars have a rollout`, width - 16)));
+    shortened("scenarios in descending order; full bars have a rollout", width - 16)));
   return svg;
 }
 
-const KINDS = { rows: drawRows, lines: drawLines, bars: drawBars };
+/* Points in metres as the text of a path, y down. */
+function pathText(xy) {
+  const out = [];
+  for (let i = 0; i < xy.length; i += 2) {
+    out.push(`${i ? "L" : "M"}${xy[i].toFixed(2)} ${(-xy[i + 1]).toFixed(2)}`);
+  }
+  return out.join("");
+}
+
+/* Where two methods part: their paths, the agents at that tick, and forecasts made there. */
+function drawParting(spec, width) {
+  const [left, bottom, metres, high] = spec.window, top = 20 * spec.methods.length + 16;
+  const height = Math.min(Math.max(width * high / metres, 240), 440);
+  const scale = Math.min(width / metres, height / high), whole = top + height;
+  const svg = element("svg", { viewBox: `0 0 ${width} ${whole}`, width, height: whole, role: "img" });
+  const colours = ["ego", "second"], paint = (name) => `var(--${name})`;
+  svg.append(element("title", {}, spec.title));
+  spec.methods.forEach(({ label, score }, i) => {
+    const y = TOP + 20 * i + 4;
+    svg.append(element("line", { class: "series", style: `stroke: ${paint(colours[i])}`, x1: 4, x2: 26, y1: y, y2: y }));
+    svg.append(element("text", { class: "name", x: 32, y: y + 4 }, labelled(label, `: score ${score.toFixed(3)}`, width - 40)));
+  });
+  const clip = `picture-${pictures++}`, frame = { x: 0, y: top, width, height };
+  const mask = element("clipPath", { id: clip });
+  mask.append(element("rect", frame));
+  const view = element("g", { "clip-path": `url(#${clip})` });
+  const world = element("g", { transform: `translate(${width / 2} ${top + height / 2}) scale(${scale}) ` +
+    `translate(${-(left + metres / 2)} ${bottom + high / 2})` });
+  const line = (xy, className, px, colour = null) => {
+    world.append(element("path", { class: className, d: pathText(xy), "stroke-width": px / scale,
+      ...(colour && { style: `stroke: ${paint(colour)}` }) }));
+  };
+  drawGround(world, spec.map, line);
+  spec.methods.forEach(({ forecasts }, i) => {
+    for (const each of forecasts) line(points(each), "path forecast", 1.2, colours[i]);
+  });
+  spec.methods.forEach(({ path }, i) => {
+    const xy = points(path);
+    line(xy, "path", i ? 2.5 : 6, colours[i]);
+    for (let n = spec.tick; n < xy.length / 2; n += spec.ticks_per_s) {
+      world.append(element("circle", { class: "agent", style: `fill: ${paint(colours[i])}`,
+        cx: xy[2 * n], cy: -xy[2 * n + 1], r: (i ? 3 : 4.5) / scale, "stroke-width": 1 / scale }));
+    }
+  });
+  for (const [kind, length, breadth, x, y, heading] of spec.agents) {
+    world.append(element("rect", { class: kind === -2 ? "agent second" : "agent", x: -length / 200, y: -breadth / 200, width: length / 100,
+      height: breadth / 100, rx: 0.3, "stroke-width": 1.2 / scale,
+      style: `fill: ${paint(kind < 0 ? colours[-1 - kind] : CLASSES[kind])}`,
+      transform: `translate(${x / 100} ${-y / 100}) rotate(${-heading / 1000 * 180 / Math.PI})` }));
+  }
+  view.append(element("rect", { class: "ground", ...frame }), world);
+  svg.append(mask, view);
+  return svg;
+}
+
+let pictures = 0;
+
+function drawGround(world, number, line) {
+  const map = DATA.maps[number];
+  world.append(element("path", { class: "road", d: map.drivable.map((ring) => `${pathText(points(ring))}Z`).join("") }));
+  for (const [kind, each] of map.lines) {
+    line(points(each), kind === CURB ? "curb" : kind === DASHED ? "marking dashed" : "marking", 1);
+  }
+}
+
+const KINDS = { rows: drawRows, lines: drawLines, bars: drawBars, parting: drawParting };
 
 /* Draws all figures, and again for another width, theme or choice. */
 function showCharts() {
@@ -274,10 +363,24 @@ function showCharts() {
       before = width;
     }).observe(plot);
     draw();
+    if (spec.open) addPlay(figure, spec);
     for (const button of figure.querySelectorAll(".save")) {
       button.addEventListener("click", () => saveChart(figure, spec, button.dataset.format));
     }
   }
+}
+
+/* A button that shows the drives of a picture in the player, at its tick. */
+function addPlay(figure, spec) {
+  const button = document.createElement("button");
+  button.className = "save open";
+  button.textContent = "Play";
+  button.setAttribute("aria-label", `Play: ${spec.title}`);
+  button.addEventListener("click", () => window.player.open(spec.open).then(() => {
+    window.player.remember();
+    showPlayer();
+  }));
+  figure.querySelector("figcaption .grow").after(button);
 }
 
 function choiceOf(figure, spec) {
@@ -289,7 +392,7 @@ function choiceOf(figure, spec) {
 }
 
 const KEPT = ["fill", "stroke", "stroke-width", "stroke-dasharray", "stroke-linecap", "stroke-linejoin",
-  "opacity", "fill-opacity", "paint-order", "font-family", "font-size", "font-weight"];
+  "opacity", "fill-opacity", "fill-rule", "paint-order", "font-family", "font-size", "font-weight"];
 
 /* A figure as the text of an SVG file, in the light theme, with its title. */
 function chartText(figure, spec) {

@@ -1,6 +1,4 @@
 /* Plays two rollouts of a scenario side by side. The fragment of the address names what is shown. */
-const PARTED_CM = 10;
-
 class Player {
   constructor() {
     const get = (name) => document.getElementById("replay-" + name);
@@ -86,7 +84,7 @@ class Player {
     const ticks = Math.min(...rollouts.map((each) => each.ticks));
     for (let tick = 0; tick < ticks; tick++) {
       const [p, q] = rollouts.map(({ agents: [ego] }) => ego.poses[tick - ego.first]);
-      if (!p !== !q || (p && Math.hypot(p[0] - q[0], p[1] - q[1]) > PARTED_CM)) return tick;
+      if (!p !== !q || (p && Math.hypot(p[0] - q[0], p[1] - q[1]) > DATA.parted_cm)) return tick;
     }
     return rollouts[0].ticks === rollouts[1].ticks ? null : ticks;
   }
@@ -115,8 +113,7 @@ class Player {
         const command = drive.command.replace("'OUT/", () => here);
         add(`Drive again: ${who}`, command);
       }
-      const file = ["rollouts", drive.driver, `${drive.name}.npz`].filter(Boolean).join("/");
-      add(`Watch: ${who}`, `asp-env watch ${quoted(`${this.folder}/${file}`)}`);
+      add(`Watch: ${who}`, `asp-env watch ${quoted(`${this.folder}/${drive.file}`)}`);
     }
     this.commands.replaceChildren(...rows);
   }
