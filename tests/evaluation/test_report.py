@@ -218,7 +218,7 @@ def test_several_conditions_have_parts_and_a_summary(tmp_path: Path) -> None:
         "traffic log",
     ]
     assert "2 conditions: yes in 1, not resolved in 1." in page
-    matrix = page[page.index('<table class="matrix">') :].partition("</table>")[0]
+    matrix = page[page.index('<table class="matrix"') :].partition("</table>")[0]
     cells = re.findall(r'<td class="(\w+)">([^<]*)', matrix)
     assert cells == [
         ("better", "+0.200"), ("open", "+0.020"),
@@ -259,6 +259,25 @@ def test_rollouts_hold_poses_events_plans_and_forecasts(report: Path) -> None:
     forecasts = rollout["forecasts"][3]
     assert forecasts
     assert all(sum(p for p, _ in modes) == pytest.approx(1, abs=2e-3) for _, modes in forecasts)
+
+
+@pytest.mark.parametrize(("conditions", "briefly"), [(4, 0), (5, 5)])
+def test_many_conditions_have_tables_of_all_scenarios_alone(
+    tmp_path: Path, conditions: int, briefly: int
+) -> None:
+    """The tables of fewer conditions have a tab for the tag `left`, too."""
+    rows = [
+        row | {"traffic": f"traffic-{number}"}
+        for number in range(conditions)
+        for row in metric_rows()
+        if row["planner"]
+    ]
+    write_tables(tmp_path, rows)
+    page = write_report(tmp_path, title="x").read_text()
+    numbers = re.findall(r"All driving metrics as numbers.*?</details>", page, re.DOTALL)
+    assert len(numbers) == conditions
+    assert sum("metrics.csv has the metrics by tag" in each for each in numbers) == briefly
+    assert sum(">left</button>" in each for each in numbers) == conditions - briefly
 
 
 def test_examples_preserve_positions_and_final_errors() -> None:

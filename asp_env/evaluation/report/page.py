@@ -9,6 +9,7 @@ from dataclasses import dataclass
 from functools import cache
 from importlib.resources import files
 from importlib.util import find_spec
+from itertools import groupby
 from pathlib import Path
 from typing import Any
 
@@ -36,6 +37,7 @@ from asp_env.evaluation.report.results import (
     Result,
     Results,
     condition_labels,
+    condition_parts,
     distinct,
     methods_of,
     metric_note,
@@ -67,6 +69,9 @@ SCRIPTS = ("draw.js", "charts.js", "pictures.js", "stage.js", "player.js", "page
 PICTURED = 2
 """Number of the largest gains, and of the largest losses, that are drawn. Chosen by hand: they fit
 one screen."""
+MOST_WITH_SUBSETS = 4
+"""Largest number of conditions with tables of all metrics in every subset of the scenarios. With
+more of them the tables show all scenarios alone, as a table of 15 methods takes 50 kB."""
 COLOURS = 8
 """Number of colours of predictors in the style sheet."""
 
@@ -90,6 +95,8 @@ class Part:
     answer: Answer | None
     comparison_tables: list[Any]
     driving_tables: list[Any]
+    has_all_subsets: bool
+    """Whether these tables show every subset of the scenarios."""
     same: str
     """The metrics that do not vary, as text."""
     has_tags: bool
@@ -233,6 +240,8 @@ def _part(
     answer = driving_answer(driving, places=values.places if values else None)
     others, same = figures.other_metrics(driving)
     by_tag = figures.tags(driving)
+    is_brief = len(results.conditions) > MOST_WITH_SUBSETS
+    in_tables = [r for r in driving if r.subset == "all" or not is_brief]
     drawn = {
         "ranking": figures.rankings(driving),
         "others": others,
@@ -249,7 +258,8 @@ def _part(
         condition=condition,
         answer=answer or (forecast_answer(forecasts) if not driving else None),
         comparison_tables=comparison_figures(driving),
-        driving_tables=[*difference_figures(driving), *result_figures(driving)],
+        driving_tables=[*difference_figures(in_tables), *result_figures(in_tables)],
+        has_all_subsets=len(in_tables) == len(driving),
         same=same,
         has_tags=by_tag is not None,
         drives=_drive_lists(driving, values, answer, privileged),
@@ -328,8 +338,10 @@ def _names(results: Results) -> dict[tuple[str, str], str]:
 class Summary:
     """The differences of the score by method and condition."""
 
+    groups: tuple[tuple[tuple[str, int], ...], ...]
+    """Rows of headings above the last one: the text, and the number of columns below it."""
     conditions: tuple[tuple[int, str], ...]
-    """Number and label of each column."""
+    """Number and heading of each column."""
     rows: tuple[tuple[str, bool, tuple[tuple[str, str, str] | None, ...]], ...]
     """Name, whether privileged, and text, interval and outcome of each cell."""
     sentence: str
@@ -354,11 +366,21 @@ def _summary(parts: Sequence[Part], results: Results) -> Summary | None:
         rows.append((labels[method], method.privileged, tuple(cells)))
     verdicts = [part.answer.verdict for part in parts if part.answer]
     counts = [f"{verdict} in {verdicts.count(verdict)}" for verdict in distinct(verdicts)]
+    headings = condition_parts(results.conditions)
     return Summary(
-        conditions=tuple(enumerate(condition_labels(results.conditions))),
+        groups=tuple(
+            _runs([parts[: level + 1] for parts in headings])
+            for level in range(len(headings[0]) - 1)
+        ),
+        conditions=tuple(enumerate(parts[-1] for parts in headings)),
         rows=tuple(rows),
         sentence=f"{len(parts)} conditions: {', '.join(counts)}.",
     )
+
+
+def _runs(keys: Sequence[tuple[str, ...]]) -> tuple[tuple[str, int], ...]:
+    """The last texts of consecutive equal keys, and how many there are of each."""
+    return tuple((key[-1], len([*same])) for key, same in groupby(keys))
 
 
 def _sections(

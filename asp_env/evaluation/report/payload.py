@@ -29,6 +29,9 @@ from asp_env.evaluation.results import Condition
 FORECAST_POINT_S = 0.4
 """Time between the drawn points of a forecast; its last point is always drawn. Chosen by hand: a
 longer time bends sharp turns, a shorter one enlarges the file."""
+FORECAST_DECIMALS = 1
+"""Decimals of the points of a rollout's forecasts, m: a pixel is about as large. Two of them make
+the page half as large again."""
 MIN_PICTURE_M = 50.0
 MAX_PICTURE_M = 110.0
 """Bounds on the side of an example's picture. Chosen by hand."""
@@ -355,7 +358,8 @@ def _event_intervals(rollout: Rollout) -> list[list]:
 def _forecasts(rollout: Rollout) -> list[list]:
     """Forecasts [slot, [[probability, points], …]] by tick."""
     forecasts: list[list] = [[] for _ in range(len(rollout.states))]
+    rounded = np.round(rollout.forecast_states, FORECAST_DECIMALS)
     for row, tick in enumerate(rollout.forecast_ticks):
-        modes = _modes(rollout.forecast_states[row], rollout.forecast_log_probs[row], rollout.dt_s)
+        modes = _modes(rounded[row], rollout.forecast_log_probs[row], rollout.dt_s)
         forecasts[int(tick)].append([int(rollout.forecast_slots[row]), modes])
     return forecasts

@@ -188,29 +188,48 @@ def methods_of(results: Iterable[Result]) -> list[MethodResult]:
 def short_labels(methods: Sequence[MethodResult]) -> dict[MethodResult, str]:
     """The shortest distinct labels of methods.
 
-    The planner is left out where all methods with a predictor have the same, details where names
-    are distinct without them.
+    The planner is left out where all methods with a predictor have the same. Methods of the same
+    name have the name of their run folder beside it, and all details if that is the same, too.
     """
     one_planner = len({method.planner for method in methods if method.predictor}) == 1
     names = {
         method: split_name(method.predictor)[0] if one_planner and method.predictor else method.name
         for method in methods
     }
-    counts = Counter(names.values())
-    return {m: name if counts[name] == 1 else m.label for m, name in names.items()}
+    runs = {method: _with_run(name, method.predictor) for method, name in names.items()}
+    once, distinct_runs = _unique(names.values()), _unique(runs.values())
+    return {
+        m: name if name in once else runs[m] if runs[m] in distinct_runs else m.label
+        for m, name in names.items()
+    }
+
+
+def _with_run(name: str, predictor: str) -> str:
+    """A name with the last folder of the predictor's run, such as `ssp-asp ours`."""
+    folders = [part for part in split_name(predictor)[1].split("/") if part.strip("*.")]
+    return " ".join((name, *folders[-1:]))
+
+
+def _unique(names: Iterable[str]) -> set[str]:
+    return {name for name, count in Counter(names).items() if count == 1}
 
 
 def condition_labels(conditions: Sequence[Condition]) -> list[str]:
     """Labels of conditions: what differs between them; all of it for a single one."""
+    return [" · ".join(parts) for parts in condition_parts(conditions)]
+
+
+def condition_parts(conditions: Sequence[Condition]) -> list[tuple[str, ...]]:
+    """What differs between conditions, of data, traffic and latency; all of a single one."""
     if len(conditions) == 1:
-        return [conditions[0].label]
+        return [(conditions[0].label,)]
     parts = [
         {condition: condition.data for condition in conditions},
         {condition: f"traffic {condition.traffic}" for condition in conditions},
         {condition: f"latency {condition.latency_ticks}" for condition in conditions},
     ]
     varying = [part for part in parts if len({*part.values()}) > 1]
-    return [" · ".join(part[condition] for part in varying) for condition in conditions]
+    return [tuple(part[condition] for part in varying) for condition in conditions]
 
 
 def read_condition(row: Mapping[str, str]) -> Condition:
