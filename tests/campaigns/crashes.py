@@ -220,6 +220,15 @@ def undisturbed(bench: Bench, case: Case, where: Path) -> int:
     return moments
 
 
+def _started(bench: Bench, case: Case, where: Path, moment: int) -> subprocess.Popen[str]:
+    """Starts a case, and returns at the change of its folder with the number `moment`."""
+    process = bench.start(case, where)
+    for number, _ in enumerate(_changes(where, process)):
+        if number == moment:
+            break
+    return process
+
+
 def kill_once(
     bench: Bench, case: Case, where: Path, expected: Mapping[str, str], moment: int
 ) -> tuple[bool, str]:
@@ -235,10 +244,7 @@ def kill_once(
     Returns:
         Whether the command was killed before its end, and the fault; empty if there is none.
     """
-    process = bench.start(case, where)
-    for number, _ in enumerate(_changes(where, process)):
-        if number == moment:
-            break
+    process = _started(bench, case, where, moment)
     was_killed = process.poll() is None
     if was_killed:
         os.killpg(process.pid, signal.SIGKILL)
@@ -281,10 +287,7 @@ def lose_once(
     Returns:
         Whether a part was lost before the end, and the fault; empty if there is none.
     """
-    process = bench.start(case, where)
-    for number, _ in enumerate(_changes(where, process)):
-        if number == moment:
-            break
+    process = _started(bench, case, where, moment)
     lost = False
     while process.poll() is None and not lost:
         lost = lose()
