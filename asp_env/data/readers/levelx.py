@@ -14,7 +14,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
-from jaxtyping import Float, Int
+from jaxtyping import Bool, Float, Int
 
 from asp_env.data.classes import FOOTPRINTS_M, VULNERABLE
 from asp_env.data.readers.compressed import CSV
@@ -287,20 +287,26 @@ def find_map(
 
 
 def metres_per_pixel(
-    files: LevelxFiles, meta: RecordingMeta, size_px: tuple[int, int], xy: np.ndarray
+    files: LevelxFiles,
+    meta: RecordingMeta,
+    size_px: tuple[int, int],
+    xy: Float[np.ndarray, "rows 2"],
+    moving: Bool[np.ndarray, " rows"],
 ) -> float | None:
     """The scale of a background image.
 
     `orthoPxToMeter` is the scale of the original image. The published image is smaller by a factor
     that no file contains. It is the dataset's factor if a folder has the dataset's name (inD 12,
     rounD 10, exiD 6, uniD 2), otherwise the smallest of 1, 2, 6, 10 and 12. A factor is used only
-    if all positions then lie in the image.
+    if all positions then lie in the image. If none fits, the largest is used if the positions of
+    agents that ever move lie in the image: an agent may stand beside it throughout.
 
     Args:
         files: the recording's files.
         meta: its metadata.
         size_px: width and height of the image.
-        xy: (n, 2) positions of the recording's agents, metres.
+        xy: positions of the recording's agents, metres.
+        moving: whether the agent of each row ever moves.
 
     Returns:
         Metres per pixel. None without `orthoPxToMeter`, or if no factor fits.
@@ -313,18 +319,22 @@ def metres_per_pixel(
         for name, factor in DOWNSCALE.items()
         if any(re.match(rf"{name}(?![a-z])", folder) for folder in folders)
     ]
-    low, high = xy.min(axis=0), xy.max(axis=0)
-    for factor in (*named, *SCALES):
-        scale = factor * meta.metres_per_ortho_pixel
-        margin = MARGIN_PX * scale
-        right, bottom = size_px[0] * scale, size_px[1] * scale
-        if (
-            min(low[0], -high[1]) > -margin
-            and high[0] - right < margin
-            and -low[1] - bottom < margin
-        ):
+    scales = [factor * meta.metres_per_ortho_pixel for factor in (*named, *SCALES)]
+    for scale in scales:
+        if _lie_in_image(xy, size_px, scale):
             return scale
-    return None
+    largest = max(scales)
+    return largest if moving.any() and _lie_in_image(xy[moving], size_px, largest) else None
+
+
+def _lie_in_image(xy: Float[np.ndarray, "rows 2"], size_px: tuple[int, int], scale: float) -> bool:
+    """Whether positions (metres) lie in an image of a scale (metres per pixel)."""
+    low_px, high_px = xy.min(axis=0) / scale, xy.max(axis=0) / scale
+    return bool(
+        min(low_px[0], -high_px[1]) > -MARGIN_PX
+        and high_px[0] - size_px[0] < MARGIN_PX
+        and -low_px[1] - size_px[1] < MARGIN_PX
+    )
 
 
 def read_levelx(files: LevelxFiles) -> TrackTable:

@@ -31,7 +31,13 @@ from asp_env.data.readers.placing import (
 )
 from asp_env.data.readers.positions import Origin
 from asp_env.data.readers.resampling import resample
-from asp_env.data.recording import DEFAULT_DT_S, Background, Recording, rate_for_ticks
+from asp_env.data.recording import (
+    DEFAULT_DT_S,
+    PARKED_WITHIN_M,
+    Background,
+    Recording,
+    rate_for_ticks,
+)
 from asp_env.data.road_map import Ragged, RoadMap
 from asp_env.data.signals import Signals
 from asp_env.errors import DataError, RepairWarning
@@ -333,7 +339,12 @@ def _scale(
     files: LevelxFiles, background: Path, meta: RecordingMeta, table: TrackTable
 ) -> float | None:
     size = _png_size(background)
-    return levelx.metres_per_pixel(files, meta, size, table.states[:, :2]) if size else None
+    if size is None:
+        return None
+    xy = table.states[:, :2]
+    from_start = np.hypot(*(xy - np.repeat(xy[table.starts[:-1]], np.diff(table.starts), axis=0)).T)
+    moves = np.maximum.reduceat(from_start, table.starts[:-1]) >= PARKED_WITHIN_M
+    return levelx.metres_per_pixel(files, meta, size, xy, np.repeat(moves, np.diff(table.starts)))
 
 
 def _road_map(

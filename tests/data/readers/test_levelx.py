@@ -275,7 +275,7 @@ def test_background_scale(tmp_path: Path, folder: str, expected_m: float) -> Non
     write_recording(tmp_path / folder)
     ((files, meta),) = recordings_with_metadata(tmp_path)
     xy = np.array([[0.0, -2.0], [18.0, -8.0], [10.0, -5.0]])
-    scale = metres_per_pixel(files, meta, (1000, 500), xy)
+    scale = metres_per_pixel(files, meta, (1000, 500), xy, np.full(len(xy), True))
     assert scale == pytest.approx(expected_m)
 
 
@@ -284,7 +284,7 @@ def test_background_that_cannot_fit(tmp_path: Path) -> None:
     write_recording(tmp_path)
     ((files, meta),) = recordings_with_metadata(tmp_path)
     xy = np.array([[0.0, -2.0], [400.0, -8.0]])
-    assert metres_per_pixel(files, meta, (1000, 500), xy) is None
+    assert metres_per_pixel(files, meta, (1000, 500), xy, np.full(len(xy), True)) is None
 
 
 def test_background_of_a_folder_named_like_a_dataset(tmp_path: Path) -> None:
@@ -292,8 +292,18 @@ def test_background_of_a_folder_named_like_a_dataset(tmp_path: Path) -> None:
     write_recording(tmp_path / "round-1")
     ((files, meta),) = recordings_with_metadata(tmp_path)
     xy = np.array([[0.0, -2.0], [110.0, -8.0]])
-    scale = metres_per_pixel(files, meta, (1000, 500), xy)
+    scale = metres_per_pixel(files, meta, (1000, 500), xy, np.full(len(xy), True))
     assert scale == pytest.approx(0.12)
+
+
+def test_background_beside_which_an_agent_stands(tmp_path: Path) -> None:
+    """119.4 m in 1,000 pixels of 0.12 m hold the agents that move; one stands 1.2 m beside them."""
+    write_recording(tmp_path)
+    ((files, meta),) = recordings_with_metadata(tmp_path)
+    xy = np.array([[0.0, -2.0], [119.4, -8.0], [121.2, -5.0]])
+    moving = np.array([True, True, False])
+    assert metres_per_pixel(files, meta, (1000, 500), xy, moving) == pytest.approx(0.12)
+    assert metres_per_pixel(files, meta, (1000, 500), xy, ~moving) is None
 
 
 def test_background_is_found(tmp_path: Path) -> None:
