@@ -144,7 +144,7 @@ class RLTrain:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class RLEvaluate:
-    """Drive scenarios with trained policy in their environment, and print what became of them."""
+    """Drive scenarios with trained policies in their environment, and print what became of them."""
 
     data: Annotated[tyro.conf.Positional[str], tyro.conf.arg(metavar="DATA")]
     """Folder in the inD/rounD or INTERACTION layout, or sample:…, synthetic:… or highway:…."""
