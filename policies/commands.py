@@ -269,7 +269,11 @@ class RLCompare:
         folders = {name: [cell.folder for cell in cells if cell.row == name] for name in names}
         for name, seeds in folders.items():
             by_row[name] = [c.read_values(folder) for folder in seeds]
-        compared = c.compare_rows(by_row, recording, names[0])
+        early = {
+            name: [c.early_success(folder, self.steps) for folder in seeds]
+            for name, seeds in folders.items()
+        }
+        compared = c.compare_rows(by_row, recording, names[0], early=early)
         console.print(c.rendered(compared, names[0]))
         content = {"settings": shared, "rows": c.as_json(compared)}
         write_text(self.out / "comparison.json", json.dumps(content, indent=1))
