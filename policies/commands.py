@@ -11,6 +11,7 @@ from rich.console import Console
 from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn
 from rich.table import Table
 
+from asp_env.console import table_console
 from asp_env.data.recording import DEFAULT_DT_S
 from asp_env.errors import AspEnvError, MissingExtraError, unknown_name
 from asp_env.files import write_text
@@ -172,8 +173,9 @@ class RLEvaluate:
 
         if self.out is not None and self.out.exists():
             raise AspEnvError(f"{self.out} exists; choose another name or remove it")
-        console, results = Console(), {}
+        console, results = table_console(), {}
         table = Table("run", "scenarios", *METRICS)
+        table.columns[0].overflow = "fold"
         with Progress(TextColumn("{task.description}"), BarColumn(), console=console) as bar:
             for folder in self.runs:
                 trained = load_policy(folder)
@@ -250,7 +252,7 @@ class RLCompare:
                 raise unknown_name("row", name, rows)
         if self.seeds < 1 or self.jobs < 1:
             raise AspEnvError(f"--seeds {self.seeds} --jobs {self.jobs}: expected at least 1")
-        console = Console()
+        console = table_console()
         held_out = c.HeldOut(
             data=self.held_out, scenarios=self.scenarios, max_scenarios=self.max_scenarios
         )
