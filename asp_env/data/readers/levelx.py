@@ -262,7 +262,7 @@ def read_recording_meta(path: Path) -> RecordingMeta:
 
 def find_map(
     files: LevelxFiles, meta: RecordingMeta, maps_by_folder: dict[Path, list[Path]]
-) -> Path:
+) -> tuple[Path, tuple[str, ...]]:
     """The lanelet2 map of a recording: the nearest matching one in a parent folder.
 
     A map matches a location if its name ends in the location's id (`location1.osm`), or its
@@ -275,6 +275,9 @@ def find_map(
         meta: its metadata.
         maps_by_folder: map files in and below the folders searched so far. Results are added.
 
+    Returns:
+        The map, and a line for a report where several match or none is named after the location.
+
     Raises:
         DataError: no map matches.
     """
@@ -286,7 +289,7 @@ def find_map(
         preferred = [path for path in fitting if _is_construction(path) == under_construction]
         chosen = preferred or fitting or _maps_near(maps, meta.origin)
         if chosen:
-            return chosen[0]
+            return chosen[0], _guess(chosen, folder, meta.location, named=bool(fitting))
     raise DataError(
         f"{files.root}: no map for location {meta.location} of recording {files.name}; "
         f"expected a lanelet2 file location{meta.location}.osm in it or below"
@@ -426,6 +429,16 @@ def _names_location(path: Path, location: int) -> bool:
         return int(own[1]) == location
     folder = re.match(r"0*([0-9]+)[_-]", path.parent.name)
     return bool(folder) and int(folder[1]) == location
+
+
+def _guess(maps: list[Path], folder: Path, location: int, *, named: bool) -> tuple[str, ...]:
+    """A line about the choice of the first of some maps, unless nothing was to be chosen."""
+    first, *others = [path.relative_to(folder).as_posix() for path in maps]
+    if named and not others:
+        return ()
+    why = "the first one" if named else f"the nearest one, since no name has location {location}"
+    more = f", not {shorten(others)}" if others else ""
+    return (f"map {first} is used, {why}{more}",)
 
 
 def _is_construction(path: Path) -> bool:
@@ -597,7 +610,7 @@ def _count_frames(
         elif not ((rows.frame - first) % usual).any() and rate_hz / usual >= LOWEST_HZ:
             step = usual
             frames = {name: column // step for name, column in frames.items()}
-            repairs.append(f"rows have every {step}th frame of {rate_hz:g} Hz: these are counted")
+            repairs.append(f"rows have one of {step} frames at {rate_hz:g} Hz: these are counted")
     meta |= {name: frames[name] for name in names}
     same = (np.diff(rows.track) == 0) & (np.diff(frames["frame"]) == 0)
     if same.any():

@@ -267,7 +267,7 @@ def explaining(
     )
     axes: dict[str, Callable[[Angles], Angles]] = {
         "": lambda angle: angle,
-        "clockwise from +x": lambda angle: -angle,
+        "clockwise from +x (or y of the positions points down)": lambda angle: -angle,
         "clockwise from north (+y)": lambda angle: 0.5 * math.pi - angle,
         "counter-clockwise from north (+y)": lambda angle: angle + 0.5 * math.pi,
     }

@@ -236,7 +236,9 @@ def find_line(path: Path, cells: Mapping[str, object], *, occurrence: int = 1) -
     header = header_of(path)
     columns = {name: _places(header, name)[0] for name in cells}
     for number, row in itertools.islice(_lines(path), 1, None):
-        if len(row) >= len(header) and all(_same(row[columns[name]], cells[name]) for name in cells):
+        if len(row) >= len(header) and all(
+            _same(row[columns[name]], cells[name]) for name in cells
+        ):
             occurrence -= 1
             if not occurrence:
                 return number
