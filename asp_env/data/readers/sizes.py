@@ -1,7 +1,7 @@
 """Sizes of agents: default footprints where files have none, and units that cannot be right."""
 
 import numpy as np
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Float, Int
 
 from asp_env.data.classes import FOOTPRINTS_M, is_predicted
 from asp_env.errors import DataError
@@ -31,7 +31,7 @@ def with_footprints(
     Raises:
         DataError: length and width of most vehicles are exchanged, or in another unit.
     """
-    known: Bool[np.ndarray, " tracks"] = (sizes > 0).all(axis=-1)
+    known = np.asarray((sizes > 0).all(axis=-1))
     vehicles = is_predicted(classes)
     _check(sizes[known & vehicles], source)
     unknown = int((vehicles & ~known).sum())

@@ -61,7 +61,7 @@ def of_tracks(recording: Recording) -> list[str]:
 
 def with_headings(change: Callable[[pd.Series], object]) -> pd.DataFrame:
     tracks = four_cars()
-    tracks["heading"] = change(tracks["heading"])
+    tracks["heading"] = change(pd.Series(tracks["heading"]))
     return tracks
 
 
@@ -262,7 +262,7 @@ def test_default_footprints_of_vehicles_are_reported() -> None:
     sizes = np.array([(4.2, 1.7), (0.0, 0.0), (5.0, np.nan), (0.0, 0.0)])
     repairs: list[str] = []
     found = with_footprints(sizes, classes, "file", repairs)
-    expected = np.stack([np.float32([4.2, 1.7]), *FOOTPRINTS_M[classes[1:]]])
+    expected = np.stack([np.array([4.2, 1.7], dtype=np.float32), *FOOTPRINTS_M[classes[1:]]])
     np.testing.assert_array_equal(found, expected)
     (line,) = repairs
     assert line.startswith("2 of 3 vehicles have no length or width")
