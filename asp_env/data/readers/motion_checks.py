@@ -24,6 +24,11 @@ Chosen by hand."""
 SPAN_S = 0.4
 """Motion is measured over this time, which averages the noise of positions. Chosen by hand."""
 
+STEADY_ABOVE = 0.3
+"""Motion of a track is compared if the mean of its motion above `MOVES_ABOVE_MPS` is at least this
+share of its mean speed: positions of a vehicle that stands may jump, but come back. Chosen by
+hand."""
+
 SAME_SPEED = 1.15
 """A track's speed agrees with its motion if their ratio is below this and above its inverse. Chosen
 by hand: smoothed positions and speeds differ by a few per cent."""
@@ -76,7 +81,7 @@ def motion_of(
     positions: Float[np.ndarray, "rows 2"],
     rate_hz: float,
 ) -> Motion:
-    """The motion of positions.
+    """The motion of positions, without tracks that lead nowhere (`STEADY_ABOVE`).
 
     Args:
         tracks: track of each row. Rows are sorted by track, then frame.
@@ -90,7 +95,12 @@ def motion_of(
     whole = (tracks[first] == tracks[last]) & (frames[last] - frames[first] == 2 * half)
     first, last = first[whole], last[whole]
     moved = (positions[last] - positions[first]).astype(np.float64) * (rate_hz / (2 * half))
-    return Motion(row=first + half, track=tracks[first], moved=moved)
+    _, of_id = np.unique(tracks[first], return_inverse=True)
+    speeds = np.hypot(*moved.T)
+    fast = moved * (speeds > MOVES_ABOVE_MPS)[:, None]
+    total = np.hypot(_sums(fast[:, 0], of_id), _sums(fast[:, 1], of_id))
+    steady = (total >= STEADY_ABOVE * _sums(np.hypot(*fast.T), of_id))[of_id]
+    return Motion(row=(first + half)[steady], track=tracks[first][steady], moved=moved[steady])
 
 
 def check_velocities(

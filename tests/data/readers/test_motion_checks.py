@@ -197,6 +197,15 @@ def test_several_conventions_may_explain_one_vehicle() -> None:
     assert names == ["clockwise from north (+y)", "counter-clockwise from north (+y)"]
 
 
+def test_standing_cars_whose_positions_jump_are_not_compared(tmp_path: Path) -> None:
+    """Jumps of 1.5 m to all sides and back, at 0 m/s and any heading."""
+    tracks = four_cars(speed=0.0)
+    for number, row in enumerate(range(10, len(tracks), 20)):
+        tracks.loc[row, "xCenter"] += 1.5 * math.cos(2.0 * number)
+        tracks.loc[row, "yCenter"] += 1.5 * math.sin(2.0 * number)
+    assert of_tracks(opened(tmp_path, tracks)) == []
+
+
 def test_gaps_are_not_spanned() -> None:
     """A gap of 50 frames between rows 24 and 25, and 0.4 s around each row."""
     frames = np.concatenate([np.arange(25), 75 + np.arange(25)])
