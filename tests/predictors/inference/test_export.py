@@ -104,7 +104,9 @@ def test_onnxruntime_agrees_with_the_predictor(exported: Exported) -> None:
     np.testing.assert_allclose(states[..., 3], expected.states[..., 3], atol=1e-4)
     np.testing.assert_allclose(log_probs, expected.log_probs, atol=1e-4)
     named = [expected.actions] * bool(expected.actions_valid.all())
-    named += [expected.features] * exported.features
+    if exported.features:
+        assert expected.features is not None
+        named.append(expected.features)
     for each, value in zip(others, named, strict=True):
         np.testing.assert_allclose(each, value, atol=1e-4)
 
