@@ -63,7 +63,7 @@ def read_geo_trax(paths: tuple[Path, ...]) -> RecordingTables:
         DataError: the table is damaged.
     """
     (path,) = paths
-    columns = {**_COLUMNS, **_SPEED}
+    columns: Mapping[str, Kind] = {**_COLUMNS, **_SPEED}
     table = read_table(path, columns, optional=frozenset(_SPEED), limits=_LIMITS)
     numbered = number_ids(table["Vehicle_ID"])
     track = numbered.columns[0]
