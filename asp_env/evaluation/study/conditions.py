@@ -117,6 +117,12 @@ def make_groups(settings: StudySettings) -> list[Group]:
                     if (group := _group(settings, condition, planner, predictors)) is not None
                 ]
         groups += _static_groups(settings, data, groups)
+    if not groups:
+        raise AspEnvError(
+            f"study: no method uses forecasts, and without forecasts there is nothing to be late "
+            f"by {', '.join(map(str, settings.latency_ticks))} ticks; add 0 to latency_ticks, or a "
+            "method PLANNER+PREDICTOR"
+        )
     return groups
 
 
