@@ -11,9 +11,11 @@ from rich.console import Console
 from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn
 from rich.table import Table
 
-from asp_env.data.recording import DEFAULT_DT_S
+from asp_env.data.predictor import load_predictor
+from asp_env.data.recording import DEFAULT_DT_S, ticks
+from asp_env.data.source import open_data
 from asp_env.errors import AspEnvError, MissingExtraError, unknown_name
-from asp_env.files import write_text
+from asp_env.files import check_new, write_text
 from asp_env.sim.action_types import ActionType
 from policies.settings import (
     REWARD_WEIGHTS,
@@ -128,17 +130,24 @@ class RLTrain:
         train_policy = _training().train_policy
         settings, console = self.settings(), Console()
         columns = (TextColumn("{task.description}"), BarColumn(), TimeRemainingColumn())
-        with Progress(*columns, console=console) as bar:
-            task = bar.add_task(
-                f"{settings.algorithm}, {settings.steps:,} steps", total=settings.steps
-            )
+        bar = Progress(*columns, console=console)
+        task = bar.add_task(f"{settings.algorithm}, {settings.steps:,} steps", total=settings.steps)
+
+        def show(steps: int) -> None:
+            bar.start()  # after all checks
+            bar.update(task, completed=steps)
+
+        try:
             train_policy(
                 settings,
                 self.out,
                 resume=self.resume,
                 privileged=self.privileged,
-                progress=lambda steps: bar.update(task, completed=steps),
+                progress=show,
             )
+        finally:
+            if bar.live.is_started:
+                bar.stop()
         console.print(f"{self.out} written: asp-env rl evaluate DATA --runs {self.out}")
 
 
@@ -170,13 +179,18 @@ class RLEvaluate:
         from policies.evaluation import METRICS, evaluate_trained
         from policies.runs import load_policy
 
-        if self.out is not None and self.out.exists():
-            raise AspEnvError(f"{self.out} exists; choose another name or remove it")
+        if self.out is not None:
+            check_new(self.out)
+        if not self.runs:
+            raise AspEnvError("--runs: none given; expected at least one run folder of a policy")
+        if self.max_scenarios is not None and self.max_scenarios < 1:
+            raise AspEnvError(f"--max-scenarios {self.max_scenarios}: expected at least 1")
+        open_data(self.data)
+        policies = {folder: load_policy(folder) for folder in self.runs}
         console, results = Console(), {}
         table = Table("run", "scenarios", *METRICS)
         with Progress(TextColumn("{task.description}"), BarColumn(), console=console) as bar:
-            for folder in self.runs:
-                trained = load_policy(folder)
+            for folder, trained in policies.items():
                 environment = dataclasses.replace(
                     trained.settings.environment,
                     traffic=self.traffic,
@@ -248,8 +262,13 @@ class RLCompare:
         for name in names:
             if name not in rows:
                 raise unknown_name("row", name, rows)
-        if self.seeds < 1 or self.jobs < 1:
-            raise AspEnvError(f"--seeds {self.seeds} --jobs {self.jobs}: expected at least 1")
+        if len(set(names)) < len(names):
+            raise AspEnvError(f"--rows {', '.join(names)}: name each once")
+        for option, number in (("seeds", self.seeds), ("jobs", self.jobs)):
+            if number < 1:
+                raise AspEnvError(f"--{option} {number}: expected at least 1")
+        load_predictor(self.learned, horizon=ticks(c.HORIZON_S, DEFAULT_DT_S), dt_s=DEFAULT_DT_S)
+        open_data(self.data)
         console = Console()
         held_out = c.HeldOut(
             data=self.held_out, scenarios=self.scenarios, max_scenarios=self.max_scenarios
