@@ -154,9 +154,7 @@ def _parse(name: str, command: Any, args: Sequence[str]) -> Any:
     stderr = io.StringIO()
     try:
         with contextlib.redirect_stderr(stderr):
-            return tyro.cli(
-                command, prog=f"asp-env {name}", args=args, registry=_CONSTRUCTORS
-            )
+            return tyro.cli(command, prog=f"asp-env {name}", args=args, registry=_CONSTRUCTORS)
     except SystemExit as stop:
         if not stop.code:
             _print_plugs(command)
@@ -174,7 +172,9 @@ def _without_box(text: str) -> str:
     lines = [line.strip("│ ") for line in text.splitlines()[1:-1]]
     joined = " ".join(line if line.strip("─-") else ";" for line in lines).strip("; ")
     problem = re.split("; (?:For full|Argument) helptext", joined.replace(" ;", ";"))[0]
-    problem = re.sub(r"no type matching .*does not match choices \('None',\) - [^:]+: ", "", problem)
+    problem = re.sub(
+        r"no type matching .*does not match choices \('None',\) - [^:]+: ", "", problem
+    )
     return re.sub(r"\[/?bold\]", "", problem).rstrip(".")
 
 
