@@ -11,7 +11,7 @@ from rich.console import Console
 from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn
 from rich.table import Table
 
-from asp_env.data.predictor import load_predictor
+from asp_env.data.predictor import feature_size, load_predictor
 from asp_env.data.recording import DEFAULT_DT_S, ticks
 from asp_env.data.source import open_data
 from asp_env.errors import AspEnvError, MissingExtraError, unknown_name
@@ -189,7 +189,9 @@ class RLEvaluate:
         policies = {folder: load_policy(folder) for folder in self.runs}
         console, results = Console(), {}
         table = Table("run", "scenarios", *METRICS)
-        with Progress(TextColumn("{task.description}"), BarColumn(), console=console) as bar:
+        with Progress(
+            TextColumn("{task.description}"), BarColumn(), console=console, transient=True
+        ) as bar:
             for folder, trained in policies.items():
                 environment = dataclasses.replace(
                     trained.settings.environment,
@@ -220,6 +222,7 @@ class RLEvaluate:
         console.print(table)
         if self.out is not None:
             write_text(self.out, json.dumps({"data": self.data, "runs": results}, indent=1))
+            console.print(f"wrote {self.out}")
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -267,7 +270,13 @@ class RLCompare:
         for option, number in (("seeds", self.seeds), ("jobs", self.jobs)):
             if number < 1:
                 raise AspEnvError(f"--{option} {number}: expected at least 1")
-        load_predictor(self.learned, horizon=ticks(c.HORIZON_S, DEFAULT_DT_S), dt_s=DEFAULT_DT_S)
+        horizon = ticks(c.HORIZON_S, DEFAULT_DT_S)
+        learned = load_predictor(self.learned, horizon=horizon, dt_s=DEFAULT_DT_S)
+        if not feature_size(learned):
+            raise AspEnvError(
+                f"--learned {self.learned}: it is not trained and has no features; name a trained "
+                "predictor, such as ssp-asp:pretrained"
+            )
         open_data(self.data)
         console = Console()
         held_out = c.HeldOut(

@@ -190,7 +190,7 @@ def read_settings(folder: Path) -> PolicySettings:
     path = folder / CONFIG
     try:
         content = parse_json(path.read_bytes())
-    except FileNotFoundError:
+    except (FileNotFoundError, NotADirectoryError):
         raise AspEnvError(
             f"{folder}: no run of a policy there ({CONFIG} is missing); train one with "
             "asp-env rl train"

@@ -44,6 +44,9 @@ LOWEST_SHARE_OF_RATE = 0.05
 OWN_ARGUMENTS = ("policy", "env", "device", "policy_kwargs", "gamma", "learning_rate", "seed")
 """Arguments of the algorithms that are no hyperparameters."""
 
+NO_VALUES = ("_class", "_kwargs", "_log", "_noise")
+"""Ends of the names of arguments that are objects or files."""
+
 LEAST = {"learning_starts": 0, "gradient_steps": -1}
 """Smallest values of whole numbers whose default is above 0, where it is not 1."""
 
@@ -82,7 +85,8 @@ def train_policy(
         progress: called before the first step, and after each step of all environments.
 
     Raises:
-        AspEnvError: a setting is invalid, `out` holds another run, or there is nothing to resume.
+        AspEnvError: a setting is invalid, `out` holds another run, there is nothing to resume, or
+            the training diverges.
     """
     done = _check_folder(settings, out, resume)
     envs = make_environments(
@@ -124,6 +128,13 @@ def train_policy(
     try:
         with one_thread():
             algorithm.learn(left, callback=CallbackList(callbacks), reset_num_timesteps=not done)
+    except ValueError as error:
+        if "invalid values" not in str(error):  # of a distribution, in words of torch
+            raise
+        raise AspEnvError(
+            f"{out}: the training diverged after {algorithm.num_timesteps:,} steps: its weights "
+            "are not finite; train again with a smaller learning rate or other hyperparameters"
+        ) from error
     finally:
         algorithm.logger.close()
     space = envs.observation_space
@@ -164,6 +175,7 @@ def make_algorithm(settings: PolicySettings, envs: VecNormalize) -> BaseAlgorith
     classes = algorithm_classes(settings.algorithm)
     arguments = {**DEFAULTS[settings.algorithm], **settings.hyperparameters}
     rate = settings.learning_rate
+    policy_kwargs = policy_arguments(settings)
     algorithm: Any = classes.algorithm
     _check_hyperparameters(settings, algorithm)
     try:
@@ -174,7 +186,7 @@ def make_algorithm(settings: PolicySettings, envs: VecNormalize) -> BaseAlgorith
             gamma=settings.gamma,
             seed=settings.seed,
             device="cpu",
-            policy_kwargs=policy_arguments(settings),
+            policy_kwargs=policy_kwargs,
             **arguments,
         )
     except (TypeError, ValueError, AssertionError) as error:
@@ -198,7 +210,7 @@ def _check_hyperparameters(settings: PolicySettings, algorithm: type) -> None:
     known = {
         name: each.default
         for name, each in parameters.items()
-        if name not in OWN_ARGUMENTS and not name.startswith("_")
+        if name not in OWN_ARGUMENTS and not name.startswith("_") and not name.endswith(NO_VALUES)
     }
     for name, value in settings.hyperparameters.items():
         if name in ("gamma", "learning_rate", "seed"):
@@ -210,7 +222,9 @@ def _check_hyperparameters(settings: PolicySettings, algorithm: type) -> None:
             flag(name, value)
         elif isinstance(default, int):
             whole_number(name, value, least=LEAST.get(name, 1 if default > 0 else -1))
-        elif isinstance(default, float) and not is_finite_number(value):
+        elif default is None and value is None:
+            continue
+        elif isinstance(default, float | None) and not is_finite_number(value):
             raise AspEnvError(f"{name} {shown(value)}: expected a finite number")
         elif isinstance(value, float) and not is_finite_number(value):
             raise AspEnvError(f"{name} {shown(value)}: expected a finite number, or a text")

@@ -137,10 +137,14 @@ def site_names(data: Sequence[str]) -> list[str]:
     """The name of each site: the last part of its path, without characters unfit for a file name.
 
     Raises:
-        AspEnvError: two sites have the same name.
+        AspEnvError: two sites have the same name, or one has none.
     """
     names = [each.rstrip("/").rpartition("/")[2].replace(":", "-") for each in data]
     for name in names:
+        if not name:
+            raise AspEnvError(
+                "DATA '': expected a folder with recordings, or a text scheme:argument"
+            )
         if names.count(name) > 1 or not name.strip("."):
             raise AspEnvError(
                 f"DATA: {name!r} names {names.count(name)} sites; each needs a name of its own"

@@ -79,6 +79,7 @@ def test_unknown_row(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None
     [
         ("nowhere", [], "nowhere does not exist"),
         ("sample:roundabout", ["--learned", "ssp-asp:nowhere"], "nowhere holds no trained"),
+        ("sample:roundabout", ["--learned", "oracle"], "--learned oracle: it is not trained"),
         ("sample:roundabout", ["--rows", "oracle", "oracle"], "--rows oracle, oracle: name each"),
         ("sample:roundabout", ["--seeds", "0"], "--seeds 0: expected at least 1"),
     ],

@@ -206,6 +206,8 @@ class TestRefusals:
             ("ppo", "clip_range", "x", "clip_range 'x': expected a finite number"),
             ("ppo", "seed", 1, "hyperparameter seed: it is an option of its own, seed"),
             ("ppo", "batch_size", 1, "`batch_size` must be greater than 1"),
+            ("ppo", "target_kl", "x", "target_kl 'x': expected a finite number"),
+            ("ppo", "policy_kwargs", 1, "unknown hyperparameter of ppo 'policy_kwargs'"),
             ("sac", "train_freq", 0, "train_freq 0: expected a whole number of at least 1"),
             ("sac", "buffer_size", 10**15, "not enough memory"),
         ],
@@ -220,6 +222,13 @@ class TestRefusals:
         with pytest.raises(AspEnvError, match=message):
             train_policy(settings, tmp_path / "run")
         assert not (tmp_path / "run").exists()
+
+    def test_a_training_that_diverges(self, tmp_path: Path) -> None:
+        """A target network that moves far beyond the network itself."""
+        given = {"buffer_size": 500, "learning_starts": 16, "batch_size": 16, "tau": 1e30}
+        settings = dataclasses.replace(small_settings(algorithm="sac"), hyperparameters=given)
+        with pytest.raises(AspEnvError, match=r"the training diverged after .* smaller learning"):
+            train_policy(settings, tmp_path / "run")
 
     def test_an_unknown_column_and_a_file_in_the_way(self, tmp_path: Path) -> None:
         """Before the run folder is made."""
