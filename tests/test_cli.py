@@ -262,6 +262,24 @@ def test_the_installed_command_exits_with_the_status():
     )
 
 
+@pytest.mark.parametrize(
+    ("given", "expected"),
+    [
+        ({}, {"GOMP_SPINCOUNT": "10000"}),
+        ({"GOMP_SPINCOUNT": "5"}, {"GOMP_SPINCOUNT": "5"}),
+        ({"OMP_WAIT_POLICY": "ACTIVE"}, {"OMP_WAIT_POLICY": "ACTIVE"}),
+    ],
+)
+def test_threads_do_not_wait_busily(monkeypatch, capsys, given, expected):
+    """Unless the environment of the command says otherwise."""
+    environment = dict(given)
+    monkeypatch.setattr(os, "environ", environment)
+    monkeypatch.setattr(sys, "argv", ["asp-env", "--version"])
+    assert main() == 0
+    assert environment == expected
+    assert capsys.readouterr().out.startswith("asp-env ")
+
+
 @pytest.mark.parametrize(("command", "old"), RENAMED_OPTIONS)
 def test_deprecated_options_warn_and_work(
     command: str, old: str, capsys: pytest.CaptureFixture[str]
