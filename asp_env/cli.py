@@ -33,9 +33,9 @@ BAD_INPUT = 2
 """Exit status for input that a command rejects."""
 
 SPIN_COUNT = "10000"
-"""How often a thread of torch looks for work before it sleeps, some tens of microseconds. By default
-it is 300,000 times: where other processes use the cores, two threads then spend several times the
-CPU time of one, waiting for each other. Results do not depend on it."""
+"""How often a thread of torch looks for work before it sleeps, some tens of microseconds. The
+default is 300,000 times: where other processes use the cores, two threads then spend several times
+the CPU time of one, waiting for each other. Results do not depend on it."""
 
 HELP = ("-h", "--help")
 
