@@ -13,6 +13,7 @@ from gymnasium.wrappers import FlattenObservation
 from rich.console import Console
 from rich.progress import track
 
+from asp_env.arguments import MAX_SEED
 from asp_env.data.recording import DEFAULT_DT_S
 from asp_env.data.source import open_data, scheme_of
 from asp_env.envs.replay import ReplayEnv
@@ -21,7 +22,6 @@ from asp_env.errors import AspEnvError
 from asp_env.files import atomic_folder, is_vacant
 from asp_env.sim.world import Ending, world_class
 from policies.dataset import ID_PATTERN, RecordedEpisode, import_h5py, write_dataset
-from policies.settings import MAX_SEED
 
 BATCH = 32
 """Number of episodes that are recorded side by side; the episodes do not depend on it."""

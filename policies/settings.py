@@ -7,6 +7,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Literal, get_args
 
+from asp_env.arguments import MAX_SEED
 from asp_env.data.recording import DEFAULT_DT_S
 from asp_env.errors import AspEnvError, unknown_name
 from asp_env.stored import brief, check_fields, parse_json
@@ -77,9 +78,6 @@ class EnvironmentSettings:
 
 MAX_NEIGHBOURS = 15
 """The vectors show the target and 15 others."""
-
-MAX_SEED = 2**32 - 1
-"""Largest seed that the generators of all packages take."""
 
 MAX_WIDTH = 4_096
 """Largest width of the layers, which bounds the memory. Chosen by hand."""

@@ -13,6 +13,7 @@ from typing import Annotated, Any, Literal
 import tyro
 from rich.console import Console
 
+from asp_env.arguments import MAX_SEED
 from asp_env.data.recording import DEFAULT_DT_S, ticks
 from asp_env.errors import AspEnvError, MissingExtraError, unknown_name
 from asp_env.files import atomic_file, is_temporary
@@ -38,9 +39,6 @@ from predictors.training.command import Train
 
 CHAININGS = ("top1", ORACLE)
 """Rules for chaining segments that are evaluated besides a predictor's own."""
-
-MAX_SEED = 2**32 - 1
-"""Largest seed that the generators of all packages take."""
 
 PLAN, LOCK = "plan.json", ".lock"
 
