@@ -10,6 +10,9 @@ import numpy as np
 
 from asp_env.errors import AspEnvError
 
+MAX_SEED = 2**32 - 1
+"""Largest seed that the generators of all packages take: those of NumPy, torch and SB3."""
+
 _LONGEST = 80
 """Longest value, in characters, that a message shows in full."""
 

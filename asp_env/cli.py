@@ -2,15 +2,18 @@
 
 import contextlib
 import io
+import os
 import re
 import sys
 import warnings
 from collections.abc import Iterator, Mapping, Sequence
+from pathlib import Path
 from typing import Any
 
 import tyro
 from rich.console import Console
 from rich.table import Table
+from tyro.constructors import ConstructorRegistry, PrimitiveConstructorSpec, PrimitiveTypeInfo
 
 from asp_env import registry
 from asp_env.errors import AspEnvError, LeftOutWarning
@@ -29,6 +32,11 @@ PLUGS_OF_OPTION: Mapping[str, registry.Group] = {
 BAD_INPUT = 2
 """Exit status for input that a command rejects."""
 
+SPIN_COUNT = "10000"
+"""How often a thread of torch looks for work before it sleeps, some tens of microseconds. The
+default is 300,000 times: where other processes use the cores, two threads then spend several times
+the CPU time of one, waiting for each other. Results do not depend on it."""
+
 HELP = ("-h", "--help")
 
 VERSION = "--version"
@@ -46,6 +54,31 @@ RENAMED_OPTIONS = {
 """Deprecated options by command. They work for one more release, with a warning."""
 
 
+_CONSTRUCTORS = ConstructorRegistry()
+"""How values of options are made from their texts, besides tyro's own rules."""
+
+
+@_CONSTRUCTORS.primitive_rule
+def _path_rule(info: PrimitiveTypeInfo) -> PrimitiveConstructorSpec[Path] | None:
+    """A path is not empty: `Path("")` is the current folder, which nobody means by "$OUT"."""
+    return None if info.type is not Path else _PATH
+
+
+def _path(texts: list[str]) -> Path:
+    if not texts[0]:
+        raise ValueError("the value is empty, expected a path")
+    return Path(texts[0])
+
+
+_PATH = PrimitiveConstructorSpec(
+    nargs=1,
+    metavar="PATH",
+    instance_from_str=_path,
+    is_instance=lambda value: isinstance(value, Path),
+    str_from_instance=lambda path: [str(path)],
+)
+
+
 def main(argv: Sequence[str] | None = None) -> int:
     """Runs one command.
 
@@ -56,6 +89,8 @@ def main(argv: Sequence[str] | None = None) -> int:
         The exit status: 0 on success or that of the command, 2 with one line on stderr for bad
         input, 130 when interrupted.
     """
+    if argv is None and "OMP_WAIT_POLICY" not in os.environ:
+        os.environ.setdefault("GOMP_SPINCOUNT", SPIN_COUNT)
     args = list(sys.argv[1:] if argv is None else argv)
     if args[:1] == [VERSION]:
         sys.stdout.write(f"{version_line()}\n")
@@ -140,15 +175,28 @@ def _parse(name: str, command: Any, args: Sequence[str]) -> Any:
     stderr = io.StringIO()
     try:
         with contextlib.redirect_stderr(stderr):
-            return tyro.cli(command, prog=f"asp-env {name}", args=args)
+            return tyro.cli(command, prog=f"asp-env {name}", args=args, registry=_CONSTRUCTORS)
     except SystemExit as stop:
         if not stop.code:
             _print_plugs(command)
             raise
-        lines = [line.strip("│─ ") or ";" for line in stderr.getvalue().splitlines()[1:-1]]
-        text = " ".join(lines).replace(" ;", ";")
-        problem = re.split("; (?:For full|Argument) helptext", text)[0].rstrip(".")
+        problem = _without_box(stderr.getvalue())
         raise AspEnvError(f"{problem}; see asp-env {name} --help") from None
+
+
+def _without_box(text: str) -> str:
+    """The problem that tyro states in a box, as one line.
+
+    The lines of the box are dashes where the encoding of stdout has no others. Of an optional
+    value, tyro also states that it is not None.
+    """
+    lines = [line.strip("│ ") for line in text.splitlines()[1:-1]]
+    joined = " ".join(line if line.strip("─-") else ";" for line in lines).strip("; ")
+    problem = re.split("; (?:For full|Argument) helptext", joined.replace(" ;", ";"))[0]
+    problem = re.sub(
+        r"no type matching .*does not match choices \('None',\) - [^:]+: ", "", problem
+    )
+    return re.sub(r"\[/?bold\]", "", problem).rstrip(".")
 
 
 def _print_plugs(command: Any) -> None:

@@ -108,6 +108,31 @@ def write_text(path: Path, text: str) -> None:
         partial.write_text(text)
 
 
+def check_new(path: Path) -> None:
+    """Checks before long work that a file or folder can be made where nothing exists yet.
+
+    Args:
+        path: the file or folder; missing parent folders are no fault.
+
+    Raises:
+        AspEnvError: something exists there, or nothing can be made there.
+    """
+    try:
+        if path.exists():
+            raise AspEnvError(f"{path} exists; choose another name or remove it")
+        parent = next(folder for folder in path.absolute().parents if folder.exists())
+    except OSError as error:
+        raise _not_writable(path, error.strerror or str(error)) from error
+    if not parent.is_dir():
+        raise _not_writable(path, f"{parent} is a file")
+    if not os.access(parent, os.W_OK | os.X_OK):
+        raise _not_writable(path, f"no permission to write in {parent}")
+
+
+def _not_writable(path: Path, reason: str) -> AspEnvError:
+    return AspEnvError(f"{path} cannot be written ({reason}); choose another path")
+
+
 def is_vacant(folder: Path) -> bool:
     """Whether nothing exists at a path, or a folder that is empty.
 

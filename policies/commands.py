@@ -12,9 +12,11 @@ from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn
 from rich.table import Table
 
 from asp_env.console import table_console
-from asp_env.data.recording import DEFAULT_DT_S
+from asp_env.data.predictor import feature_size, load_predictor
+from asp_env.data.recording import DEFAULT_DT_S, ticks
+from asp_env.data.source import open_data
 from asp_env.errors import AspEnvError, MissingExtraError, unknown_name
-from asp_env.files import write_text
+from asp_env.files import check_new, write_text
 from asp_env.sim.action_types import ActionType
 from policies.settings import (
     REWARD_WEIGHTS,
@@ -129,17 +131,24 @@ class RLTrain:
         train_policy = _training().train_policy
         settings, console = self.settings(), Console()
         columns = (TextColumn("{task.description}"), BarColumn(), TimeRemainingColumn())
-        with Progress(*columns, console=console) as bar:
-            task = bar.add_task(
-                f"{settings.algorithm}, {settings.steps:,} steps", total=settings.steps
-            )
+        bar = Progress(*columns, console=console)
+        task = bar.add_task(f"{settings.algorithm}, {settings.steps:,} steps", total=settings.steps)
+
+        def show(steps: int) -> None:
+            bar.start()  # after all checks
+            bar.update(task, completed=steps)
+
+        try:
             train_policy(
                 settings,
                 self.out,
                 resume=self.resume,
                 privileged=self.privileged,
-                progress=lambda steps: bar.update(task, completed=steps),
+                progress=show,
             )
+        finally:
+            if bar.live.is_started:
+                bar.stop()
         console.print(f"{self.out} written: asp-env rl evaluate DATA --runs {self.out}")
 
 
@@ -171,14 +180,21 @@ class RLEvaluate:
         from policies.evaluation import METRICS, evaluate_trained
         from policies.runs import load_policy
 
-        if self.out is not None and self.out.exists():
-            raise AspEnvError(f"{self.out} exists; choose another name or remove it")
+        if self.out is not None:
+            check_new(self.out)
+        if not self.runs:
+            raise AspEnvError("--runs: none given; expected at least one run folder of a policy")
+        if self.max_scenarios is not None and self.max_scenarios < 1:
+            raise AspEnvError(f"--max-scenarios {self.max_scenarios}: expected at least 1")
+        open_data(self.data)
+        policies = {folder: load_policy(folder) for folder in self.runs}
         console, results = table_console(), {}
         table = Table("run", "scenarios", *METRICS)
         table.columns[0].overflow = "fold"
-        with Progress(TextColumn("{task.description}"), BarColumn(), console=console) as bar:
-            for folder in self.runs:
-                trained = load_policy(folder)
+        with Progress(
+            TextColumn("{task.description}"), BarColumn(), console=console, transient=True
+        ) as bar:
+            for folder, trained in policies.items():
                 environment = dataclasses.replace(
                     trained.settings.environment,
                     traffic=self.traffic,
@@ -208,6 +224,7 @@ class RLEvaluate:
         console.print(table)
         if self.out is not None:
             write_text(self.out, json.dumps({"data": self.data, "runs": results}, indent=1))
+            console.print(f"wrote {self.out}")
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -250,8 +267,19 @@ class RLCompare:
         for name in names:
             if name not in rows:
                 raise unknown_name("row", name, rows)
-        if self.seeds < 1 or self.jobs < 1:
-            raise AspEnvError(f"--seeds {self.seeds} --jobs {self.jobs}: expected at least 1")
+        if len(set(names)) < len(names):
+            raise AspEnvError(f"--rows {', '.join(names)}: name each once")
+        for option, number in (("seeds", self.seeds), ("jobs", self.jobs)):
+            if number < 1:
+                raise AspEnvError(f"--{option} {number}: expected at least 1")
+        horizon = ticks(c.HORIZON_S, DEFAULT_DT_S)
+        learned = load_predictor(self.learned, horizon=horizon, dt_s=DEFAULT_DT_S)
+        if not feature_size(learned):
+            raise AspEnvError(
+                f"--learned {self.learned}: it is not trained and has no features; name a trained "
+                "predictor, such as ssp-asp:pretrained"
+            )
+        open_data(self.data)
         console = table_console()
         held_out = c.HeldOut(
             data=self.held_out, scenarios=self.scenarios, max_scenarios=self.max_scenarios

@@ -13,8 +13,9 @@ from gymnasium.wrappers import FlattenObservation
 from rich.console import Console
 from rich.progress import track
 
+from asp_env.arguments import MAX_SEED
 from asp_env.data.recording import DEFAULT_DT_S
-from asp_env.data.source import scheme_of
+from asp_env.data.source import open_data, scheme_of
 from asp_env.envs.replay import ReplayEnv
 from asp_env.envs.vector import ReplayVectorEnv
 from asp_env.errors import AspEnvError
@@ -108,8 +109,9 @@ class Demonstrations:
             raise AspEnvError(f"--out {self.out}: exists already; choose another or remove it")
         if self.max_scenarios is not None and self.max_scenarios < 1:
             raise AspEnvError(f"--max-scenarios {self.max_scenarios}: expected at least 1")
-        if self.seed < 0:
-            raise AspEnvError(f"--seed {self.seed}: expected at least 0")
+        if not 0 <= self.seed <= MAX_SEED:
+            raise AspEnvError(f"--seed {self.seed}: expected 0 to {MAX_SEED}")
+        open_data(self.data)
         if world_class(self.data).traffic != "log":
             raise AspEnvError(
                 f"{self.data}: its traffic reacts and has no logged drivers; use recordings"

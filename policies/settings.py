@@ -2,12 +2,12 @@
 
 import dataclasses
 import json
-import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Literal, get_args
 
+from asp_env.arguments import MAX_SEED
 from asp_env.data.recording import DEFAULT_DT_S
 from asp_env.errors import AspEnvError, unknown_name
 from asp_env.stored import brief, check_fields, parse_json
@@ -59,6 +59,21 @@ class EnvironmentSettings:
             raise AspEnvError(f"neighbours {self.neighbours}: expected 1 to {MAX_NEIGHBOURS}")
         if not 0 <= self.map_lines <= MAX_MAP_LINES:
             raise AspEnvError(f"map_lines {self.map_lines}: expected 0 to {MAX_MAP_LINES}")
+        if self.forecast and self.predictor is None:
+            raise AspEnvError(
+                f"forecast {', '.join(self.forecast)}: there are no forecasts without a predictor; "
+                "name one, such as constant-velocity"
+            )
+        if self.raster_px is not None:
+            if self.view is None:
+                raise AspEnvError(
+                    f"raster_px {self.raster_px}: there are no rasters without a view; name one, "
+                    "such as chauffeurnet"
+                )
+            if min(self.raster_px) < MIN_RASTER_PX:
+                raise AspEnvError(
+                    f"raster_px {self.raster_px}: expected at least {MIN_RASTER_PX} each"
+                )
 
 
 MAX_NEIGHBOURS = 15
@@ -66,6 +81,9 @@ MAX_NEIGHBOURS = 15
 
 MAX_WIDTH = 4_096
 """Largest width of the layers, which bounds the memory. Chosen by hand."""
+
+MIN_RASTER_PX = 36
+"""Smallest side of rasters: the convolutions of the policy leave one pixel of it."""
 
 MAX_MAP_LINES = 64
 """The vectors show 64 pieces of lines."""
@@ -110,11 +128,7 @@ class PolicySettings:
         """
         if self.algorithm not in ALGORITHMS:
             raise unknown_name("algorithm", self.algorithm, ALGORITHMS)
-        for name, least in (("steps", 1), ("num_envs", 1), ("width", 1), ("demonstrations", 0)):
-            if getattr(self, name) < least:
-                raise AspEnvError(f"{name} {getattr(self, name)}: expected at least {least}")
-        if self.width > MAX_WIDTH:
-            raise AspEnvError(f"width {self.width}: expected at most {MAX_WIDTH:,}")
+        self._check_numbers()
         if self.algorithm == "bc" and not self.demonstrations:
             raise AspEnvError(
                 "algorithm bc, behaviour cloning: give the number of epochs, such as "
@@ -124,10 +138,25 @@ class PolicySettings:
             raise AspEnvError(
                 f"demonstrations {self.demonstrations}: only ppo can start from them, and bc"
             )
+        if self.encoder is not None and self.environment.view is None:
+            raise AspEnvError(
+                f"encoder {self.encoder}: it reads rasters; name the view that it was trained with"
+            )
+
+    def _check_numbers(self) -> None:
+        for name, least in (("steps", 1), ("num_envs", 1), ("width", 1), ("demonstrations", 0)):
+            if getattr(self, name) < least:
+                raise AspEnvError(f"{name} {getattr(self, name)}: expected at least {least}")
+        if self.width > MAX_WIDTH:
+            raise AspEnvError(f"width {self.width}: expected at most {MAX_WIDTH:,}")
         if not 0.0 <= self.gamma < 1.0:
             raise AspEnvError(f"gamma {self.gamma}: expected at least 0 and less than 1")
-        if not (math.isfinite(self.learning_rate) and self.learning_rate > 0.0):
-            raise AspEnvError(f"learning_rate {self.learning_rate}: expected a positive number")
+        if not 0.0 < self.learning_rate <= 1.0:
+            raise AspEnvError(
+                f"learning_rate {self.learning_rate}: expected a positive number of at most 1"
+            )
+        if not 0 <= self.seed <= MAX_SEED:
+            raise AspEnvError(f"seed {self.seed}: expected 0 to {MAX_SEED}")
 
     def to_json(self) -> str:
         """The settings as JSON."""
@@ -159,7 +188,7 @@ def read_settings(folder: Path) -> PolicySettings:
     path = folder / CONFIG
     try:
         content = parse_json(path.read_bytes())
-    except FileNotFoundError:
+    except (FileNotFoundError, NotADirectoryError):
         raise AspEnvError(
             f"{folder}: no run of a policy there ({CONFIG} is missing); train one with "
             "asp-env rl train"

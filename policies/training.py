@@ -1,5 +1,6 @@
 """Training of policies with stable-baselines3."""
 
+import inspect
 from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
@@ -13,12 +14,13 @@ from stable_baselines3.common.logger import configure
 from stable_baselines3.common.vec_env import VecMonitor, VecNormalize
 from torch import Tensor
 
+from asp_env.arguments import flag, is_finite_number, shown, whole_number
 from asp_env.data.predictor import Predictor
-from asp_env.errors import AspEnvError
-from asp_env.files import is_vacant
+from asp_env.errors import AspEnvError, unknown_name
+from asp_env.files import check_new, is_vacant
 from asp_env.workers import one_thread
 from policies.cloning import clone
-from policies.curriculum import Curriculum
+from policies.curriculum import Curriculum, ordered
 from policies.environments import PolicyObservations, make_environments
 from policies.logged_steps import logged_steps
 from policies.runs import (
@@ -38,6 +40,15 @@ from policies.settings import CONFIG, DEFAULTS, PolicySettings, read_settings
 
 LOWEST_SHARE_OF_RATE = 0.05
 """Share of the learning rate at the end of the training. Chosen by hand."""
+
+OWN_ARGUMENTS = ("policy", "env", "device", "policy_kwargs", "gamma", "learning_rate", "seed")
+"""Arguments of the algorithms that are no hyperparameters."""
+
+NO_VALUES = ("_class", "_kwargs", "_log", "_noise")
+"""Ends of the names of arguments that are objects or files."""
+
+LEAST = {"learning_starts": 0, "gradient_steps": -1}
+"""Smallest values of whole numbers whose default is above 0, where it is not 1."""
 
 CHECKPOINT_STEPS = 50_000
 """Steps between checkpoints. Chosen by hand: some tens of seconds."""
@@ -71,10 +82,11 @@ def train_policy(
         out: the run folder.
         resume: whether to go on with an interrupted run in `out`.
         privileged: allows forecasts of a predictor that uses the recorded future.
-        progress: called after each step of all environments.
+        progress: called before the first step, and after each step of all environments.
 
     Raises:
-        AspEnvError: a setting is invalid, `out` holds another run, or there is nothing to resume.
+        AspEnvError: a setting is invalid, `out` holds another run, there is nothing to resume, or
+            the training diverges.
     """
     done = _check_folder(settings, out, resume)
     envs = make_environments(
@@ -84,6 +96,8 @@ def train_policy(
         scenarios=settings.environment.scenarios,
         privileged=privileged,
     )
+    if settings.curriculum is not None:  # raises an error if there is no such column
+        ordered(envs.get_attr("scenarios", 0)[0], settings.curriculum)
     monitored = VecMonitor(envs, info_keywords=EPISODE_KEYS)
     normalized = VecNormalize(
         monitored, norm_obs=False, norm_reward=settings.normalize_reward, gamma=settings.gamma
@@ -100,8 +114,10 @@ def train_policy(
         space = envs.observation_space
         assert isinstance(space, spaces.Dict)
         save_config(out, settings, space, predictor, 0)
-        if settings.demonstrations:
-            _clone_logged_drivers(settings, algorithm, privileged)
+    if progress is not None:
+        progress(done)
+    if settings.demonstrations and not done:
+        _clone_logged_drivers(settings, algorithm, privileged)
     left = 0 if settings.algorithm == "bc" else settings.steps - done
     algorithm.set_logger(configure(str(out), ["csv", "tensorboard"]))
     callbacks: list[BaseCallback] = [EpisodeStatistics(), Checkpoints(out, normalized)]
@@ -112,6 +128,13 @@ def train_policy(
     try:
         with one_thread():
             algorithm.learn(left, callback=CallbackList(callbacks), reset_num_timesteps=not done)
+    except ValueError as error:
+        if "invalid values" not in str(error):  # of a distribution, in words of torch
+            raise
+        raise AspEnvError(
+            f"{out}: the training diverged after {algorithm.num_timesteps:,} steps: its weights "
+            "are not finite; train again with a smaller learning rate or other hyperparameters"
+        ) from error
     finally:
         algorithm.logger.close()
     space = envs.observation_space
@@ -152,7 +175,9 @@ def make_algorithm(settings: PolicySettings, envs: VecNormalize) -> BaseAlgorith
     classes = algorithm_classes(settings.algorithm)
     arguments = {**DEFAULTS[settings.algorithm], **settings.hyperparameters}
     rate = settings.learning_rate
+    policy_kwargs = policy_arguments(settings)
     algorithm: Any = classes.algorithm
+    _check_hyperparameters(settings, algorithm)
     try:
         return algorithm(
             classes.policy,
@@ -161,11 +186,48 @@ def make_algorithm(settings: PolicySettings, envs: VecNormalize) -> BaseAlgorith
             gamma=settings.gamma,
             seed=settings.seed,
             device="cpu",
-            policy_kwargs=policy_arguments(settings),
+            policy_kwargs=policy_kwargs,
             **arguments,
         )
-    except TypeError as error:
+    except (TypeError, ValueError, AssertionError) as error:
         raise AspEnvError(f"hyperparameters of {settings.algorithm}: {error}") from None
+    except MemoryError as error:
+        raise AspEnvError(
+            f"{settings.algorithm} with {settings.num_envs} environments and hyperparameters "
+            f"{arguments}: not enough memory ({error}); choose smaller numbers"
+        ) from None
+
+
+def _check_hyperparameters(settings: PolicySettings, algorithm: type) -> None:
+    """Checks the names of hyperparameters, and that their values are like the algorithm's own.
+
+    stable-baselines3 itself checks few of them, and some only while it trains.
+
+    Raises:
+        AspEnvError: a name or a value is invalid.
+    """
+    parameters = inspect.signature(algorithm).parameters
+    known = {
+        name: each.default
+        for name, each in parameters.items()
+        if name not in OWN_ARGUMENTS and not name.startswith("_") and not name.endswith(NO_VALUES)
+    }
+    for name, value in settings.hyperparameters.items():
+        if name in ("gamma", "learning_rate", "seed"):
+            raise AspEnvError(f"hyperparameter {name}: it is an option of its own, {name}")
+        if name not in known:
+            raise unknown_name(f"hyperparameter of {settings.algorithm}", name, known)
+        default = {**known, **DEFAULTS[settings.algorithm]}[name]
+        if isinstance(default, bool):
+            flag(name, value)
+        elif isinstance(default, int):
+            whole_number(name, value, least=LEAST.get(name, 1 if default > 0 else -1))
+        elif default is None and value is None:
+            continue
+        elif isinstance(default, float | None) and not is_finite_number(value):
+            raise AspEnvError(f"{name} {shown(value)}: expected a finite number")
+        elif isinstance(value, float) and not is_finite_number(value):
+            raise AspEnvError(f"{name} {shown(value)}: expected a finite number, or a text")
 
 
 def predictor_of(envs: PolicyObservations) -> Predictor | None:
@@ -210,6 +272,8 @@ def _check_folder(settings: PolicySettings, out: Path, resume: bool) -> bool:
             raise AspEnvError(
                 f"{out} exists and is not an empty folder; choose another, or go on with --resume"
             )
+        if not out.exists():
+            check_new(out)
         return False
     if (out / POLICY).exists():
         (out / CHECKPOINT).unlink(missing_ok=True)

@@ -6,6 +6,8 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float
 
+from asp_env.errors import AspEnvError
+
 RECORDING_META_COLUMNS = (
     "recordingId", "locationId", "frameRate", "speedLimit", "weekday", "startTime", "duration",
     "numTracks", "numVehicles", "numVRUs", "latLocation", "lonLocation", "xUtmOrigin",
@@ -26,7 +28,21 @@ VULNERABLE = ("pedestrian", "bicycle")
 """Classes whose size is written as zero."""
 XZ_PRESET = 6 | 1 << 31
 """`xz -6e`. Reading takes 9 MiB; higher presets do not make a table of a few minutes smaller."""
+MAX_RECORDINGS = 10_000
+"""Largest number of recordings of one command. Chosen by hand."""
 _ROW = "%d,%d,%d,%d,%.4f,%.4f,%.4f,%s,%s,%.4f,%.4f,%.3f,%.3f,%.4f,%.4f,%.3f,%.3f\n"
+
+
+def check_numbers(*, recordings: int, seed: int) -> None:
+    """Checks the number of recordings to generate, and the seed.
+
+    Raises:
+        AspEnvError: one of them is out of range.
+    """
+    if not 1 <= recordings <= MAX_RECORDINGS:
+        raise AspEnvError(f"--recordings {recordings}: expected 1 to {MAX_RECORDINGS:,}")
+    if seed < 0:
+        raise AspEnvError(f"--seed {seed}: expected at least 0")
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

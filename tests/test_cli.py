@@ -1,5 +1,6 @@
 """The command line: exit status 0 on success, 2 and one line on stderr for bad input."""
 
+import io
 import os
 import subprocess
 import sys
@@ -73,6 +74,50 @@ def test_invalid_options_are_rejected(capsys, args, message):
     assert message in line
     assert line.endswith("; see asp-env drive --help")
     assert not set("│─╭╰╮╯") & set(line)
+
+
+@pytest.mark.parametrize(
+    ("args", "line"),
+    [
+        (["--episodes", "nan"], "Error parsing --episodes: invalid literal for int()"),
+        (["--envs"], "Missing value for argument '--envs'. Expected 1 values; see"),
+    ],
+    ids=["no number", "no value"],
+)
+def test_messages_do_not_depend_on_the_encoding(capsys, monkeypatch, args, line):
+    """Without UTF-8, tyro draws its box with dashes."""
+    lines = [_rejected(capsys, "bench", *args)]
+    with monkeypatch.context() as patch:
+        patch.setattr(sys, "stdout", io.TextIOWrapper(io.BytesIO(), encoding="latin-1"))
+        lines.append(_rejected(capsys, "bench", *args))
+    assert lines[0] == lines[1]
+    assert lines[0].startswith(f"asp-env: {line}")
+    assert lines[0].count("--help") == 1
+
+
+def test_of_an_optional_value_the_message_states_the_problem_alone(capsys):
+    """Tyro's own says that it is not None, either."""
+    line = _rejected(capsys, "drive", "x", "--out", "o", "--max-scenarios", "few")
+    assert line == (
+        "asp-env: Error parsing --max-scenarios: invalid literal for int() with base 10: 'few'; "
+        "see asp-env drive --help"
+    )
+
+
+@pytest.mark.parametrize(
+    "args",
+    [
+        ["drive", "sample:intersection", "--out", ""],
+        ["compare", "a", "b", "--out", ""],
+        ["watch", ""],
+    ],
+    ids=["required", "optional", "positional"],
+)
+def test_an_empty_path_is_rejected(capsys, tmp_path, monkeypatch, args):
+    """Of a variable that is not set; it is not the current folder."""
+    monkeypatch.chdir(tmp_path)
+    assert "the value is empty, expected a path" in _rejected(capsys, *args)
+    assert list(tmp_path.iterdir()) == []
 
 
 @pytest.mark.parametrize("command", ["evaluate", "drive", "inspect"])
@@ -215,6 +260,24 @@ def test_the_installed_command_exits_with_the_status():
     assert done.stderr == (
         "asp-env: /dev/null exists and is not an empty folder; choose another name or remove it\n"
     )
+
+
+@pytest.mark.parametrize(
+    ("given", "expected"),
+    [
+        ({}, {"GOMP_SPINCOUNT": "10000"}),
+        ({"GOMP_SPINCOUNT": "5"}, {"GOMP_SPINCOUNT": "5"}),
+        ({"OMP_WAIT_POLICY": "ACTIVE"}, {"OMP_WAIT_POLICY": "ACTIVE"}),
+    ],
+)
+def test_threads_do_not_wait_busily(monkeypatch, capsys, given, expected):
+    """Unless the environment of the command says otherwise."""
+    environment = dict(given)
+    monkeypatch.setattr(os, "environ", environment)
+    monkeypatch.setattr(sys, "argv", ["asp-env", "--version"])
+    assert main() == 0
+    assert environment == expected
+    assert capsys.readouterr().out.startswith("asp-env ")
 
 
 @pytest.mark.parametrize(("command", "old"), RENAMED_OPTIONS)

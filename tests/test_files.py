@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 
 from asp_env.errors import AspEnvError
-from asp_env.files import atomic_file, atomic_folder, is_vacant, remove_abandoned
+from asp_env.files import atomic_file, atomic_folder, check_new, is_vacant, remove_abandoned
 
 
 def everything(folder: Path) -> list[str]:
@@ -90,6 +90,19 @@ def test_an_unwritable_folder_is_refused(tmp_path):
             write_folder(out)
     with pytest.raises(AspEnvError, match=r"out cannot be written \(No space left on device\)"):
         write_folder(tmp_path / "out", error=OSError(errno.ENOSPC, os.strerror(errno.ENOSPC)))
+    assert everything(tmp_path) == ["file"]
+
+
+def test_a_new_path_is_checked_before_anything_is_written(tmp_path):
+    """A missing parent folder is no fault; a file in the way, and what exists already, are."""
+    file = tmp_path / "file"
+    file.write_text("words")
+    check_new(tmp_path / "new" / "deep")
+    with pytest.raises(AspEnvError, match="file exists; choose another name or remove it"):
+        check_new(file)
+    for path in (file / "below", file / "far" / "below", Path("/proc/version/out")):
+        with pytest.raises(AspEnvError, match=r"cannot be written \([^\n]*; choose another path$"):
+            check_new(path)
     assert everything(tmp_path) == ["file"]
 
 

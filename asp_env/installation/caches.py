@@ -113,9 +113,10 @@ def compiled_state() -> CompiledState:
 
 def _content(folder: Path) -> tuple[int, int]:
     """Number of files, and bytes."""
-    if not folder.is_dir():
+    try:
+        files = [path for path in folder.rglob("*") if path.is_file()]
+    except OSError:  # a folder that must not be read
         return 0, 0
-    files = [path for path in folder.rglob("*") if path.is_file()]
     return len(files), sum(_sizes(files))
 
 

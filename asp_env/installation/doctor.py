@@ -167,7 +167,8 @@ def _show(diagnosis: Diagnosis, console: Console) -> None:
     line("")
     for problem in diagnosis.problems:
         line(f"problem: {problem}")
-    line("fit for use" if not diagnosis.problems else f"{len(diagnosis.problems)} problems")
+    count = len(diagnosis.problems)
+    line("fit for use" if not count else f"{count} problem{'s' if count > 1 else ''}")
 
 
 def _compiled_line(compiled: CompiledState) -> str:

@@ -47,6 +47,8 @@ def examine(data: str, *, progress: Callable[[str], None]) -> FolderFindings:
         AspEnvError: the source is unknown.
         DataError: the folder does not exist.
     """
+    if not data:
+        raise AspEnvError("FOLDER '': expected a folder with recordings")
     folder = source_folder(data)
     if not folder.is_dir():
         what = "is a file" if folder.exists() else "does not exist"

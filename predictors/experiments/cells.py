@@ -9,7 +9,12 @@ from dataclasses import dataclass
 from itertools import product
 from typing import Any
 
-from asp_env.data.source import open_readable
+import numpy as np
+
+from asp_env.data.recording import DEFAULT_DT_S
+from asp_env.data.snippets import index_snippets
+from asp_env.data.source import Recordings, open_readable
+from asp_env.data.split import SPLIT_HORIZON_S, split_by_recording
 from asp_env.errors import AspEnvError, unknown_name
 
 SEGMENT_S = 3.0
@@ -97,6 +102,8 @@ def _open_site(name: str, data: str, validation: str | None, test: str | None) -
                     f"recording {names[min(both)]} of {test!r} is also in {other!r}: evaluate on "
                     "recordings that are neither trained nor selected on"
                 )
+    if validation is None:
+        _check_split(opened[data])
     hashes = {given: recordings.data_hash() for given, recordings in opened.items()}
     return Site(
         name=name,
@@ -109,14 +116,35 @@ def _open_site(name: str, data: str, validation: str | None, test: str | None) -
     )
 
 
+def _check_split(recordings: Recordings) -> None:
+    """Checks that DATA can be divided into parts, which every cell needs.
+
+    Raises:
+        AspEnvError: it cannot.
+    """
+    index = index_snippets(recordings, dt_s=DEFAULT_DT_S, horizon_s=SPLIT_HORIZON_S)
+    counts = np.bincount(index.recording, minlength=len(recordings))
+    try:
+        split_by_recording(counts, [recording.location for recording in recordings])
+    except AspEnvError as error:
+        raise AspEnvError(
+            f"{recordings.source!r}: {str(error).partition(';')[0]}; give more recordings, or "
+            "other data by --validation and --test"
+        ) from error
+
+
 def site_names(data: Sequence[str]) -> list[str]:
     """The name of each site: the last part of its path, without characters unfit for a file name.
 
     Raises:
-        AspEnvError: two sites have the same name.
+        AspEnvError: two sites have the same name, or one has none.
     """
     names = [each.rstrip("/").rpartition("/")[2].replace(":", "-") for each in data]
     for name in names:
+        if not name:
+            raise AspEnvError(
+                "DATA '': expected a folder with recordings, or a text scheme:argument"
+            )
         if names.count(name) > 1 or not name.strip("."):
             raise AspEnvError(
                 f"DATA: {name!r} names {names.count(name)} sites; each needs a name of its own"

@@ -13,6 +13,7 @@ from typing import Annotated, Any, Literal
 import tyro
 from rich.console import Console
 
+from asp_env.arguments import MAX_SEED
 from asp_env.data.recording import DEFAULT_DT_S, ticks
 from asp_env.errors import AspEnvError, MissingExtraError, unknown_name
 from asp_env.files import atomic_file, is_temporary
@@ -155,17 +156,29 @@ class Table:
                 raise unknown_name("view", view, view_names())
         for horizon in self.horizons:
             ticks(horizon, DEFAULT_DT_S)
-        if self.jobs < 0 or (self.per_recording is not None and self.per_recording < 1):
-            raise AspEnvError(
-                f"table: jobs is {self.jobs} and per_recording {self.per_recording}, expected 0 or "
-                "more and 1 or more"
-            )
+        self._check_names_and_numbers()
+
+    def _check_names_and_numbers(self) -> None:
+        for option in ("views", "predictors", "horizons", "seeds"):
+            given = getattr(self, option)
+            twice = [each for each in given if given.count(each) > 1]
+            if twice:
+                raise AspEnvError(f"--{option}: {twice[0]} is given twice; give it once")
+        for seed in self.seeds:
+            if not 0 <= seed <= MAX_SEED:
+                raise AspEnvError(f"--seeds {seed}: expected 0 to {MAX_SEED}")
+        if "none" in self.ablations and len(self.ablations) > 1:
+            raise AspEnvError(f"--ablations {' '.join(self.ablations)}: expected none alone")
+        if self.jobs < 0:
+            raise AspEnvError(f"--jobs {self.jobs}: expected 0 or more")
+        if self.per_recording is not None and self.per_recording < 1:
+            raise AspEnvError(f"--per-recording {self.per_recording}: expected 1 or more")
 
     def _plan(self) -> list[Cell]:
         """All cells.
 
         Raises:
-            AspEnvError: a predictor, recipe or ablation is unknown.
+            AspEnvError: a predictor, recipe or ablation is unknown, or the costs cannot be read.
         """
         try:
             from predictors.training.variants import ablations as ablations_of
@@ -194,6 +207,10 @@ class Table:
                     train.unlimited_for(cell.horizon_s, epochs=self.epochs)
                     if self.budget == "cpu":
                         train.costly_configs()
+            if self.budget == "cpu":
+                from predictors.training.budgets import EpochCosts
+
+                EpochCosts.read(self._costs, self._reference)
         except ModuleNotFoundError as error:
             raise MissingExtraError(str(error.name), "train", "training") from error
         return cells

@@ -80,6 +80,10 @@ class EpochCosts:
                 reference=str(content["reference"]),
                 epochs={key: EpochCost(**cost) for key, cost in content["epochs"].items()},
             )
+        except OSError as error:
+            raise AspEnvError(
+                f"{path}: cannot be read ({error.strerror}); expected a file of costs, or nothing"
+            ) from error
         except (AttributeError, KeyError, TypeError, ValueError) as error:
             raise AspEnvError(
                 f"{path}: holds no costs of epochs ({error}); delete it to measure them again"

@@ -279,7 +279,7 @@ class Train:
         return needed_configs(model, self.horizon_s, reference)
 
     def check_budget(self) -> None:
-        """Refuses options that the budget does not read.
+        """Refuses options that the budget does not read, or that are out of range.
 
         Raises:
             AspEnvError: There is one.
@@ -289,6 +289,8 @@ class Train:
                 f"training: patience is {self.patience} with the budget {self.budget}: give it "
                 "with --budget converged"
             )
+        if self.patience is not None and self.patience < 1:
+            raise AspEnvError(f"training: patience is {self.patience}, expected 1 or more")
         if self.costs is not None and self.budget != "cpu":
             raise AspEnvError(
                 f"training: costs are given with the budget {self.budget}: give --budget cpu"

@@ -10,6 +10,7 @@ from dataclasses import dataclass
 from types import MappingProxyType
 from typing import Literal
 
+from asp_env.arguments import MAX_SEED
 from asp_env.data.histories import History
 from asp_env.data.recording import DEFAULT_DT_S, ticks
 from asp_env.data.snippets import HISTORY_S
@@ -119,6 +120,8 @@ class TrainingConfig:
             value = getattr(self, field)
             if value is not None and value < 1:
                 raise AspEnvError(f"training: {field} is {value}, expected 1 or more")
+        if not 0 <= self.seed <= MAX_SEED:
+            raise AspEnvError(f"training: seed is {self.seed}, expected 0 to {MAX_SEED}")
         if self.pretraining_epochs < 0:
             raise AspEnvError(
                 f"training: pretraining_epochs is {self.pretraining_epochs}, expected 0 or more"

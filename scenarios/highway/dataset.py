@@ -21,7 +21,14 @@ from scenarios.highway.rounds import (
 from scenarios.highway.sites import SITES, STEP_S, STEPS_PER_S, Site, network
 from scenarios.noise import measure
 from scenarios.processes import run_with_progress
-from scenarios.tables import Meta, Track, write_recording_meta, write_tracks, write_tracks_meta
+from scenarios.tables import (
+    Meta,
+    Track,
+    check_numbers,
+    write_recording_meta,
+    write_tracks,
+    write_tracks_meta,
+)
 
 MOST_MINUTES = 60.0
 SMOOTHED_FRAMES = 13
@@ -102,10 +109,10 @@ def synthesize(
     for each in sites:
         if each not in SITES:
             raise unknown_name("site", f"highway:{each}", [f"highway:{name}" for name in SITES])
-    if recordings < 1 or not 0.0 < minutes <= MOST_MINUTES or seed < 0:
+    check_numbers(recordings=recordings, seed=seed)
+    if not 0.0 < minutes <= MOST_MINUTES:
         raise AspEnvError(
-            f"{recordings} recordings of {minutes} minutes with seed {seed} cannot be made: at "
-            f"least one recording, at most {MOST_MINUTES:g} minutes, and a seed of 0 or above"
+            f"--minutes {minutes:g}: expected more than 0, and at most {MOST_MINUTES:g}"
         )
     with atomic_folder(out) as folder:
         content = _Content(

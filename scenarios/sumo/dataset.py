@@ -20,7 +20,14 @@ from scenarios.sumo.motion import FRAME_RATE_HZ, Motion, reconstruct
 from scenarios.sumo.network import Movements, simulate
 from scenarios.sumo.place import METRES_PER_ORTHO_PIXEL, SITES, Place, draw_site, make_place
 from scenarios.sumo.tracker import Tracker, draw_tracker, observe
-from scenarios.tables import Meta, Track, write_recording_meta, write_tracks, write_tracks_meta
+from scenarios.tables import (
+    Meta,
+    Track,
+    check_numbers,
+    write_recording_meta,
+    write_tracks,
+    write_tracks_meta,
+)
 
 CHECKS_PER_S = 5.0
 """Overlaps are checked at 5 Hz."""
@@ -371,11 +378,15 @@ def synthesize(
     if site not in SITES:
         raise unknown_name("site", site, SITES)
     places = max(1, recordings // RECORDINGS_PER_LOCATION) if locations is None else locations
-    if not 1 <= places <= recordings or not 1.0 <= minutes * 60.0 < MAX_SECONDS or seed < 0:
+    check_numbers(recordings=recordings, seed=seed)
+    if not 1.0 <= minutes * 60.0 < MAX_SECONDS:
         raise AspEnvError(
-            f"{recordings} recordings of {minutes} minutes at {places} locations with seed {seed} "
-            "cannot be made: expected at least one recording of a second or more, at least one "
-            "location and no more locations than recordings, and a seed of 0 or more"
+            f"--minutes {minutes:g}: expected at least a second, 0.0167, and less than "
+            f"{MAX_SECONDS / 60.0:g}"
+        )
+    if not 1 <= places <= recordings:
+        raise AspEnvError(
+            f"--locations {places}: expected 1 to {recordings}, the number of recordings"
         )
     with atomic_folder(out) as folder:
         content = _Content(

@@ -2,6 +2,7 @@
 
 import importlib.util
 import json
+import os
 import re
 import sys
 import time
@@ -96,6 +97,8 @@ def test_bad_recordings_are_problems(tmp_path: Path, capsys: pytest.CaptureFixtu
 def test_a_missing_folder_is_bad_input(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["doctor", str(tmp_path / "nowhere")]) == 2
     assert f"{tmp_path / 'nowhere'} does not exist" in capsys.readouterr().err
+    assert main(["doctor", ""]) == 2
+    assert "FOLDER '': expected a folder with recordings" in capsys.readouterr().err
 
 
 def test_a_cache_that_cannot_be_made_is_a_problem(
@@ -108,6 +111,23 @@ def test_a_cache_that_cannot_be_made_is_a_problem(
     assert status == 1
     (problem,) = found["problems"]
     assert "set ASP_ENV_CACHE to a folder that can be written to" in problem
+
+
+@pytest.mark.skipif(os.geteuid() == 0, reason="everything is permitted")
+def test_a_cache_that_must_not_be_read_is_a_problem(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Such as the home folder of another user in a container."""
+    home = tmp_path / "home"
+    (home / "cache").mkdir(parents=True)
+    home.chmod(0)
+    monkeypatch.setenv("ASP_ENV_CACHE", str(home / "cache"))
+    try:
+        status, found = diagnosis(capsys)
+    finally:
+        home.chmod(0o700)
+    assert status == 1
+    assert "set ASP_ENV_CACHE to a folder that can be written to" in found["problems"][0]
 
 
 def test_a_wrong_clock_is_found(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -81,3 +81,26 @@ def test_unknown_row(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None
     args = ["rl", "compare", "sample:roundabout", "--held-out", "sample:roundabout", "--out"]
     assert main([*args, str(tmp_path / "x"), "--rows", "orakle"]) == 2
     assert "orakle" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    ("data", "options", "message"),
+    [
+        ("nowhere", [], "nowhere does not exist"),
+        ("sample:roundabout", ["--learned", "ssp-asp:nowhere"], "nowhere holds no trained"),
+        ("sample:roundabout", ["--learned", "oracle"], "--learned oracle: it is not trained"),
+        ("sample:roundabout", ["--rows", "oracle", "oracle"], "--rows oracle, oracle: name each"),
+        ("sample:roundabout", ["--seeds", "0"], "--seeds 0: expected at least 1"),
+    ],
+)
+def test_bad_options_are_refused_before_anything_is_trained(
+    data: str, options: list[str], message: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """The folder is not made."""
+    out = tmp_path / "compared"
+    args = ["rl", "compare", data, "--held-out", "sample:roundabout", "--out", str(out)]
+    assert main([*args, *options]) == 2
+    printed = capsys.readouterr()
+    assert message in printed.err
+    assert (printed.err.count("\n"), printed.out) == (1, "")
+    assert not out.exists()

@@ -187,8 +187,10 @@ def test_invalid_options_are_rejected(capsys: pytest.CaptureFixture[str], tmp_pa
         ([DATA, "--out", str(taken)], "exists already; choose another or remove it"),
         ([DATA, "--out", str(tmp_path / "a-v0"), "--max-scenarios", "0"], "expected at least 1"),
         ([DATA, "--out", str(tmp_path / "a-v0"), "--observations", "stat"], "state"),
-        ([DATA, "--out", str(tmp_path / "a-v0"), "--seed", "-1"], "--seed -1: expected at least 0"),
+        ([DATA, "--out", str(tmp_path / "a-v0"), "--seed", "-1"], "--seed -1: expected 0 to 429"),
+        ([DATA, "--out", str(tmp_path / "a-v0"), "--seed", "99999999999"], "expected 0 to 429"),
         ([str(tmp_path / "none"), "--out", str(tmp_path / "a-v0")], "does not exist"),
+        (["", "--out", str(tmp_path / "a-v0")], "data '': expected a folder with recordings"),
     ]
     for args, message in cases:
         assert message in rejected(capsys, *args), args

@@ -4,6 +4,7 @@ import dataclasses
 import json
 import shutil
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -17,7 +18,7 @@ from policies.curriculum import number_drawn, ordered
 from policies.evaluation import METRICS, evaluate_trained
 from policies.logged_steps import logged_steps
 from policies.runs import CHECKPOINT, POLICY, check_predictor, load_policy, read_tensors
-from policies.settings import CONFIG, PolicySettings, read_settings
+from policies.settings import CONFIG, EnvironmentSettings, PolicySettings, read_settings
 from policies.training import checkpoint_of, train_policy
 from tests.policies.conftest import small_settings
 
@@ -160,7 +161,16 @@ class TestRefusals:
 
     @pytest.mark.parametrize(
         ("field", "value"),
-        [("steps", 0), ("gamma", 1.0), ("learning_rate", 0.0), ("algorithm", "dqn")],
+        [
+            ("steps", 0),
+            ("gamma", 1.0),
+            ("learning_rate", 0.0),
+            ("learning_rate", 1e300),
+            ("seed", -1),
+            ("seed", 2**32),
+            ("encoder", "ssp-asp:pretrained"),
+            ("algorithm", "dqn"),
+        ],
     )
     def test_settings(self, field: str, value: object) -> None:
         with pytest.raises(AspEnvError, match=field if field != "algorithm" else "dqn"):
@@ -171,6 +181,63 @@ class TestRefusals:
             PolicySettings(algorithm="bc")
         with pytest.raises(AspEnvError, match="only ppo"):
             PolicySettings(algorithm="sac", demonstrations=2)
+
+    @pytest.mark.parametrize(
+        "fields",
+        [
+            {"raster_px": (90, 60)},
+            {"view": "chauffeurnet", "raster_px": (35, 60)},
+            {"forecast": {"modes": 1}},
+        ],
+        ids=["no view", "too small", "no predictor"],
+    )
+    def test_observations(self, fields: dict[str, Any]) -> None:
+        """What nothing would use, and rasters of which the convolutions leave nothing."""
+        with pytest.raises(AspEnvError, match=[*fields][-1]):
+            EnvironmentSettings(**fields)
+
+    @pytest.mark.parametrize(
+        ("algorithm", "name", "value", "message"),
+        [
+            ("ppo", "n_stepz", 3, "unknown hyperparameter of ppo 'n_stepz' .did you mean 'n_st"),
+            ("ppo", "n_steps", 0, "n_steps 0: expected a whole number of at least 1"),
+            ("ppo", "batch_size", 1.5, "batch_size 1.5: expected a whole number of at least 1"),
+            ("ppo", "ent_coef", float("nan"), "ent_coef nan: expected a finite number"),
+            ("ppo", "clip_range", "x", "clip_range 'x': expected a finite number"),
+            ("ppo", "seed", 1, "hyperparameter seed: it is an option of its own, seed"),
+            ("ppo", "batch_size", 1, "`batch_size` must be greater than 1"),
+            ("ppo", "target_kl", "x", "target_kl 'x': expected a finite number"),
+            ("ppo", "policy_kwargs", 1, "unknown hyperparameter of ppo 'policy_kwargs'"),
+            ("sac", "train_freq", 0, "train_freq 0: expected a whole number of at least 1"),
+            ("sac", "buffer_size", 10**15, "not enough memory"),
+        ],
+    )
+    def test_hyperparameters_of_the_algorithm(
+        self, algorithm: str, name: str, value: object, message: str, tmp_path: Path
+    ) -> None:
+        """Before the run folder is made."""
+        settings = dataclasses.replace(
+            small_settings(algorithm=algorithm), hyperparameters={name: value}
+        )
+        with pytest.raises(AspEnvError, match=message):
+            train_policy(settings, tmp_path / "run")
+        assert not (tmp_path / "run").exists()
+
+    def test_a_training_that_diverges(self, tmp_path: Path) -> None:
+        """A target network that moves far beyond the network itself."""
+        given = {"buffer_size": 500, "learning_starts": 16, "batch_size": 16, "tau": 1e30}
+        settings = dataclasses.replace(small_settings(algorithm="sac"), hyperparameters=given)
+        with pytest.raises(AspEnvError, match=r"the training diverged after .* smaller learning"):
+            train_policy(settings, tmp_path / "run")
+
+    def test_an_unknown_column_and_a_file_in_the_way(self, tmp_path: Path) -> None:
+        """Before the run folder is made."""
+        (tmp_path / "file").touch()
+        with pytest.raises(AspEnvError, match="cannot be written"):
+            train_policy(small_settings(), tmp_path / "file" / "run")
+        with pytest.raises(AspEnvError, match="desnity"):
+            train_policy(small_settings(curriculum="desnity"), tmp_path / "run")
+        assert [path.name for path in tmp_path.iterdir()] == ["file"]
 
     def test_hyperparameters(self, tmp_path: Path) -> None:
         settings = dataclasses.replace(small_settings(), hyperparameters={"n_stepz": 3})

@@ -1,6 +1,7 @@
 """The command, the source and the samples: determinism and faults."""
 
 import hashlib
+import re
 import subprocess
 import sys
 from collections.abc import Callable
@@ -100,21 +101,28 @@ def test_an_unwritable_folder_is_refused(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    ("recordings", "minutes", "seed", "locations"),
+    ("recordings", "minutes", "seed", "locations", "message"),
     [
-        (0, 1.0, 0, None),
-        (1, 0.0, 0, None),
-        (1, float("nan"), 0, None),
-        (1, 1.0, -1, None),
-        (2, 1.0, 0, 3),
-        (2, 1.0, 0, -1),
+        (0, 1.0, 0, None, "--recordings 0: expected 1 to 10,000"),
+        (10**20, 1.0, 0, None, f"--recordings {10**20}: expected 1 to 10,000"),
+        (1, 0.0, 0, None, "--minutes 0: expected at least a second, 0.0167, and less than 1440"),
+        (1, 1e300, 0, None, "--minutes 1e+300: expected at least a second"),
+        (1, float("nan"), 0, None, "--minutes nan: expected at least a second"),
+        (1, 1.0, -1, None, "--seed -1: expected at least 0"),
+        (2, 1.0, 0, 3, "--locations 3: expected 1 to 2, the number of recordings"),
+        (2, 1.0, 0, -1, "--locations -1: expected 1 to 2"),
     ],
 )
 def test_impossible_numbers_are_refused(
-    tmp_path: Path, recordings: int, minutes: float, seed: int, locations: int | None
+    tmp_path: Path,
+    recordings: int,
+    minutes: float,
+    seed: int,
+    locations: int | None,
+    message: str,
 ) -> None:
-    """No recordings, no time, a negative seed, or more locations than recordings give one line."""
-    with pytest.raises(AspEnvError, match="cannot be made"):
+    """The message names the option that is wrong, and no other."""
+    with pytest.raises(AspEnvError, match=re.escape(message)):
         synthesize(
             tmp_path / "x",
             site="intersection",

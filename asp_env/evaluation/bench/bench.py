@@ -35,6 +35,8 @@ RASTER_SIZES_PX = ((360, 240), (90, 60))
 SECTIONS = ("rasters", "stepping", "environments", "scaling")
 RENAMED_SECTIONS = {"drawing": "rasters"}
 """Old names of sections. They work for one more release, with a warning."""
+MOST = {"episodes": 65_536, "agents": 1_024, "envs": 65_536}
+"""Largest numbers, chosen by hand: more than that is not faster, and needs tens of gigabytes."""
 SCALING_EPISODES = (1, 16, 64, 256, 1024, 4096)
 SCALING_AGENTS = (16, 32, 64, 128, 256)
 
@@ -60,9 +62,11 @@ class Bench:
 
     def run(self) -> None:
         """Measures the sections and the latencies and prints a table for each."""
-        for name in ("episodes", "agents", "envs"):
-            if getattr(self, name) < 1:
-                raise AspEnvError(f"--{name} {getattr(self, name)}: expected at least 1")
+        for name, most in MOST.items():
+            if not 1 <= getattr(self, name) <= most:
+                raise AspEnvError(f"--{name} {getattr(self, name)}: expected 1 to {most:,}")
+        if not self.sections and not self.predictors:
+            raise AspEnvError(f"--sections: none given; expected some of {', '.join(SECTIONS)}")
         sections = [_current_section(name) for name in self.sections]
         console = Console(width=max(Console().width, 120))
         recordings = open_readable(self.data, dt_s=DEFAULT_DT_S)

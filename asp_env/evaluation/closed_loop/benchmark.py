@@ -21,8 +21,8 @@ from rich.table import Table
 from asp_env import registry
 from asp_env.data.cache import digest
 from asp_env.data.scenarios.selection import save_scenarios
-from asp_env.data.source import source_folder
-from asp_env.errors import AspEnvError
+from asp_env.data.source import open_data, source_folder
+from asp_env.errors import AspEnvError, unknown_name
 from asp_env.evaluation.closed_loop.comparison import EXPERT
 from asp_env.evaluation.closed_loop.drive import ClosedLoopResult, Drive, drive, save_rollouts
 from asp_env.evaluation.closed_loop.scenario_table import write_scenario_table
@@ -44,7 +44,7 @@ from asp_env.evaluation.selection import short_names, with_fallback
 from asp_env.evaluation.statistics import is_resolved
 from asp_env.evaluation.verdicts import share_text
 from asp_env.files import atomic_file, atomic_folder
-from asp_env.metrics.driving.rules import DEFAULT_RULES
+from asp_env.metrics.driving.rules import DEFAULT_RULES, find_rules
 from asp_env.planning.planner import load_planner
 
 SUITE = "intersection-v1"
@@ -167,11 +167,17 @@ def parse_method(name: str) -> tuple[str, str]:
         The name of the planner, and that of the predictor, which is empty for a planner alone.
 
     Raises:
-        AspEnvError: the part after the plus sign is missing.
+        AspEnvError: nothing is named, the planner is unknown, or the part after the plus sign is
+            missing.
     """
     planners = registry.names("planners")
     head, plus, predictor = name.partition("+")
-    if plus and head.partition(":")[0] in planners:
+    plug = head.partition(":")[0]
+    if not plug:
+        raise AspEnvError(f"method {name!r}: expected PLANNER+PREDICTOR, a predictor or a planner")
+    if plus and plug not in (*planners, *registry.names("predictors")):
+        raise unknown_name("planner", plug, planners)
+    if plus and plug in planners:
         if not predictor:
             raise AspEnvError(f"method {name!r}: expected PLANNER+PREDICTOR, such as {head}+oracle")
         return head, predictor
@@ -195,6 +201,12 @@ def benchmark(config: Benchmark) -> tuple[list[BenchmarkRow], list[ClosedLoopRes
     """
     if not config.methods:
         raise AspEnvError("no METHOD: expected at least one, such as constant-velocity")
+    # The traffic of a suite takes minutes to make; what is bad is refused before.
+    find_rules(config.rules)
+    if config.jobs < 1:
+        raise AspEnvError(f"--jobs {config.jobs}: expected at least 1 process")
+    if config.max_scenarios is not None and config.max_scenarios < 1:
+        raise AspEnvError(f"--max-scenarios {config.max_scenarios}: expected at least 1")
     data = _data(config)
     parsed = {name: parse_method(name) for name in config.methods}
     if config.fallback:
@@ -238,12 +250,15 @@ def _data(config: Benchmark) -> str:
             f"--suite {config.suite} and --data {config.data}: give one of them; a suite brings "
             "its own data"
         )
-    return config.data or f"suite:{config.suite or SUITE}"
+    if config.data is not None:
+        return config.data
+    return f"suite:{SUITE if config.suite is None else config.suite}"
 
 
 def _frozen(data: str) -> str:
     path = source_folder(data) / FROZEN
     if not path.is_file():
+        open_data(data)  # raises an error if there are no recordings at all
         raise AspEnvError(
             f"{data} has no frozen scenarios: {path} is missing; give the {FROZEN} of a run by "
             "--scenarios FILE, or a filter such as --scenarios interactive"

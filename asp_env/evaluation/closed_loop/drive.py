@@ -183,6 +183,8 @@ def drive(config: Drive) -> ClosedLoopResult:
     """
     if config.jobs < 1:
         raise AspEnvError(f"--jobs {config.jobs}: expected at least 1 process")
+    if config.max_scenarios is not None and config.max_scenarios < 1:
+        raise AspEnvError(f"--max-scenarios {config.max_scenarios}: expected at least 1")
     config = _guarded(config) if config.fallback else config
     config = replace(config, traffic=config.traffic or world_class(config.data).traffic)
     runs = _runs_to_drive(config)

@@ -96,6 +96,10 @@ def load_rollouts(path: Path) -> dict[Path, Rollout]:
     Raises:
         DataError: there is none, or one cannot be read.
     """
+    if not path.exists():
+        raise DataError(
+            f"{path} does not exist; expected a rollout (.npz), or a folder of asp-env drive"
+        )
     if not path.is_dir():
         return {path: Rollout.load(path)}
     files = sorted(each for each in path.rglob("*.npz") if not each.name.startswith("."))

@@ -158,6 +158,8 @@ def evaluate(config: Evaluate) -> OpenLoopResult:
     Raises:
         AspEnvError: an option or the data are bad.
     """
+    if config.max_states < 1:
+        raise AspEnvError(f"--max-states {config.max_states}: expected at least 1")
     recordings = open_readable(config.data, dt_s=config.dt)
     horizon = ticks(config.horizon, config.dt)
     planner = None if config.planner in NO_PLANNER else load_candidate_planner(config.planner)

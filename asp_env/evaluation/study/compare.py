@@ -17,7 +17,7 @@ from asp_env.errors import AspEnvError, DataError, unknown_name
 from asp_env.evaluation.closed_loop.scenario_table import COLUMNS
 from asp_env.evaluation.results import SCORE
 from asp_env.evaluation.statistics import Difference, difference, resampled_means
-from asp_env.files import atomic_file
+from asp_env.files import atomic_file, check_new
 
 TABLE = "scenarios.csv"
 
@@ -47,7 +47,7 @@ class Compare:
     latency_ticks: int | None = None
     """Latency of both; the default is all."""
     out: Path | None = None
-    """CSV file to write: the difference in every scenario."""
+    """CSV file to write: the difference in every scenario. It must not exist."""
 
     def run(self) -> None:
         """Prints the differences, and the scenarios that decide.
@@ -55,6 +55,8 @@ class Compare:
         Raises:
             AspEnvError: a folder or an option is bad, or nothing can be compared.
         """
+        if self.out is not None:
+            check_new(self.out)
         first, second = self._read(self.a), self._read(self.b)
         pairs = self._pairs(first, second)
         compared = [
@@ -78,13 +80,21 @@ class Compare:
 
     def _read(self, folder: Path) -> dict[str, "DrivenMethod"]:
         read = read_scenario_table(folder / TABLE, self.metric)
+        keys = [key for method in read.values() for key in method.values]
+        for option, chosen, known in (
+            ("traffic", self.traffic, [traffic for _, traffic, _, _ in keys]),
+            ("latency-ticks", self.latency_ticks, [_latency(key) for key in keys]),
+        ):
+            if chosen is not None and chosen not in known:
+                found = ", ".join(map(str, sorted(set(known)))) or "nothing"
+                raise AspEnvError(f"--{option} {chosen}: {folder} has {found}")
         return {
             name: DrivenMethod(
                 values={
                     key: value
                     for key, value in method.values.items()
                     if self.traffic in (None, key[1])
-                    and self.latency_ticks in (None, int(key[2] or 0))
+                    and self.latency_ticks in (None, _latency(key))
                 },
                 recordings=method.recordings,
             )
@@ -108,6 +118,10 @@ class Compare:
                 raise unknown_name("method", name, known)
         label = names[1] if names[0] == names[1] else f"{names[1]} less {names[0]}"
         return {label: names}
+
+
+def _latency(key: Key) -> int:
+    return int(key[2] or 0)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -151,8 +165,10 @@ def read_scenario_table(path: Path, metric: str) -> dict[str, DrivenMethod]:
         with path.open(newline="", encoding="utf-8") as file:
             lines = list(csv.DictReader(file))
     except (OSError, UnicodeDecodeError, csv.Error) as error:
+        reason = error.strerror if isinstance(error, OSError) else error
         raise DataError(
-            f"{path}: cannot be read ({error}); expected the folder of a run"
+            f"{path}: cannot be read ({reason}); expected a folder written by asp-env study, drive "
+            "or benchmark"
         ) from error
     columns = list(lines[0]) if lines else []
     if missing := [name for name in COLUMNS if name not in columns]:
@@ -256,7 +272,9 @@ def deciding_table(compared: Compared, metric: str) -> Table:
     chosen = [i for i in order.tolist() if gain[i] != 0]
     rest = gain.sum() - gain[chosen].sum()
     table = Table(
-        title=f"the {len(chosen)} scenarios with the largest difference of {metric}",
+        title=f"the {len(chosen)} scenarios with the largest difference of {metric}"
+        if chosen
+        else f"no scenario differs in {metric}",
         caption=f"together {gain[chosen].sum() / len(gain):+.3f} of the mean difference "
         f"{gain.mean():+.3f}; all others {rest / len(gain):+.3f}",
         box=box.SIMPLE_HEAD,

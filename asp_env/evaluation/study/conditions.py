@@ -30,6 +30,7 @@ from asp_env.evaluation.study.identity import (
     versions,
 )
 from asp_env.evaluation.study.settings import StudySettings
+from asp_env.metrics.driving.rules import find_rules
 from asp_env.planning.planner import load_planner
 from asp_env.sim.traffic.log import LogDriver
 from asp_env.sim.world import world_class
@@ -101,6 +102,7 @@ def make_groups(settings: StudySettings) -> list[Group]:
     Raises:
         AspEnvError: a name is unknown, or a method is not a planner with a predictor.
     """
+    find_rules(settings.rules)  # raises an error before the traffic of a suite is made
     named: dict[str, list[str]] = {}
     for method in settings.methods:
         planner, predictor = parse_method(method)
@@ -117,6 +119,12 @@ def make_groups(settings: StudySettings) -> list[Group]:
                     if (group := _group(settings, condition, planner, predictors)) is not None
                 ]
         groups += _static_groups(settings, data, groups)
+    if not groups:
+        raise AspEnvError(
+            f"study: no method uses forecasts, and without forecasts there is nothing to be late "
+            f"by {', '.join(map(str, settings.latency_ticks))} ticks; add 0 to latency_ticks, or a "
+            "method PLANNER+PREDICTOR"
+        )
     return groups
 
 

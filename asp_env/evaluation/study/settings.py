@@ -1,6 +1,7 @@
 """What a study drives: from a TOML file, from options, or from both."""
 
 import dataclasses
+import math
 import tomllib
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -70,8 +71,8 @@ class StudySettings:
             )
         for name in ("max_scenarios", "horizon_s", "dt_s", "budget_ms"):
             value = getattr(self, name)
-            if value is not None and not value > 0:
-                raise AspEnvError(f"study: {name} {value:g}, expected a number above 0")
+            if value is not None and not 0 < value < math.inf:
+                raise AspEnvError(f"study: {name} {value:g}, expected a finite number above 0")
 
     def as_json(self) -> dict[str, Any]:
         """The settings as plain values."""

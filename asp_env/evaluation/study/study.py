@@ -128,6 +128,13 @@ class Study:
             raise AspEnvError(f"--jobs {self.jobs}: expected at least 1 process")
         if self.ray is not None and self.jobs > 1:
             raise AspEnvError("--ray and --jobs: give one of them; a cluster uses all its cores")
+        if self.ray is None and self.ray_send_data:
+            raise AspEnvError("--ray-send-data: goes with --ray ADDRESS; leave it out")
+        if self.traffic == ():
+            raise AspEnvError(
+                "study: no traffic given, expected at least one; leave --traffic out for that of "
+                "the data"
+            )
         names = [field.name for field in fields(StudySettings)]
         settings = read_settings(self.config, {name: getattr(self, name) for name in names})
         check_report_possible()

@@ -88,8 +88,10 @@ def test_old_names_of_sections_work_with_a_warning(
 @pytest.mark.parametrize(
     ("args", "message"),
     [
-        (["--episodes", "0"], "--episodes 0: expected at least 1"),
-        (["--agents", "-1"], "--agents -1: expected at least 1"),
+        (["--episodes", "0"], "--episodes 0: expected 1 to 65,536"),
+        (["--agents", "-1"], "--agents -1: expected 1 to 1,024"),
+        (["--envs", "99999999999"], "--envs 99999999999: expected 1 to 65,536"),
+        (["--sections"], "--sections: none given; expected some of rasters, stepping"),
         (["--sections", "raster"], "did you mean 'rasters'"),
     ],
 )

@@ -125,7 +125,33 @@ def test_bad_options_are_refused(tmp_path: Path) -> None:
         config(tmp_path).run()
     with pytest.raises(AspEnvError, match="unknown predictor 'mpt'"):
         config(tmp_path, "sampling+mpt").run()
+    with pytest.raises(AspEnvError, match="unknown planner 'smapling'"):
+        config(tmp_path, "smapling+oracle").run()
+    with pytest.raises(AspEnvError, match="nowhere does not exist; expected a folder"):
+        config(tmp_path, "idm", data=str(tmp_path / "nowhere"), scenarios="").run()
     assert not list(tmp_path.iterdir())
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"jobs": 0}, "--jobs 0"),
+        ({"max_scenarios": 0}, "--max-scenarios 0"),
+        ({"rules": "hard"}, "unknown rules 'hard'"),
+        ({"suite": ""}, "unknown suite ''"),
+        ({"data": ""}, "data '': expected a folder"),
+    ],
+    ids=lambda value: " ".join(value) if isinstance(value, dict) else None,
+)
+def test_bad_options_are_refused_before_a_suite_is_made(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, options: dict[str, object], message: str
+) -> None:
+    """The traffic of a suite takes minutes, and an empty name is not the default."""
+    monkeypatch.setenv("ASP_ENV_CACHE", str(tmp_path / "cache"))
+    with pytest.raises(AspEnvError, match=message):
+        config(tmp_path / "out", "idm", **{"data": None, "scenarios": "", **options}).run()
+    assert not (tmp_path / "cache").exists()
+    assert not (tmp_path / "out").exists()
 
 
 def test_the_command_is_registered() -> None:

@@ -127,7 +127,7 @@ def test_data_that_have_been_moved_need_an_option(drives, tmp_path, capsys):
 
 def test_files_that_are_no_rollouts_are_errors(drives, tmp_path, capsys):
     """A missing file, another file, a truncated one among good ones, a folder without any."""
-    assert "No such file" in error(capsys, tmp_path / "none.npz")
+    assert "none.npz does not exist; expected a rollout" in error(capsys, tmp_path / "none.npz")
     (tmp_path / "words.txt").write_text("words")
     assert "not a readable rollout" in error(capsys, tmp_path / "words.txt")
     assert "no rollouts (.npz) below it" in error(capsys, tmp_path)

@@ -5,6 +5,7 @@ from pathlib import Path
 import pytest
 import tyro
 
+from asp_env.cli import main
 from asp_env.errors import AspEnvError
 from asp_env.evaluation.study.settings import StudySettings, read_settings
 from asp_env.evaluation.study.study import Study
@@ -47,7 +48,8 @@ def test_options_replace_what_the_file_states(tmp_path: Path) -> None:
         ("data = ['a']\nmethod = ['idm']", "unknown key 'method' \\(did you mean 'methods'"),
         ("data = ['a']\nmethods = ['idm']\nlatency_ticks = [-1]", "latency_ticks -1, expected 0"),
         ("data = ['a']\nmethods = ['idm']\nlatency_ticks = [1.5]", "expected a list of int"),
-        ("data = ['a']\nmethods = ['idm']\nhorizon_s = 0", "horizon_s 0, expected a number"),
+        ("data = ['a']\nmethods = ['idm']\nhorizon_s = 0", "horizon_s 0, expected a finite"),
+        ("data = ['a']\nmethods = ['idm']\nbudget_ms = inf", "budget_ms inf, expected a finite"),
         ("data = ['a']\nmethods = ['idm']\nrules = 3", "rules 3 has a wrong type"),
         ("data = ['a'", "not a TOML file"),
     ],
@@ -63,6 +65,30 @@ def test_a_missing_file_and_no_options_are_refused(tmp_path: Path) -> None:
         read_settings(tmp_path / "none.toml", {})
     with pytest.raises(AspEnvError, match="no data and no methods: give a TOML file or options"):
         read_settings(None, {})
+
+
+@pytest.mark.parametrize(
+    ("given", "message"),
+    [
+        (["--traffic"], "study: no traffic given, expected at least one; leave --traffic out"),
+        (["--ray-send-data"], "--ray-send-data: goes with --ray ADDRESS; leave it out"),
+        (["--latency-ticks", "2"], "study: no method uses forecasts"),
+        (["--methods", ""], "method '': expected PLANNER+PREDICTOR, a predictor or a planner"),
+        (["--methods", "pdn+oracle"], "unknown planner 'pdn' (did you mean 'pdm'?)"),
+    ],
+    ids=lambda value: " ".join(value) if isinstance(value, list) else None,
+)
+def test_options_that_fit_nothing_are_refused(
+    tmp_path: Path, given: list[str], message: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """In one line, before anything is driven or written."""
+    out = tmp_path / "study"
+    args = ["--data", "sample:roundabout", "--methods", "idm", "--out", str(out), *given]
+    assert main(["study", *args]) == 2
+    printed = capsys.readouterr()
+    assert message in printed.err
+    assert (printed.err.count("\n"), printed.out) == (1, "")
+    assert not out.exists()
 
 
 @pytest.mark.parametrize(

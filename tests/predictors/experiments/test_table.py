@@ -381,7 +381,13 @@ def test_failed_cells_end_with_status_1(
         (["--views", "raster"], "unknown view 'raster'"),
         (["--ablations", "skip"], "unknown ablation 'skip'"),
         (["--horizons", "0.3"], "0.3"),
-        (["--jobs", "-1"], "jobs is -1"),
+        (["--jobs", "-1"], "--jobs -1: expected 0 or more"),
+        (["--per-recording", "0"], "--per-recording 0: expected 1 or more"),
+        (["--horizons", "3", "6", "3"], "--horizons: 3.0 is given twice; give it once"),
+        (["--seeds", "-1"], "--seeds -1: expected 0 to 4294967295"),
+        (["--ablations", "none", "all"], "--ablations none all: expected none alone"),
+        (["--budget", "converged", "--patience", "0"], "patience is 0, expected 1 or more"),
+        (["--budget", "cpu", "--costs", "."], ".: cannot be read (Is a directory)"),
         (["--epochs", "0"], "epochs is 0"),
         (["--patience", "2"], "patience is 2 with the budget epochs"),
         (["--budget", "cpu", "--ablations", "long"], "unknown ablation 'long'"),
@@ -403,6 +409,18 @@ def test_bad_options_are_one_line(
     error = capsys.readouterr().err
     assert what in error
     assert error.count("\n") == 1
+    assert not out.exists()
+
+
+def test_data_that_cannot_be_divided_are_refused(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """A single recording, before any cell fails for it, with options that this command has."""
+    out = tmp_path / "table"
+    assert main(["table", "sample:intersection", "--out", str(out), *OPTIONS]) == 2
+    error = capsys.readouterr().err
+    assert "a split by recording needs three; give more recordings, or other data by" in error
+    assert "--validation and --test" in error
     assert not out.exists()
 
 

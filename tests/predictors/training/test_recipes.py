@@ -148,3 +148,11 @@ def test_horizon_that_is_no_number_of_segments_is_refused(name: str, horizon_s: 
     """1.5 and 4 s are no whole number of segments of 3 s."""
     with pytest.raises(AspEnvError, match=f"horizon of {horizon_s:g} s is no whole number"):
         recipe("ssp-asp", name, view="vectors", horizon_s=horizon_s)
+
+
+@pytest.mark.parametrize("seed", [-1, 2**32])
+def test_seeds_that_not_all_generators_take_are_refused(seed: int) -> None:
+    """NumPy refuses the first one, others the second."""
+    config = recipe("ffw-asp", "cpu", view="vectors", horizon_s=3.0)
+    with pytest.raises(AspEnvError, match=f"seed is {seed}, expected 0 to 4294967295"):
+        dataclasses.replace(config, seed=seed)

@@ -104,10 +104,10 @@ def test_same_seed_same_bytes_in_another_process(short, tmp_path):
     [
         ({"site": "highway:motorway"}, "known are highway:intersection, highway:roundabout"),
         ({"locations": 3}, "has a single location"),
-        ({"recordings": 0}, "cannot be made"),
-        ({"seed": -1}, "cannot be made"),
-        ({"minutes": "nan"}, "cannot be made"),
-        ({"minutes": 61}, "cannot be made"),
+        ({"recordings": 0}, "--recordings 0: expected 1 to 10,000"),
+        ({"seed": -1}, "--seed -1: expected at least 0"),
+        ({"minutes": "nan"}, "--minutes nan: expected more than 0, and at most 60"),
+        ({"minutes": 61}, "--minutes 61: expected more than 0, and at most 60"),
     ],
 )
 def test_invalid_options_are_refused(tmp_path, options, what, capsys):
