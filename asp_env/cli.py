@@ -121,14 +121,27 @@ def main(argv: Sequence[str] | None = None) -> int:
 
 @contextlib.contextmanager
 def _one_line_warnings(*, strict: bool) -> Iterator[None]:
-    """Prints warnings as one line each; with `strict`, recordings that are left out are errors."""
+    """Prints warnings as one line each, and equal ones once.
+
+    Commands open the same data in several environments, each of which would repeat their repairs.
+
+    Args:
+        strict: whether recordings that are left out are errors.
+    """
     before = warnings.formatwarning
+    shown: set[str] = set()
+
+    def line(message: object, *_args: object, **_options: object) -> str:
+        text = f"asp-env: warning: {' '.join(str(message).split())}\n"
+        if text in shown:
+            return ""
+        shown.add(text)
+        return text
+
     with warnings.catch_warnings():
         if strict:
             warnings.simplefilter("error", LeftOutWarning)
-        warnings.formatwarning = lambda message, *_args, **_options: (
-            f"asp-env: warning: {' '.join(str(message).split())}\n"
-        )
+        warnings.formatwarning = line
         try:
             yield
         finally:

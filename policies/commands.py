@@ -11,6 +11,7 @@ from rich.console import Console
 from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn
 from rich.table import Table
 
+from asp_env.console import table_console
 from asp_env.data.predictor import feature_size, load_predictor
 from asp_env.data.recording import DEFAULT_DT_S, ticks
 from asp_env.data.source import open_data
@@ -187,8 +188,9 @@ class RLEvaluate:
             raise AspEnvError(f"--max-scenarios {self.max_scenarios}: expected at least 1")
         open_data(self.data)
         policies = {folder: load_policy(folder) for folder in self.runs}
-        console, results = Console(), {}
+        console, results = table_console(), {}
         table = Table("run", "scenarios", *METRICS)
+        table.columns[0].overflow = "fold"
         with Progress(
             TextColumn("{task.description}"), BarColumn(), console=console, transient=True
         ) as bar:
@@ -278,7 +280,7 @@ class RLCompare:
                 "predictor, such as ssp-asp:pretrained"
             )
         open_data(self.data)
-        console = Console()
+        console = table_console()
         held_out = c.HeldOut(
             data=self.held_out, scenarios=self.scenarios, max_scenarios=self.max_scenarios
         )
@@ -297,7 +299,11 @@ class RLCompare:
         folders = {name: [cell.folder for cell in cells if cell.row == name] for name in names}
         for name, seeds in folders.items():
             by_row[name] = [c.read_values(folder) for folder in seeds]
-        compared = c.compare_rows(by_row, recording, names[0])
+        early = {
+            name: [c.early_success(folder, self.steps) for folder in seeds]
+            for name, seeds in folders.items()
+        }
+        compared = c.compare_rows(by_row, recording, names[0], early=early)
         console.print(c.rendered(compared, names[0]))
         content = {"settings": shared, "rows": c.as_json(compared)}
         write_text(self.out / "comparison.json", json.dumps(content, indent=1))

@@ -232,7 +232,11 @@ def read_values(folder: Path) -> Values:
 
 def as_json(rows: Sequence["ComparedRow"]) -> list[dict[str, Any]]:
     """The table as plain values."""
-    return [dataclasses.asdict(row) for row in rows]
+    return [
+        dataclasses.asdict(row)
+        | {"early_success": [None if np.isnan(each) else each for each in row.early_success]}
+        for row in rows
+    ]
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -245,10 +249,16 @@ class ComparedRow:
     """Means by `METRICS`, with intervals over recordings and seeds."""
     less_reference: dict[str, Difference]
     """Paired differences to the reference; empty for rows without seeds and the reference."""
+    early_success: tuple[float, ...] = ()
+    """`early_success` of each seed; empty for rows that are not trained."""
 
 
 def compare_rows(
-    rows: Mapping[str, Sequence[Values]], recording: Sequence[int] | np.ndarray, reference: str
+    rows: Mapping[str, Sequence[Values]],
+    recording: Sequence[int] | np.ndarray,
+    reference: str,
+    *,
+    early: Mapping[str, Sequence[float]],
 ) -> list[ComparedRow]:
     """The table: means, and differences to one row.
 
@@ -256,6 +266,7 @@ def compare_rows(
         rows: values of each seed, by row; all of the same scenarios.
         recording: (N,) recording of each scenario.
         reference: name of the row that differences refer to.
+        early: `early_success` of each seed, by row.
     """
     groups = np.asarray(recording)
     draws: dict[str, dict[str, np.ndarray]] = {}
@@ -276,6 +287,7 @@ def compare_rows(
                 for metric, each in values.items()
                 if name != reference and metric in draws[reference]
             },
+            early_success=tuple(early.get(name, ())),
         )
         for name, values in draws.items()
     ]
@@ -294,6 +306,23 @@ def learning_curves(
     }
 
 
+def early_success(folder: Path, steps: int) -> float:
+    """Share of training episodes that reach the goal in the first half of the training.
+
+    It is the mean of the values that the run stored, one for each update of the policy.
+
+    Args:
+        folder: the run folder.
+        steps: steps of the whole training.
+
+    Returns:
+        The share; NaN if the run stored none.
+    """
+    progress = _progress_of(folder)
+    values = progress[progress[:, 0] <= steps / 2, 1]
+    return float(values.mean()) if len(values) else float("nan")
+
+
 def _progress_of(folder: Path) -> Float[np.ndarray, "points 2"]:
     """Steps and success of a run, from all its tables of statistics."""
     lines: list[dict[str, str]] = []
@@ -301,7 +330,7 @@ def _progress_of(folder: Path) -> Float[np.ndarray, "points 2"]:
         with path.open(newline="") as file:
             lines += [line for line in csv.DictReader(file) if line.get(CURVE)]
     points = [[float(line["time/total_timesteps"]), float(line[CURVE])] for line in lines]
-    return np.array(sorted(points))
+    return np.array(sorted(points)).reshape(-1, 2)
 
 
 def _curve(seeds: Sequence[Float[np.ndarray, "_ 2"]]) -> Float[np.ndarray, "points 4"]:
@@ -350,12 +379,17 @@ def rendered(rows: Sequence[ComparedRow], reference: str) -> Table:
     for metric in METRICS:
         table.add_column(metric)
     table.add_column(f"score less {reference}")
+    table.add_column("success in the first half of training")
     for row in rows:
         means = [
             f"{row.estimates[metric]:.3f}" if metric in row.estimates else "" for metric in METRICS
         ]
         less = f"{row.less_reference['score']:+.3f}" if "score" in row.less_reference else ""
-        table.add_row(row.name, str(row.seeds), *means, less)
+        early = ""
+        if not np.isnan(row.early_success).all():
+            low, high = np.nanmin(row.early_success), np.nanmax(row.early_success)
+            early = f"{np.nanmean(row.early_success):.2f} ({low:.2f} to {high:.2f})"
+        table.add_row(row.name, str(row.seeds), *means, less, early)
     return table
 
 

@@ -1,38 +1,33 @@
 """Latency: the forecast that a predictor made some ticks ago."""
 
 import dataclasses
-from collections.abc import Mapping
 from dataclasses import dataclass
 
 import numpy as np
 
 from asp_env.data.predictor import (
     Forecast,
-    Predictor,
     continued,
-    feature_size,
     load_predictor,
     make_forecast,
-    needs_simulation,
 )
 from asp_env.data.scene import Scene
 from asp_env.data.snippets import Future
-from asp_env.data.split import TrainedOn
 from asp_env.errors import AspEnvError
+from predictors.wrapping import Wrapping
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Delayed:
+class Delayed(Wrapping):
     """The forecast that another predictor made D ticks ago, less its first D ticks.
 
-    A target that was absent then has no forecast. Modes, probabilities and training data are those
-    of the other predictor, which forecasts D ticks more. If its horizon is fixed, its modes
-    continue straight at their last speed. If it is privileged, it is given the future as of D ticks
-    ago, so that `delayed:TICKS:oracle` forecasts the same states as `oracle`.
+    A target that was absent then has no forecast. Modes, probabilities, training data and features,
+    which are those of then, are those of the other predictor, which forecasts D ticks more. If its
+    horizon is fixed, its modes continue straight at their last speed. If it is privileged, it is
+    given the future as of D ticks ago, so that `delayed:TICKS:oracle` forecasts the same states as
+    `oracle`.
     """
 
-    inner: Predictor
-    """The other predictor."""
     ticks: int
     """D."""
     horizon: int
@@ -44,39 +39,9 @@ class Delayed:
         return f"delayed:{self.ticks}:{self.inner.name}"
 
     @property
-    def dt_s(self) -> float:
-        """Seconds per tick."""
-        return self.inner.dt_s
-
-    @property
-    def privileged(self) -> bool:
-        """Whether the other predictor is."""
-        return self.inner.privileged
-
-    @property
-    def needs_simulation(self) -> bool:
-        """Whether the other predictor does."""
-        return needs_simulation(self.inner)
-
-    @property
     def history(self) -> int:
         """Past ticks that the other predictor needed, D ticks ago."""
         return self.inner.history + self.ticks
-
-    @property
-    def feature_size(self) -> int:
-        """That of the other predictor, whose features are those of then."""
-        return feature_size(self.inner)
-
-    @property
-    def trained_on(self) -> TrainedOn | None:
-        """Training data of the other predictor."""
-        return self.inner.trained_on
-
-    @property
-    def metadata(self) -> Mapping[str, str]:
-        """That of the other predictor."""
-        return self.inner.metadata
 
     @classmethod
     def from_name(cls, argument: str, *, horizon: int, dt_s: float) -> "Delayed":

@@ -15,7 +15,6 @@ smaller angle.
 """
 
 import dataclasses
-from collections.abc import Mapping
 from dataclasses import dataclass
 
 import numpy as np
@@ -28,17 +27,15 @@ from asp_env.data.predictor import (
     GuardablePlug,
     Predictor,
     constant_velocity,
-    feature_size,
-    needs_simulation,
 )
 from asp_env.data.scene import Scene
 from asp_env.data.snippets import Future
-from asp_env.data.split import TrainedOn
 from asp_env.dynamics import rollout
 from asp_env.dynamics.bicycle import Integrator
 from asp_env.errors import AspEnvError
 from asp_env.geometry import wrap_angle
 from predictors.inference.feature_distance import FeatureDistance
+from predictors.wrapping import Wrapping
 
 FULL_AT = 1.5
 """Score from which a forecast is constant velocity alone. Chosen by hand: a smaller one makes
@@ -47,7 +44,7 @@ all validation data."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Guarded:
+class Guarded(Wrapping):
     """The forecast of a trained predictor, blended to constant velocity far from its training."""
 
     inner: FeaturePredictor
@@ -66,41 +63,6 @@ class Guarded:
     def horizon(self) -> int:
         """Ticks that the trained predictor forecasts."""
         return self.inner.horizon
-
-    @property
-    def dt_s(self) -> float:
-        """Seconds per tick."""
-        return self.inner.dt_s
-
-    @property
-    def privileged(self) -> bool:
-        """Whether the trained predictor is."""
-        return self.inner.privileged
-
-    @property
-    def feature_size(self) -> int:
-        """Number of features in the trained predictor's forecasts."""
-        return feature_size(self.inner)
-
-    @property
-    def needs_simulation(self) -> bool:
-        """Whether the trained predictor does."""
-        return needs_simulation(self.inner)
-
-    @property
-    def history(self) -> int:
-        """Past ticks that the trained predictor needs."""
-        return self.inner.history
-
-    @property
-    def trained_on(self) -> TrainedOn | None:
-        """Training data of the trained predictor."""
-        return self.inner.trained_on
-
-    @property
-    def metadata(self) -> Mapping[str, str]:
-        """That of the trained predictor."""
-        return self.inner.metadata
 
     @classmethod
     def from_name(cls, argument: str, *, horizon: int, dt_s: float) -> Predictor:

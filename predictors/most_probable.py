@@ -1,33 +1,23 @@
 """The most probable mode of another predictor alone, to show what its other modes are worth."""
 
 import dataclasses
-from collections.abc import Mapping
 from dataclasses import dataclass
 
 import numpy as np
 
-from asp_env.data.predictor import (
-    Forecast,
-    Predictor,
-    feature_size,
-    load_predictor,
-    needs_simulation,
-)
+from asp_env.data.predictor import Forecast, load_predictor
 from asp_env.data.scene import Scene
 from asp_env.data.snippets import Future
-from asp_env.data.split import TrainedOn
 from asp_env.errors import AspEnvError
+from predictors.wrapping import Wrapping
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class MostProbable:
+class MostProbable(Wrapping):
     """The most probable mode of another predictor's forecast, with a probability of 1.
 
     Of equally probable modes it is the first. All else is the other predictor's.
     """
-
-    inner: Predictor
-    """The other predictor."""
 
     @property
     def name(self) -> str:
@@ -38,41 +28,6 @@ class MostProbable:
     def horizon(self) -> int:
         """Ticks that the other predictor forecasts."""
         return self.inner.horizon
-
-    @property
-    def dt_s(self) -> float:
-        """Seconds per tick."""
-        return self.inner.dt_s
-
-    @property
-    def privileged(self) -> bool:
-        """Whether the other predictor is."""
-        return self.inner.privileged
-
-    @property
-    def needs_simulation(self) -> bool:
-        """Whether the other predictor does."""
-        return needs_simulation(self.inner)
-
-    @property
-    def history(self) -> int:
-        """Past ticks that the other predictor needs."""
-        return self.inner.history
-
-    @property
-    def trained_on(self) -> TrainedOn | None:
-        """Training data of the other predictor."""
-        return self.inner.trained_on
-
-    @property
-    def feature_size(self) -> int:
-        """That of the other predictor."""
-        return feature_size(self.inner)
-
-    @property
-    def metadata(self) -> Mapping[str, str]:
-        """That of the other predictor."""
-        return self.inner.metadata
 
     @classmethod
     def from_name(cls, argument: str, *, horizon: int, dt_s: float) -> "MostProbable":

@@ -14,7 +14,7 @@ ROOT = Path(__file__).parents[1]
 PACKAGES = ("asp_env", "predictors", "scenarios", "policies")
 
 ON_ALL = {
-    *("arguments", "errors", "registry", "geometry"),
+    *("arguments", "errors", "registry", "geometry", "console"),
     *("files", "stored", "workers", "compiled"),
 }
 FOR_PREDICTORS = {"views", "metrics", "data", "dynamics"} | ON_ALL
@@ -22,6 +22,7 @@ ARROWS = {
     "__init__": {"envs", "planning", "data", "dynamics", "errors"},
     "arguments": {"errors"},
     "errors": set[str](),
+    "console": set[str](),
     "registry": {"errors"},
     "geometry": {"errors", "compiled"},
     "files": {"errors"},

@@ -295,3 +295,18 @@ def test_deprecated_options_warn_and_work(
     lines = capsys.readouterr().err.splitlines()
     assert lines[:2] == [f"asp-env: {old} is deprecated; use {new}"] * 2
     assert "Unrecognized" not in lines[-1]
+
+
+def test_equal_warnings_are_printed_once() -> None:
+    """In one line each; a process of its own, since pytest records warnings."""
+    code = (
+        "import warnings\n"
+        "from asp_env.cli import _one_line_warnings\n"
+        "with _one_line_warnings(strict=False):\n"
+        "    for text in ('a\\nb', 'c', 'a\\nb'):\n"
+        "        with warnings.catch_warnings():\n"
+        "            warnings.simplefilter('always')\n"
+        "            warnings.warn(text)\n"
+    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert done.stderr == "asp-env: warning: a b\nasp-env: warning: c\n"

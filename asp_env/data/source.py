@@ -13,7 +13,8 @@ from typing import Any, SupportsIndex, overload
 
 from asp_env import registry
 from asp_env.arguments import shown
-from asp_env.data.readers.layout import ARCHIVE, archive_hint, shorten
+from asp_env.data.readers.compressed import CSV
+from asp_env.data.readers.layout import ARCHIVE, archive_hint, shorten, walk
 from asp_env.data.readers.levelx import LevelxFiles
 from asp_env.data.readers.opening import ReaderState, RecordingFiles, content_hash, open_recording
 from asp_env.data.recording import DEFAULT_DT_S, Recording, check_duration
@@ -190,14 +191,17 @@ def open_data(data: str | Path, *, dt_s: float = DEFAULT_DT_S) -> Recordings:
         what = "is a file" if folder.exists() else "does not exist"
         if folder.exists() and ARCHIVE.search(folder.name):
             what = "is an archive, unpack it first"
-        raise DataError(f"data {source!r}: {folder} {what}; expected a folder with recordings")
+        hint = f": give the folder that it is in, {folder.parent}" if what == "is a file" else ""
+        raise DataError(
+            f"data {source!r}: {folder} {what}; expected a folder with recordings{hint}"
+        )
     files = _find(folder)
     if not files:
         raise DataError(
             f"data {source!r}: no recordings found; expected XX_recordingMeta.csv, "
             "XX_tracksMeta.csv and XX_tracks.csv, or LOCATION/vehicle_tracks_NNN.csv, or the "
             f"files of another reader ({', '.join(registry.names('readers'))}), in the folder or "
-            f"below{archive_hint(folder)}"
+            f"below{_tables_hint(folder)}{archive_hint(folder)}"
         )
     counts = Counter(each.name for each in files)
     if duplicate := next((name for name, count in counts.items() if count > 1), None):
@@ -206,6 +210,19 @@ def open_data(data: str | Path, *, dt_s: float = DEFAULT_DT_S) -> Recordings:
             "put each layout in a folder of its own"
         )
     return Recordings(source, files, dt_s=dt_s)
+
+
+def _tables_hint(folder: Path) -> str:
+    """The end of an error message that names tables and maps which no reader uses; may be empty."""
+    names = [
+        name
+        for _, names in walk(folder)
+        for name in names
+        if re.search(rf"(?:{CSV}|\.osm)$", name, re.IGNORECASE)
+    ]
+    if not names:
+        return ""
+    return f"; {shorten(names, 3)} are there, with other names or columns, or without the others"
 
 
 def open_readable(

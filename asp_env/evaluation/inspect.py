@@ -12,6 +12,7 @@ from rich.console import Console
 from rich.progress import track
 from rich.table import Table
 
+from asp_env.console import table_console
 from asp_env.data.classes import AgentClass
 from asp_env.data.recording import DEFAULT_DT_S, Recording, frames_per_tick, ticks
 from asp_env.data.road_map import RoadMap
@@ -29,8 +30,6 @@ HORIZONS_S = (3.0, 6.0)
 """Horizons of the counted snippets and of the drift."""
 PERCENTILES = (50, 90, 99)
 """Percentiles of the drift."""
-PIPED_WIDTH = 160
-"""Width of the tables in characters where the output is no terminal."""
 CHUNK = 10_000
 """Number of snippets that are rolled out at once, which bounds the memory."""
 
@@ -126,9 +125,7 @@ class Inspect:
                 shorter than a frame.
         """
         recordings = open_data(self.data, dt_s=self.dt)
-        console = Console()
-        if not console.is_terminal:
-            console = Console(width=PIPED_WIDTH)
+        console = table_console()
         summaries, faults = self._examine(recordings, console)
         if summaries:
             maps = {id(each.recording.road_map): each.recording.road_map for each in summaries}

@@ -4,14 +4,11 @@ from dataclasses import dataclass
 from typing import Annotated
 
 import tyro
-from rich.console import Console
 from rich.table import Table
 
+from asp_env.console import table_console
 from asp_env.errors import unknown_name
 from asp_env.installation.catalogue import DATASETS, PublicDataset
-
-PIPED_WIDTH = 160
-"""Width of the table in characters where the output is no terminal."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -27,9 +24,7 @@ class Datasets:
         Raises:
             AspEnvError: the name is unknown.
         """
-        console = Console()
-        if not console.is_terminal:
-            console = Console(width=PIPED_WIDTH)
+        console = table_console()
         if self.name is None:
             console.print(_table())
             console.print(

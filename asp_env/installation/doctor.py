@@ -11,6 +11,7 @@ from rich.console import Console
 from rich.markup import escape
 from rich.table import Table
 
+from asp_env.console import table_console
 from asp_env.installation.caches import CacheState, CompiledState, cache_state, compiled_state
 from asp_env.installation.found_data import FolderFindings, examine
 from asp_env.installation.packages import (
@@ -26,9 +27,6 @@ from asp_env.installation.version import version_line
 
 WITH_PROBLEMS = 1
 """Exit status with problems."""
-
-PIPED_WIDTH = 160
-"""Width of the tables in characters where the output is no terminal."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -73,9 +71,7 @@ class Doctor:
         Raises:
             AspEnvError: a folder does not exist.
         """
-        console = Console()
-        if not console.is_terminal:
-            console = Console(width=PIPED_WIDTH)
+        console = table_console()
         diagnosis = diagnose(self.folders, console)
         if self.json:
             content = json.dumps(asdict(diagnosis), indent=2, default=str)

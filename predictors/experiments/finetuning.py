@@ -34,10 +34,10 @@ from typing import Annotated, Literal
 import numpy as np
 import tyro
 from jaxtyping import Float, Int
-from rich.console import Console
 from rich.table import Table
 
 from asp_env import registry
+from asp_env.console import table_console
 from asp_env.data.predictor import Predictor, load_predictor
 from asp_env.data.snippets import SnippetIndex
 from asp_env.data.source import Recordings, join_data, open_readable
@@ -123,7 +123,7 @@ class Finetuning:
             data_hash=study.recordings.data_hash(),
             snippets=len(study.index),
         )
-        Console().print(table_of(rows))
+        table_console().print(table_of(rows))
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

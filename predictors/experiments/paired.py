@@ -16,9 +16,9 @@ from typing import Annotated
 import numpy as np
 import tyro
 from jaxtyping import Float
-from rich.console import Console
 from rich.table import Table
 
+from asp_env.console import table_console
 from asp_env.data.predictor import load_predictor
 from asp_env.data.recording import DEFAULT_DT_S, ticks
 from asp_env.data.source import open_readable
@@ -60,7 +60,7 @@ class Paired:
         Raises:
             AspEnvError: The data or a predictor are bad.
         """
-        Console().print(table(self.compare()))
+        table_console().print(table(self.compare()))
 
     def compare(self) -> list["Row"]:
         """The rows of the table, in the order of the methods.

@@ -139,7 +139,8 @@ def cost_key(config: TrainingConfig) -> str:
     """The name of a configuration in a file of costs.
 
     It has the recipe with the variant, the view and the horizon, the length of the segments and of
-    the history where they are not the default, and whether parked vehicles are targets, too.
+    the history and the precision where they are not the default, whether parked vehicles are
+    targets, too, and the limit of the number of snippets.
     """
     parts = [f"{config.predictor}:{config.preset}", config.view, f"{config.horizon_s:g}s"]
     if config.segment_s not in (None, SEGMENT_S):
@@ -148,6 +149,10 @@ def cost_key(config: TrainingConfig) -> str:
         parts.append(f"history-{config.history_s:g}s")
     if config.parked:
         parts.append("parked")
+    if config.precision != "32-true":
+        parts.append(config.precision)
+    if config.max_snippets is not None:
+        parts.append(f"{config.max_snippets}-snippets")
     return "/".join(parts)
 
 

@@ -10,10 +10,13 @@ import subprocess
 import sys
 import tempfile
 from collections import Counter
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
+
+from rich.console import Console
+from rich.progress import Progress
 
 from tests.campaigns.campaign import Verdict, run_mutants
 from tests.campaigns.formats import FORMATS
@@ -52,8 +55,16 @@ def main() -> int:
     options = Options.parse()
     if options.inside:
         return run_inside(options)
-    with ThreadPoolExecutor(options.jobs) as pool:
-        found = list(pool.map(lambda name: run_outside(name, options), options.formats))
+    console = Console(stderr=True)
+    with Progress(console=console, disable=not console.is_terminal) as bar:
+        task = bar.add_task("mutants", total=len(options.formats) * options.mutants)
+        with ThreadPoolExecutor(options.jobs) as pool:
+            found = list(
+                pool.map(
+                    lambda name: run_outside(name, options, lambda: bar.advance(task)),
+                    options.formats,
+                )
+            )
     by_format = dict(zip(options.formats, found, strict=True))
     sys.stdout.writelines(f"{line}\n" for line in report(by_format))
     return int(any(verdict.is_fault for verdicts in found for verdict in verdicts))
@@ -70,8 +81,14 @@ def run_inside(options: Options) -> int:
     return 0
 
 
-def run_outside(name: str, options: Options) -> list[Verdict]:
-    """The verdicts of a format, from a process that is started anew when a mutant ends it."""
+def run_outside(name: str, options: Options, ended: Callable[[], None]) -> list[Verdict]:
+    """The verdicts of a format, from a process that is started anew when a mutant ends it.
+
+    Args:
+        name: the format.
+        options: the command line.
+        ended: called after each mutant.
+    """
     verdicts: list[Verdict] = []
     first, end = options.first, options.first + options.mutants
     while first < end:
@@ -79,22 +96,29 @@ def run_outside(name: str, options: Options) -> list[Verdict]:
             f"-m tests.campaigns --inside --formats {name} --first {first} "
             f"--mutants {end - first} --seed {options.seed}"
         )
-        with tempfile.TemporaryDirectory() as cache:
-            done = subprocess.run(
+        count = len(verdicts)
+        with tempfile.TemporaryDirectory() as cache, tempfile.TemporaryFile("w+") as errors:
+            with subprocess.Popen(
                 [sys.executable, *command.split()],
                 env={**os.environ, "ASP_ENV_CACHE": cache, "OMP_NUM_THREADS": "1"},
-                capture_output=True,
+                stdout=subprocess.PIPE,
+                stderr=errors,
                 text=True,
-                check=False,
-            )
-        lines = [line for line in done.stdout.splitlines() if line.startswith("[")]
-        verdicts += [Verdict(*json.loads(line)) for line in lines]
-        first += len(lines)
+            ) as process:
+                assert process.stdout is not None
+                for line in process.stdout:
+                    if line.startswith("["):
+                        verdicts.append(Verdict(*json.loads(line)))
+                        ended()
+            errors.seek(0)
+            last = errors.read().strip().rpartition("\n")[2]
+        finished = len(verdicts) - count
+        first += finished
         if first < end:
-            last = done.stderr.strip().rpartition("\n")[2]
-            verdicts.append(Verdict(first, "", f"process ended by {done.returncode}", last))
+            verdicts.append(Verdict(first, "", f"process ended by {process.returncode}", last))
+            ended()
             first += 1
-            if not lines and len(verdicts) > 1 and verdicts[-2].outcome == verdicts[-1].outcome:
+            if not finished and len(verdicts) > 1 and verdicts[-2].outcome == verdicts[-1].outcome:
                 break  # not one mutant, but every process
     return verdicts
 

@@ -80,6 +80,7 @@ def test_a_vehicle_that_backs_up(tmp_path: Path):
     rows = np.genfromtxt(path, delimiter=",", names=True, dtype=None, encoding="utf-8")
     rows["xVelocity"], rows["yVelocity"], rows["heading"] = -2.0, 0.0, 0.0
     rows["xAcceleration"], rows["yAcceleration"] = 1.0, 0.0
+    rows["xCenter"], rows["yCenter"] = 60.0 - 2.0 * rows["frame"] / 25.0, -21.75
     lines = [",".join(rows.dtype.names or ()), *(",".join(map(str, row)) for row in rows.tolist())]
     path.write_text("\n".join(lines) + "\n")
     recording = open_data(tmp_path)[0]

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from asp_env.cli import main
-from policies.comparison import compare_rows, default_rows, learning_curves
+from policies.comparison import compare_rows, default_rows, early_success, learning_curves
 
 METRIC = "success"
 
@@ -15,16 +15,17 @@ METRIC = "success"
 def test_means_and_differences_by_hand() -> None:
     reference = [{METRIC: np.array([0.0, 1.0, 0.0, 1.0])}, {METRIC: np.array([0.0, 0.0, 0.0, 0.0])}]
     better = [{METRIC: np.ones(4)}, {METRIC: np.ones(4)}]
-    rows = compare_rows({"a": reference, "b": better}, [0, 0, 1, 1], "a")
+    rows = compare_rows({"a": reference, "b": better}, [0, 0, 1, 1], "a", early={"b": [0.5]})
     assert rows[0].estimates[METRIC].value == 0.25
     assert not rows[0].less_reference
     assert rows[1].estimates[METRIC].value == 1.0
+    assert (rows[0].early_success, rows[1].early_success) == ((), (0.5,))
     assert rows[1].less_reference[METRIC].estimate.value == 0.75
 
 
 def test_equal_rows_differ_by_nothing() -> None:
     values = {METRIC: np.array([0.0, 1.0, 1.0])}
-    rows = compare_rows({"a": [values], "b": [values]}, [0, 1, 2], "a")
+    rows = compare_rows({"a": [values], "b": [values]}, [0, 1, 2], "a", early={})
     less = rows[1].less_reference[METRIC]
     assert (less.estimate.value, less.estimate.low, less.estimate.high) == (0.0, 0.0, 0.0)
 
@@ -41,6 +42,14 @@ def test_learning_curves_by_hand(tmp_path: Path) -> None:
     assert curve.shape == (20, 4)
     np.testing.assert_allclose(curve[:, 0], np.arange(100, 2100, 100))
     np.testing.assert_allclose(curve[:, 1:], [[0.3, 0.2, 0.4]] * 20)
+
+
+def test_early_success_by_hand(tmp_path: Path) -> None:
+    """Values at 100, 200 and 300 of 400 steps: the first two count."""
+    lines = ["time/total_timesteps,episodes/success", "100,0.1", "200,0.3", "300,0.9"]
+    (tmp_path / "progress.csv").write_text("\n".join(lines))
+    assert early_success(tmp_path, steps=400) == pytest.approx(0.2)
+    assert np.isnan(early_success(tmp_path, steps=100))
 
 
 def test_privileged_rows_are_marked() -> None:

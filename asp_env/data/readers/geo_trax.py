@@ -14,6 +14,7 @@ import pandas as pd
 
 from asp_env.data.readers.compressed import CSV
 from asp_env.data.readers.found import FoundRecording, RecordingTables
+from asp_env.data.readers.interaction import KMH_PER_MPS
 from asp_env.data.readers.layout import ClassNames, walk
 from asp_env.data.readers.measurements import Measurements
 from asp_env.data.readers.ranges import POSITION, SIZE, Limit
@@ -33,6 +34,7 @@ _COLUMNS: Mapping[str, Kind] = {
     "Vehicle_Length": "number or empty",
     "Vehicle_Width": "number or empty",
 }
+_SPEED: Mapping[str, Kind] = {"Vehicle_Speed": "number or empty"}
 _LIMITS: Mapping[str, Limit] = {
     "Local_X": POSITION,
     "Local_Y": POSITION,
@@ -61,7 +63,8 @@ def read_geo_trax(paths: tuple[Path, ...]) -> RecordingTables:
         DataError: the table is damaged.
     """
     (path,) = paths
-    table = read_table(path, _COLUMNS, limits=_LIMITS)
+    columns: Mapping[str, Kind] = {**_COLUMNS, **_SPEED}
+    table = read_table(path, columns, optional=frozenset(_SPEED), limits=_LIMITS)
     numbered = number_ids(table["Vehicle_ID"])
     track = numbered.columns[0]
     times = pd.to_datetime(pd.Series(table["Timestamp"]), format="ISO8601", errors="coerce")
@@ -73,10 +76,14 @@ def read_geo_trax(paths: tuple[Path, ...]) -> RecordingTables:
             "2022-10-07 17:52:13.500"
         )
     names = ClassNames()
-    classes = [CLASSES.get(str(name).strip(), name) for name in table["Vehicle_Class"]]
+    classes = [
+        CLASSES.get(re.sub(r"\.0*$", "", str(name).strip()), name)
+        for name in table["Vehicle_Class"]
+    ]
     positions = np.stack([table["Local_X"], table["Local_Y"]], axis=-1)
     origin = np.floor(positions.min(axis=0) / _ROUND_M) * _ROUND_M
     sizes = np.stack([table["Vehicle_Length"], table["Vehicle_Width"]], axis=-1)
+    speed = table.get("Vehicle_Speed")
     first = times.min()
     named = _LOCATION.match(path.name)
     return RecordingTables(
@@ -87,6 +94,7 @@ def read_geo_trax(paths: tuple[Path, ...]) -> RecordingTables:
             positions=positions - origin,
             heading=np.full(len(track), np.nan),
             sizes=np.nan_to_num(sizes, nan=0.0),
+            speed=speed if speed is None else speed / KMH_PER_MPS,
         ),
         location=named[1] if named else path.parent.name,
         start_hour=first.hour + first.minute / 60 + first.second / 3600,

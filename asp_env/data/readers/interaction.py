@@ -7,7 +7,8 @@ INTERACTION has `recorded_trackfiles/LOCATION/` and `maps/` in one folder, TAF-B
 `meta_data.csv` in the tracks' folder.
 
 Only positions and times are used as they are. Published velocities may be scaled or have the wrong
-sign and headings may be folded into ±90°, so both are derived from the positions. Frame ids are not
+sign and headings may be folded into ±90°, so both are derived from the positions; velocities of
+another size than the motion of the positions are reported. Frame ids are not
 read: they may count frames that were left out.
 """
 
@@ -56,11 +57,13 @@ TRACKS: Mapping[str, Kind] = {
     "agent_type": "text",
     "x": "number",
     "y": "number",
+    "vx": "number or empty",
+    "vy": "number or empty",
     "psi_rad": "number or empty",
     "length": "number or empty",
     "width": "number or empty",
 }
-OPTIONAL_TRACKS = frozenset({"psi_rad", "length", "width"})
+OPTIONAL_TRACKS = frozenset({"vx", "vy", "psi_rad", "length", "width"})
 LIMITS: Mapping[str, Limit] = {
     "timestamp_ms": TIME_MS,
     "x": POSITION,
@@ -328,6 +331,7 @@ def measurements_of(columns: Mapping[str, np.ndarray]) -> Measurements:
         positions=np.stack([columns["x"], columns["y"]], axis=-1),
         heading=columns["psi_rad"],
         sizes=np.nan_to_num(sizes, nan=0.0),
+        speed=np.hypot(columns["vx"], columns["vy"]),
     )
 
 

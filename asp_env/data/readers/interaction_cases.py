@@ -96,7 +96,7 @@ def find_recordings(root: Path) -> tuple[CaseFiles, ...]:
                 cases = [None]
             found += [
                 CaseFiles(
-                    name=prefix if case is None else f"{prefix}/{case:g}",
+                    name=prefix if case is None else f"{prefix}/{_shown(case)}",
                     root=root,
                     location=match[1],
                     case=case,
@@ -142,6 +142,11 @@ def _columns_of(arrays: Mapping[str, np.ndarray], first: int, end: int) -> dict[
     return {name: arrays[name][first:end] for name in _COLUMNS}
 
 
+def _shown(case: float) -> str:
+    """A case's id in the name of its recording: all digits, so that names differ as ids do."""
+    return str(int(case)) if case == int(case) else repr(float(case))
+
+
 def _list_cases(path: Path) -> CacheEntry:
     return {}, {"case_ids": np.unique(read_table(path, {"case_id": "number"})["case_id"])}
 
@@ -167,11 +172,11 @@ def _read_cases(path: Path) -> CacheEntry:
             cells = {"case_id": case, "track_id": ids.texts[track]}
             line = find_line(path, {**cells, "timestamp_ms": time_ms}, occurrence=occurrence)
             text = what.format(track=brief(cells["track_id"]), time=f"{time_ms:g}")
-            return f"{path}, line {line}: case {case:g}: {text}"
+            return f"{path}, line {line}: case {_shown(case)}: {text}"
 
         rows = measurements.select(np.arange(begin, end))
         try:
-            table, rate_hz = derive_tracks(rows, f"{path}, case {case:g}", located)
+            table, rate_hz = derive_tracks(rows, f"{path}, case {_shown(case)}", located)
         except DataError as error:
             cases.append({"fault": str(error)})
         else:

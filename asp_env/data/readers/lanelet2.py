@@ -406,6 +406,8 @@ class _SpeedRules:
         self._unused: set[str] = set()
         self._unknown: list[str] = []
         self._dynamic: list[str] = []
+        self._present = {relation.id for relation in osm.relations}
+        self._missing: set[str] = set()
         tags_of = {way.id: way.tags for way in osm.ways.values()}
         for relation in osm.relations:
             kind = relation.tags.get("type"), relation.tags.get("subtype", "").lower()
@@ -436,6 +438,7 @@ class _SpeedRules:
     def limit_mps(self, lanelet: Relation) -> float | None:
         """The limit of the first element of a lanelet that is no fallback, else of the first."""
         named = [rule for role, rule in lanelet.relations if role == "regulatory_element"]
+        self._missing.update(rule for rule in named if rule not in self._present)
         rules = [
             rule for rule in (*named, *self._of_lanelet.get(lanelet.id, ())) if rule in self._rules
         ]
@@ -444,7 +447,12 @@ class _SpeedRules:
         return self._rules[first[0]] if first else None
 
     def report(self, repairs: list[str]) -> None:
-        """Adds the elements that are not used."""
+        """Adds the elements that are not used, or that lanelets refer to and the file lacks."""
+        if self._missing:
+            repairs.append(
+                f"{len(self._missing)} regulatory elements that lanelets refer to are not in the "
+                f"file: {shorten(sorted(self._missing))}"
+            )
         for ids, why in (
             (self._unknown, "have no known speed"),
             (self._dynamic, "are dynamic"),

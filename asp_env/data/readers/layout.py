@@ -45,7 +45,10 @@ class TrackTable:
     """Frames per second of the files where the rows are interpolated; None where they are not."""
 
 
-ARCHIVE = re.compile(r"\.(zip|7z|rar|tar|tgz|tbz2|txz|tar\.(gz|bz2|xz|zst))$", re.IGNORECASE)
+ARCHIVE = re.compile(
+    r"(\.(zip|7z|rar|tar|tgz|tbz2|txz|zst|bz2|lz4|tar\.(gz|xz)|osm\.(gz|xz))|meta\.csv\.(gz|xz))$",
+    re.IGNORECASE,
+)
 """The end of the name of an archive, which has to be unpacked before it can be read."""
 
 

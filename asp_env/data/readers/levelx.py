@@ -16,7 +16,7 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
-from asp_env.data.classes import FOOTPRINTS_M, VULNERABLE
+from asp_env.data.classes import VULNERABLE
 from asp_env.data.readers.compressed import CSV
 from asp_env.data.readers.layout import (
     COURSE_ABOVE_MPS,
@@ -31,6 +31,7 @@ from asp_env.data.readers.layout import (
     walk,
     with_parents,
 )
+from asp_env.data.readers.motion_checks import check_headings, check_velocities, motion_of
 from asp_env.data.readers.osm import read_osm
 from asp_env.data.readers.positions import Origin, locate_nodes
 from asp_env.data.readers.ranges import (
@@ -44,6 +45,7 @@ from asp_env.data.readers.ranges import (
     check_duration,
     check_extent,
 )
+from asp_env.data.readers.sizes import with_footprints
 from asp_env.data.readers.tables import (
     HIGHEST_HZ,
     LOWEST_HZ,
@@ -70,6 +72,9 @@ DOWNSCALE = {"ind": 12, "round": 10, "exid": 6, "unid": 2}
 SCALES = (1, 2, 6, 10, 12)
 """Factors to try for a dataset that is not in `DOWNSCALE`."""
 
+HIGHEST_LIMIT_MPS = 45.0
+"""No speed limit is higher: 162 km/h. Larger numbers are km/h. Chosen by hand."""
+
 MARGIN_PX = 5.0
 """Distance by which positions may lie outside the image, for rounded scales and smoothed positions.
 Chosen by hand."""
@@ -83,8 +88,8 @@ _META: Mapping[str, Kind] = {
     "trackId": "id",
     "initialFrame": "whole",
     "finalFrame": "whole",
-    "width": "number",
-    "length": "number",
+    "width": "number or empty",
+    "length": "number or empty",
     "class": "text",
 }
 _TRACKS: Mapping[str, Kind] = {
@@ -95,9 +100,10 @@ _TRACKS: Mapping[str, Kind] = {
     "heading": "number",
     "xVelocity": "number",
     "yVelocity": "number",
-    "width": "number",
-    "length": "number",
+    "width": "number or empty",
+    "length": "number or empty",
 }
+_VULNERABLE = [int(kind) for kind in VULNERABLE]
 _ACCELERATIONS = ("xAcceleration", "yAcceleration", "lonAcceleration")
 _MEASURED = ("xCenter", "yCenter", "heading", "xVelocity", "yVelocity")
 _LIMITS: Mapping[str, Limit] = {
@@ -222,7 +228,9 @@ def read_recording_meta(path: Path) -> RecordingMeta:
             **dict.fromkeys(needed[:2], "whole"),
             **dict.fromkeys(needed[2:], "number"),
             **dict.fromkeys(("latLocation", "lonLocation"), "number"),
+            "speedLimit": "number or empty",
         },
+        optional=frozenset({"speedLimit"}),
         limits=_LIMITS,
     )
     if len(table["frameRate"]) > 1:
@@ -239,7 +247,7 @@ def read_recording_meta(path: Path) -> RecordingMeta:
         number=int(table["recordingId"][0]),
         location=int(table["locationId"][0]),
         frame_rate_hz=rate,
-        speed_limit_mps=_speed_limit(path),
+        speed_limit_mps=_speed_limit(path, table.get("speedLimit")),
         metres_per_ortho_pixel=_positive_or_none(path, "orthoPxToMeter"),
         origin=Origin(
             x_m=float(table["xUtmOrigin"][0]),
@@ -254,7 +262,7 @@ def read_recording_meta(path: Path) -> RecordingMeta:
 
 def find_map(
     files: LevelxFiles, meta: RecordingMeta, maps_by_folder: dict[Path, list[Path]]
-) -> Path:
+) -> tuple[Path, tuple[str, ...]]:
     """The lanelet2 map of a recording: the nearest matching one in a parent folder.
 
     A map matches a location if its name ends in the location's id (`location1.osm`), or its
@@ -267,6 +275,9 @@ def find_map(
         meta: its metadata.
         maps_by_folder: map files in and below the folders searched so far. Results are added.
 
+    Returns:
+        The map, and a line for a report where several match or none is named after the location.
+
     Raises:
         DataError: no map matches.
     """
@@ -278,7 +289,7 @@ def find_map(
         preferred = [path for path in fitting if _is_construction(path) == under_construction]
         chosen = preferred or fitting or _maps_near(maps, meta.origin)
         if chosen:
-            return chosen[0]
+            return chosen[0], _guess(chosen, folder, meta.location, named=bool(fitting))
     raise DataError(
         f"{files.root}: no map for location {meta.location} of recording {files.name}; "
         f"expected a lanelet2 file location{meta.location}.osm in it or below"
@@ -366,12 +377,13 @@ def read_levelx(files: LevelxFiles) -> TrackTable:
     rows, step = _count_frames(files, rows, meta, numbered, repairs)
     begins = np.flatnonzero(np.diff(rows.track, prepend=rows.track[0] - 1))
     _compare_frames(rows, begins, meta, order, repairs)
-    sizes = _sizes(rows.sizes[begins], meta, order, classes)
+    sizes = _sizes(files, rows.sizes[begins], meta, order, classes, repairs)
+    _check_motion(files, rows, step, is_vulnerable=np.isin(classes, _VULNERABLE), repairs=repairs)
 
     starts, new_ids = _split_at_gaps(rows, begins, ids, repairs)
     lengths = np.diff(starts, append=len(rows.track))
     owner = np.searchsorted(ids, rows.track[starts])
-    vulnerable = np.isin(classes[owner], [int(kind) for kind in VULNERABLE])
+    vulnerable = np.isin(classes[owner], _VULNERABLE)
     states = states_of(rows.measured, np.repeat(starts, lengths), np.repeat(vulnerable, lengths))
     accelerations = _along_motion(rows, states)
     by_id = np.argsort(new_ids, kind="stable")
@@ -419,6 +431,16 @@ def _names_location(path: Path, location: int) -> bool:
     return bool(folder) and int(folder[1]) == location
 
 
+def _guess(maps: list[Path], folder: Path, location: int, *, named: bool) -> tuple[str, ...]:
+    """A line about the choice of the first of some maps, unless nothing was to be chosen."""
+    first, *others = [path.relative_to(folder).as_posix() for path in maps]
+    if named and not others:
+        return ()
+    why = "the first one" if named else f"the nearest one, since no name has location {location}"
+    more = f", not {shorten(others)}" if others else ""
+    return (f"map {first} is used, {why}{more}",)
+
+
 def _is_construction(path: Path) -> bool:
     return "const" in f"{path.parent.name}/{path.stem}".lower()
 
@@ -448,14 +470,19 @@ def _positive_or_none(path: Path, column: str) -> float | None:
     return value if value > 0 else None
 
 
-def _speed_limit(path: Path) -> float | None:
-    limit = _positive_or_none(path, "speedLimit")
-    if limit is not None and limit > SPEED.largest:
+def _speed_limit(path: Path, cells: np.ndarray | None) -> float | None:
+    """The cell of the optional column `speedLimit`, m/s.
+
+    Raises:
+        DataError: no limit is that high.
+    """
+    limit = math.nan if cells is None else float(cells[0])
+    if limit > HIGHEST_LIMIT_MPS:
         raise DataError(
-            f"{path}, line 2: speedLimit is {limit:g}, expected at most {SPEED.largest:g} m/s, or "
-            "-1 for none: correct the cell"
+            f"{path}, line 2: speedLimit is {limit:g}, expected at most {HIGHEST_LIMIT_MPS:g} m/s, "
+            "or -1 for none: convert the cell to m/s"
         )
-    return limit
+    return limit if limit > 0 else None
 
 
 def _text_or_none(path: Path, column: str) -> str | None:
@@ -583,7 +610,7 @@ def _count_frames(
         elif not ((rows.frame - first) % usual).any() and rate_hz / usual >= LOWEST_HZ:
             step = usual
             frames = {name: column // step for name, column in frames.items()}
-            repairs.append(f"rows have every {step}th frame of {rate_hz:g} Hz: these are counted")
+            repairs.append(f"rows have one of {step} frames at {rate_hz:g} Hz: these are counted")
     meta |= {name: frames[name] for name in names}
     same = (np.diff(rows.track) == 0) & (np.diff(frames["frame"]) == 0)
     if same.any():
@@ -639,15 +666,49 @@ def _compare_frames(
 
 
 def _sizes(
+    files: LevelxFiles,
     in_rows: Float[np.ndarray, "metas 2"],
     meta: Mapping[str, np.ndarray],
     order: Int[np.ndarray, " metas"],
     classes: Int[np.ndarray, " metas"],
+    repairs: list[str],
 ) -> Float[np.ndarray, "metas 2"]:
-    """The sizes in the rows, where these are zero those in the metadata, else the class's."""
+    """The sizes in the rows, where these are unknown those in the metadata, else the class's."""
     in_meta = np.stack([meta["length"], meta["width"]], axis=-1)[order].astype(np.float32)
     sizes = np.where((in_rows > 0).all(axis=-1, keepdims=True), in_rows, in_meta)
-    return np.where((sizes > 0).all(axis=-1, keepdims=True), sizes, FOOTPRINTS_M[classes])
+    return with_footprints(sizes, classes, str(files.tracks), repairs)
+
+
+def _check_motion(
+    files: LevelxFiles,
+    rows: _Rows,
+    step: int,
+    *,
+    is_vulnerable: Bool[np.ndarray, " metas"],
+    repairs: list[str],
+) -> None:
+    """Checks that velocities, frame rate and headings of vehicles agree with the positions.
+
+    Args:
+        files: the recording's files.
+        rows: the rows, whose frames count rows.
+        step: frames of the file per frame of `rows`.
+        is_vulnerable: whether each track, in the order of `rows`, is that of a vulnerable road
+            user, whose heading is not used.
+        repairs: lines about single tracks are added.
+
+    Raises:
+        DataError: those of most moving tracks do not agree.
+    """
+    rate_hz = read_recording_meta(files.recording_meta).frame_rate_hz / step
+    motion = motion_of(rows.track, rows.frame, rows.measured[:, :2], rate_hz)
+    repairs += check_velocities(
+        motion, rows.measured[:, 3:], rate_hz, str(files.tracks), files.recording_meta.name
+    )
+    of_track = np.cumsum(np.diff(rows.track, prepend=rows.track[:1]) != 0)
+    headings = np.radians(rows.measured[:, 2].astype(np.float64))
+    headings[is_vulnerable[of_track]] = np.nan
+    repairs += check_headings(motion, headings, str(files.tracks), unit="degrees")
 
 
 def _split_at_gaps(

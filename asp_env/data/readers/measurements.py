@@ -11,10 +11,17 @@ from dataclasses import dataclass, replace
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
-from asp_env.data.classes import FOOTPRINTS_M, VULNERABLE
+from asp_env.data.classes import VULNERABLE
 from asp_env.data.readers.layout import TrackTable, shorten, states_of
+from asp_env.data.readers.motion_checks import (
+    check_conventions,
+    check_speeds,
+    contradicting_share,
+    motion_of,
+)
 from asp_env.data.readers.ranges import check_duration, check_extent
 from asp_env.data.readers.resampling import at_times, frames_within
+from asp_env.data.readers.sizes import with_footprints
 from asp_env.data.readers.smoothing import (
     JUMP_M,
     count_held,
@@ -59,10 +66,16 @@ class Measurements:
     """Direction of the front, radians counter-clockwise from +x; NaN where it is unknown."""
     sizes: Float[np.ndarray, "rows 2"]
     """Length and width, m; 0 where they are unknown."""
+    speed: Float[np.ndarray, " rows"] | None = None
+    """Speed, m/s; NaN where it is unknown. It is only compared with the positions: a factor between
+    both is reported, since one of them is in another unit."""
 
     def select(self, rows: np.ndarray) -> "Measurements":
         """The rows of a mask, or at some indices."""
-        return replace(self, **{name: getattr(self, name)[rows] for name in self.__slots__})
+        columns = {name: getattr(self, name) for name in self.__slots__}
+        return replace(
+            self, **{name: each[rows] for name, each in columns.items() if each is not None}
+        )
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -133,7 +146,8 @@ def derive_tracks(
             f"{source}: no track lasts {MIN_PIECE_S:g} s without a gap or jump; "
             "copy it again or remove the recording"
         )
-    kinds, sizes = _kinds_and_sizes(rows, pieces, repairs)
+    rows = _checked(rows, clock, source, repairs)
+    kinds, sizes = _kinds_and_sizes(rows, pieces, source, repairs)
     vulnerable = np.isin(kinds, [int(kind) for kind in VULNERABLE])
     folded = _headings_are_folded(rows, pieces, vulnerable, repairs)
     measured = np.concatenate(
@@ -247,7 +261,7 @@ def _report_splits(
 
 
 def _kinds_and_sizes(
-    rows: Measurements, pieces: Sequence[_Piece], repairs: list[str]
+    rows: Measurements, pieces: Sequence[_Piece], source: str, repairs: list[str]
 ) -> tuple[Int[np.ndarray, " pieces"], Float[np.ndarray, "pieces 2"]]:
     """Each piece's class, which is that of its first row, and its median size."""
     kinds = np.array([rows.classes[piece.rows.start] for piece in pieces], dtype=np.int8)
@@ -258,8 +272,28 @@ def _kinds_and_sizes(
         if (rows.classes[piece.rows] != kind).any()
     ]
     _report_tracks(differ, "tracks change their agent_type", repairs)
-    known = (sizes > 0).all(axis=-1, keepdims=True)
-    return kinds, np.where(known, sizes, FOOTPRINTS_M[kinds]).astype(np.float32)
+    return kinds, with_footprints(sizes, kinds, source, repairs)
+
+
+def _checked(rows: Measurements, clock: Clock, source: str, repairs: list[str]) -> Measurements:
+    """The rows, without headings if these contradict the motion at either end of most vehicles.
+
+    Raises:
+        DataError: one convention explains all headings, or positions are in degrees.
+    """
+    motion = motion_of(rows.track, clock.frames, rows.positions, clock.rate_hz)
+    if rows.speed is not None:
+        repairs += check_speeds(motion, rows.speed, clock.rate_hz, source)
+    vulnerable = np.isin(rows.classes, [int(kind) for kind in VULNERABLE])
+    headings = np.where(vulnerable, np.nan, rows.heading)
+    check_conventions(motion, headings, source, unit="radians")
+    if (share := contradicting_share(motion, headings)) <= 0.5:
+        return rows
+    repairs.append(
+        f"the headings of {100 * share:.0f} % of the fast vehicles contradict their motion: "
+        "headings are not used, and vehicles that never move head along +x"
+    )
+    return replace(rows, heading=np.full(len(rows.track), np.nan))
 
 
 def _headings_are_folded(

@@ -25,6 +25,7 @@ from asp_env.data.readers.measurements import derive_tracks
 from asp_env.data.readers.placing import (
     Box,
     check_place,
+    doubts,
     driven_lanelets,
     moving_vehicles,
     used_region,
@@ -80,8 +81,8 @@ class ReaderState:
     maps: dict["MapKey | Path | str", RoadMap] = field(default_factory=dict)
     """By file, frame and part; by a table of cases, which have one map; or by a hash of their
     content."""
-    places: dict[str, tuple[Meta, Path]] = field(default_factory=dict)
-    """Metadata and path of the map of each recording."""
+    places: dict[str, tuple[Meta, Path, tuple[str, ...]]] = field(default_factory=dict)
+    """Metadata and path of the map of each recording, and lines about guesses."""
     hashes: dict[str, str] = field(default_factory=dict)
     tables: dict[Path, CacheEntry] = field(default_factory=dict)
     """Tables of several recordings."""
@@ -104,10 +105,11 @@ def open_recording(files: RecordingFiles, state: ReaderState) -> Recording:
         if isinstance(files, FoundRecording):
             recording = _open_found(files, state)
         else:
-            meta, map_path = _place(files, state)
+            meta, map_path, guesses = _place(files, state)
             recording = _recording(files, meta, state)
-            road_map = _road_map(files, recording, map_path, meta.origin, state)
-            recording = replace(recording, road_map=road_map)
+            road_map, lines = _road_map(files, recording, map_path, meta.origin, state)
+            repairs = (*recording.repairs, *guesses, *lines)
+            recording = replace(recording, road_map=road_map, repairs=repairs)
         state.recordings[files.name] = recording
     return state.recordings[files.name]
 
@@ -148,19 +150,19 @@ def _files_hash(path: Path, sources: tuple[Path, ...], state: ReaderState) -> st
 
 def _place(
     files: LevelxFiles | InteractionFiles | CaseFiles, state: ReaderState
-) -> tuple[Meta, Path]:
+) -> tuple[Meta, Path, tuple[str, ...]]:
     if files.name not in state.places:
         if isinstance(files, CaseFiles):
-            state.places[files.name] = files.place(state.maps_by_folder)
+            state.places[files.name] = (*files.place(state.maps_by_folder), ())
             return state.places[files.name]
         files.check_complete()
         if isinstance(files, LevelxFiles):
             meta = levelx.read_recording_meta(files.recording_meta)
-            map_path = levelx.find_map(files, meta, state.maps_by_folder)
+            map_path, guesses = levelx.find_map(files, meta, state.maps_by_folder)
         else:
             meta = interaction.read_meta(files)
-            map_path = interaction.find_map(files, meta, state.maps_by_folder)
-        state.places[files.name] = (meta, map_path)
+            map_path, guesses = interaction.find_map(files, meta, state.maps_by_folder), ()
+        state.places[files.name] = (meta, map_path, guesses)
     return state.places[files.name]
 
 
@@ -311,7 +313,9 @@ def _found_entry(files: FoundRecording) -> CacheEntry:
     table = replace(table, repairs=(*tables.repairs, *table.repairs))
     of_file, road_map = None, tables.road_map
     if isinstance(road_map, Lanelet2File):
-        of_file, road_map = road_map.path.name, _used_map(files, table, road_map)
+        of_file = road_map.path.name
+        road_map, lines = _used_map(files, table, road_map)
+        table = replace(table, repairs=(*table.repairs, *lines))
     road_map = road_map or driven_area(table, files.name)
     facts, arrays = _entry(table, rate_hz, None)
     map_facts, map_arrays = _map_arrays(road_map)
@@ -353,15 +357,18 @@ def _road_map(
     path: Path,
     origin: Origin,
     state: ReaderState,
-) -> RoadMap:
+) -> tuple[RoadMap, Sequence[str]]:
     """The map of a recording: what of the file its agents may reach; cases of a table share it.
+
+    Returns:
+        The map, and lines about what does not fit; of a table of cases for the first one only.
 
     Raises:
         DataError: the map is damaged, or of another place.
     """
     is_case = isinstance(files, CaseFiles)
     if is_case and files.tracks in state.maps:
-        return state.maps[files.tracks]
+        return state.maps[files.tracks], ()
     content = functools.cache(lambda: parse_lanelet2(path, origin))
     facts, survey = cached(path, [path], lambda: _survey_entry(content()), (origin, "survey"))
     of_tracks = ("place",) if is_case else ("place", recording.frame_rate_hz)
@@ -388,16 +395,19 @@ def _road_map(
     def check() -> CacheEntry:
         name = files.tracks.name if is_case else files.name
         check_place(path, name, vehicles, state.maps[key], survey["lane_points"])
-        return {}, {}
+        return {"doubts": doubts(vehicles, state.maps[key])}, {}
 
-    cached(files.tracks, [*files.tables, path], check, (*of_tracks, origin, str(path)))
+    salt = (*of_tracks, origin, str(path))
+    found, _ = cached(files.tracks, [*files.tables, path], check, salt)
     if is_case:
         state.maps[files.tracks] = state.maps[key]
-    return state.maps[key]
+    return state.maps[key], found["doubts"]
 
 
-def _used_map(files: FoundRecording, table: TrackTable, content: Lanelet2File) -> RoadMap:
-    """What of a map file the agents of a recording may reach.
+def _used_map(
+    files: FoundRecording, table: TrackTable, content: Lanelet2File
+) -> tuple[RoadMap, list[str]]:
+    """What of a map file the agents of a recording may reach, and lines about what does not fit.
 
     Raises:
         DataError: the map is of another place.
@@ -407,7 +417,7 @@ def _used_map(files: FoundRecording, table: TrackTable, content: Lanelet2File) -
     region_m, driven = _part(extent["extent_m"], places["vehicles"], facts, survey)
     road_map = make_road_map(content, region_m=region_m, driven=driven)
     check_place(content.path, files.name, places["vehicles"], road_map, survey["lane_points"])
-    return road_map
+    return road_map, doubts(places["vehicles"], road_map)
 
 
 def _part(

@@ -26,6 +26,12 @@ MIN_ON_ROAD = 0.02
 """A map on which a smaller share of the positions of vehicles lies is of another place. Chosen by
 hand: in published recordings, 90 to 100 % lie on the map."""
 
+USUAL_ON_ROAD = 0.5
+"""A smaller share of the positions of vehicles on the map is reported. Chosen by hand."""
+
+NUM_PLACED = 500
+"""Largest number of states of which the direction is compared with that of lanes."""
+
 NUM_STATES = 10_000
 """Largest number of states of vehicles that are examined."""
 
@@ -125,6 +131,54 @@ def check_place(
         "the middle of the tracks; expected a map that vehicles drive on: put the right file in "
         "its place, or correct the origin in the recording's metadata"
     )
+
+
+def doubts(vehicles: Float[np.ndarray, "n 4"], road_map: RoadMap) -> list[str]:
+    """What speaks against the units, the axes or the map, for a report.
+
+    Args:
+        vehicles: states of moving vehicles; without any there are no doubts.
+        road_map: the map, or the part of it that the recording uses.
+    """
+    if not len(vehicles):
+        return []
+    found = []
+    if (share := share_on_road(vehicles, road_map.drivable)) < USUAL_ON_ROAD:
+        found.append(
+            f"only {100 * share:.0f} % of the positions of moving vehicles lie on the map "
+            f"{road_map.name}: check units, origin and map"
+        )
+    chosen = vehicles[:: -(-len(vehicles) // NUM_PLACED) or 1]
+    along, against = _driven_directions(chosen, road_map)
+    if 2 * against.sum() > (along | against).sum():
+        found.append(
+            f"{100 * against.sum() / (along | against).sum():.0f} % of the positions of moving "
+            f"vehicles on one-way lanes of the map {road_map.name} are against their direction: "
+            "check whether y points up, and which bounds of lanelets are left and right"
+        )
+    return found
+
+
+def _driven_directions(
+    vehicles: Float[np.ndarray, "n 4"], road_map: RoadMap
+) -> tuple[Bool[np.ndarray, " n"], Bool[np.ndarray, " n"]]:
+    """Masks of the vehicles that drive along a lane they are on, and of those only against it."""
+    along, against = (np.zeros(len(vehicles), dtype=bool) for _ in range(2))
+    for number in range(len(road_map.areas)):
+        rows = np.flatnonzero(_in_ring(vehicles[:, :2], road_map.areas[number]))
+        lane = road_map.lanes[number]
+        if not len(rows) or len(lane) < 2:
+            continue
+        steps = np.diff(lane, axis=0)
+        away = vehicles[rows, None, :2] - 0.5 * (lane[1:] + lane[:-1])
+        nearest = steps[(away**2).sum(axis=-1).argmin(axis=1)]
+        course = vehicles[rows, 2] + np.where(vehicles[rows, 3] < 0, np.pi, 0.0)
+        cosine = np.cos(course - np.arctan2(nearest[:, 1], nearest[:, 0]))
+        is_along = cosine > math.cos(ALONG_RAD)
+        is_against = cosine < -math.cos(ALONG_RAD)
+        along[rows] |= is_along | (is_against & bool(road_map.two_way[number]))
+        against[rows] |= is_against
+    return along, against & ~along
 
 
 def _in_ring(

@@ -206,9 +206,14 @@ def _another_place(
 ) -> DataError:
     middle = np.nanmedian(coordinates[:, SYSTEMS[system]], axis=0)
     unit = "" if system == "degrees" else " (metres)"
+    longitude_deg, latitude_deg = Transformer.from_crs(origin.epsg, 4326, always_xy=True).transform(
+        origin.x_m, origin.y_m
+    )
     return DataError(
         f"{osm.path}: lies at about {middle[0]:.4f}, {middle[1]:.4f}{unit}, expected it at its "
-        f"recordings' origin {origin.latitude_deg:.4f}, {origin.longitude_deg:.4f} (degrees; from "
-        "recordingMeta.csv, or meta_data.csv in the tracks' folder): put the right file in its "
+        f"recordings' origin, which is at {latitude_deg:.4f}, {longitude_deg:.4f} (degrees; "
+        f"x {origin.x_m:,.0f} m, y {origin.y_m:,.0f} m in the UTM zone of "
+        f"{origin.latitude_deg:.4f}, {origin.longitude_deg:.4f}, from recordingMeta.csv, or "
+        "meta_data.csv in the tracks' folder): correct the origin, or put the right file in its "
         "place"
     )

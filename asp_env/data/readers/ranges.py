@@ -4,6 +4,7 @@ The ranges are far wider than any traffic and far narrower than single precision
 are stored. All of them are chosen by hand.
 """
 
+import math
 from collections.abc import Callable
 from dataclasses import dataclass
 
@@ -51,6 +52,10 @@ EXTENT_M = 10_000.0
 """Largest distance along one axis from the median position of a recording: no camera sees farther.
 Positions in millimetres or micrometres are beyond."""
 
+FROM_ORIGIN_M = 100_000.0
+"""Largest distance of the median position from the origin: states are stored in single precision,
+which rounds to 0.01 m there."""
+
 MAX_FRAMES = 10_000_000
 """Largest number of frames of a recording: 23 hours at 120 Hz."""
 
@@ -68,8 +73,8 @@ def check_extent(
         located: returns the file and line of a row; it begins the error message.
 
     Raises:
-        DataError: a position is farther than `EXTENT_M` from the median. The message names the
-            first one.
+        DataError: a position is farther than `EXTENT_M` from the median, or the median is farther
+            than `FROM_ORIGIN_M` from the origin. The message names the first one.
     """
     for axis, name in enumerate(names):
         along = positions[:, axis]
@@ -84,6 +89,14 @@ def check_extent(
                 f"expected metres, all within {EXTENT_M:,.0f} m of it: convert the column to "
                 "metres, or correct the line or remove it"
             )
+    middles = np.median(positions, axis=0).tolist()
+    if math.hypot(*middles) > FROM_ORIGIN_M:
+        raise DataError(
+            f"{located(0)}: {' and '.join(names)} are absolute, such as UTM coordinates "
+            f"({middles[0]:,.0f} and {middles[1]:,.0f} on average); expected metres from an origin "
+            "at the site: subtract the same numbers, such as the recording's xUtmOrigin and "
+            "yUtmOrigin, from all positions"
+        )
 
 
 def check_duration(frames: Int[np.ndarray, " rows"], located: Callable[[int], str]) -> None:

@@ -60,12 +60,14 @@ _TRACKS: Mapping[str, Kind] = {
     "agent_type": "text",
     "x": "number",
     "y": "number",
+    "vx": "number or empty",
+    "vy": "number or empty",
     "yaw_rad": "number or empty",
     "length": "number or empty",
     "width": "number or empty",
 }
 _LIMITS = {"yaw_rad": HEADING_RAD}
-_OF_VEHICLES = frozenset({"yaw_rad", "length", "width"})
+_OF_VEHICLES = frozenset({"vx", "vy", "yaw_rad", "length", "width"})
 
 
 def find_recordings(folder: Path) -> Iterator[FoundRecording]:

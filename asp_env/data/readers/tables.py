@@ -3,6 +3,7 @@
 import csv
 import itertools
 import math
+import re
 import zlib
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass
@@ -51,6 +52,7 @@ WHOLE_WITHIN = 0.01
 less than this share. Chosen by hand."""
 
 _BLOCK_BYTES = 1 << 22
+_UTF16 = (b"\xff\xfe", b"\xfe\xff")
 _DTYPES = {"id": np.int64, "whole": np.int64, "number": np.float64, "number or empty": np.float64}
 
 
@@ -233,8 +235,10 @@ def find_line(path: Path, cells: Mapping[str, object], *, occurrence: int = 1) -
     """
     header = header_of(path)
     columns = {name: _places(header, name)[0] for name in cells}
-    for number, row in _lines(path):
-        if number > 1 and all(_same(row[columns[name]], cells[name]) for name in cells):
+    for number, row in itertools.islice(_lines(path), 1, None):
+        if len(row) >= len(header) and all(
+            _same(row[columns[name]], cells[name]) for name in cells
+        ):
             occurrence -= 1
             if not occurrence:
                 return number
@@ -321,19 +325,50 @@ def header_of(path: Path) -> list[str]:
     """The names of a table's columns, without spaces around them.
 
     Raises:
-        DataError: the file is empty or damaged.
+        DataError: the file is empty, damaged, or not a table in UTF-8 with commas.
     """
-    for _, row in _lines(path):
+    _check_encoding(path)
+    for number, row in _lines(path):
+        if len(row) == 1 and (mark := next((mark for mark in ";\t|" if mark in row[0]), None)):
+            raise DataError(
+                f"{path}, line {number}: columns are separated by {mark!r}, expected ',', and "
+                "points in decimal numbers: save it as CSV with commas"
+            )
         return [name.strip() for name in row]
     raise DataError(f"{path}: is empty; expected a table with a header; copy it again")
 
 
+def _check_encoding(path: Path) -> None:
+    """Refuses encodings and line ends that spreadsheets may write but no table here has."""
+    with open_table(path) as file:
+        start = file.read(1 << 10)
+    if start.startswith(_UTF16) or b"\0" in start[:4]:
+        raise DataError(
+            f"{path}: is encoded in UTF-16 or UTF-32, expected UTF-8: save it as CSV in UTF-8"
+        )
+    if b"\r" in start.replace(b"\r\n", b"") and b"\n" not in start:
+        raise DataError(
+            f"{path}: its lines end in carriage returns alone, expected line feeds: save it again "
+            "with line ends of Unix or Windows"
+        )
+
+
 def has_columns(path: Path, names: Iterable[str]) -> bool:
-    """Whether a file is a table with all of some columns, in upper or lower case."""
+    """Whether a file is a table with all of some columns, in upper or lower case.
+
+    The columns are found in tables of another encoding or with other separators, too, so that
+    reading such a table tells what is wrong with it.
+    """
     try:
-        header = {name.lower() for name in header_of(path)}
+        with open_table(path) as file:
+            start = file.read(1 << 14)
     except (DataError, OSError, EOFError, zlib.error):
         return False
+    text = start.replace(b"\0", b"").decode("utf-8-sig", "replace")
+    if start.startswith(_UTF16):
+        text = text.lstrip("\ufffd")
+    line = next((line for line in text.splitlines() if line.strip()), "")
+    header = {name.strip(' "\t').lower() for name in re.split(r"[,;\t|]", line)}
     return all(name.lower() in header for name in names)
 
 
@@ -351,7 +386,8 @@ def _present(
     if missing:
         raise DataError(
             f"{path}: lacks the column {', '.join(map(repr, missing))}; "
-            f"expected it among those found: {' '.join(', '.join(header).split())[:200]}"
+            f"expected it among those found: {' '.join(', '.join(header).split())[:200]}; "
+            "rename or add the column, in the first line of the file"
         )
     if double := next((name for name in columns if len(places[name]) > 1), None):
         numbers = " and ".join(str(index + 1) for index in places[double])
@@ -459,10 +495,8 @@ def _diagnose(
     limits: Mapping[str, Limit],
 ) -> None:
     """Raises an error that names the first wrong line, if any. Slow: for damaged files only."""
-    for number, row in _lines(path):
-        if number == 1:
-            continue
-        if len(row) != len(header):
+    for number, row in itertools.islice(_lines(path), 1, None):
+        if len(row) < len(header) or any(cell.strip() for cell in row[len(header) :]):
             raise DataError(
                 f"{path}, line {number}: has {len(row)} fields, expected {len(header)} as in the "
                 "header; the line is truncated or damaged: copy the file again"
@@ -470,9 +504,10 @@ def _diagnose(
         for index, (name, kind) in columns.items():
             if expected := _expected(row[index], kind, limits.get(name)):
                 more = _count_beyond(path, index, limits.get(name))
+                do = "; if no id is one, number the agents in all tables" if kind == "id" else ""
                 raise DataError(
                     f"{path}, line {number}: {name} is {brief(repr(row[index]))}{more}, expected "
-                    f"{expected}; correct the line or remove it"
+                    f"{expected}; correct the line or remove it{do}"
                 )
 
 
@@ -513,7 +548,7 @@ def _lines(path: Path) -> Iterator[tuple[int, list[str]]]:
                 row = next(csv.reader([text.replace("\0", "?").replace("\r", "?")]), [])
             except csv.Error as error:
                 raise DataError(f"{path}, line {number}: cannot be read: {error}") from error
-            if row:
+            if any(cell.strip() for cell in row) or len(row) > 1:
                 yield number, row
 
 

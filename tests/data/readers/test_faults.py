@@ -201,7 +201,7 @@ FAULTS = {
     "size in the metadata": (set_cell(META, 3, 5, "450"), [f"{META}, line 3: width is '450'"]),
     "speed limit": (
         set_cell(RECORDING, 2, 3, "1e23"),
-        [f"{RECORDING}, line 2: speedLimit is 1e+23, expected at most 100 m/s"],
+        [f"{RECORDING}, line 2: speedLimit is 1e+23, expected at most 45 m/s"],
     ),
     "origin": (set_cell(RECORDING, 2, 12, "1e308"), [f"{RECORDING}, line 2: xUtmOrigin"]),
     "longitude": (set_cell(RECORDING, 2, 11, "200"), ["lonLocation is '200', expected degrees"]),

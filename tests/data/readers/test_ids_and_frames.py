@@ -122,5 +122,5 @@ def test_every_fifth_frame(tmp_path: Path) -> None:
     tracks = some_tracks(np.arange(0, 250, 5))
     recording = opened(tmp_path, tracks)
     assert (recording.frame_rate_hz, recording.num_frames, len(recording)) == (5.0, 50, 2)
-    assert recording.repairs == ("rows have every 5th frame of 25 Hz: these are counted",)
+    assert recording.repairs == ("rows have one of 5 frames at 25 Hz: these are counted",)
     assert recording.resampled_from_hz is None

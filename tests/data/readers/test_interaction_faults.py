@@ -169,7 +169,11 @@ FAULTS = {
     ),
     "map of another place": (
         set_metadata("0,49.0,8.4"),
-        [f"{PLACE}.osm", "expected it at its recordings' origin 49.0000, 8.4000", META],
+        [
+            f"{PLACE}.osm",
+            "expected it at its recordings' origin, which is at 49.0000, 8.4000",
+            META,
+        ],
     ),
     "metadata of another recording": (set_metadata("7,0,0"), [META, "no row whose id is 000"]),
     "metadata twice": (set_metadata("0,0,0\n0,0,0"), [META, "2 rows whose id is 000"]),

@@ -214,7 +214,8 @@ def test_map_by_location(tmp_path: Path) -> None:
             write_map(tmp_path / dataset, location=location)
         write_recording(tmp_path / dataset, location=2)
     for files, meta in recordings_with_metadata(tmp_path):
-        found = find_map(files, meta, {})
+        found, guesses = find_map(files, meta, {})
+        assert guesses == ()
         assert found.name == "location2.osm"
         assert found.is_relative_to(tmp_path / files.name.split("/")[0])
 
@@ -224,7 +225,7 @@ def test_map_beside_the_data_folder(tmp_path: Path) -> None:
     path = write_map(tmp_path)
     write_recording(tmp_path)
     ((files, meta),) = recordings_with_metadata(tmp_path / "data")
-    assert find_map(files, meta, {}) == path
+    assert find_map(files, meta, {})[0] == path
 
 
 def test_map_by_folder(tmp_path: Path) -> None:
@@ -234,7 +235,7 @@ def test_map_by_folder(tmp_path: Path) -> None:
     path, other = (each.rename(each.with_name("crossing.osm")) for each in (path, other))
     write_recording(tmp_path, location=4)
     ((files, meta),) = recordings_with_metadata(tmp_path)
-    assert find_map(files, meta, {}) == other
+    assert find_map(files, meta, {})[0] == other
 
 
 def test_map_by_place(tmp_path: Path) -> None:
@@ -245,7 +246,7 @@ def test_map_by_place(tmp_path: Path) -> None:
     (tmp_path / "source" / "maps" / "lanelets" / "01_place" / "location1.osm").unlink()
     write_recording(tmp_path, location=3)
     ((files, meta),) = recordings_with_metadata(tmp_path)
-    assert find_map(files, meta, {}) == path
+    assert find_map(files, meta, {})[0] == path
 
 
 @pytest.mark.parametrize(("number", "folder"), [(10, "01_site"), (11, "01_site_constuction")])
@@ -257,7 +258,7 @@ def test_construction_map(tmp_path: Path, number: int, folder: str) -> None:
         path.write_text("<osm />")
     write_recording(tmp_path, number=number)
     ((files, meta),) = recordings_with_metadata(tmp_path)
-    assert find_map(files, meta, {}).parent.name == folder
+    assert find_map(files, meta, {})[0].parent.name == folder
 
 
 @pytest.mark.parametrize(

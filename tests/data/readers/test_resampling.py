@@ -247,7 +247,7 @@ def test_9_99_hz_without_jitter(tmp_path: Path) -> None:
     times_ms = np.arange(200) * 1000 / 9.99
     vehicles = interaction_files.rows(1, np.zeros((200, 4)))
     vehicles["timestamp_ms"] = times_ms
-    vehicles["x"], vehicles["y"] = 5.0 + 5.0 * times_ms / 1000, -21.75
+    vehicles["x"], vehicles["y"], vehicles["vx"] = 5.0 + 5.0 * times_ms / 1000, -21.75, 5.0
     interaction_files.write_recording(tmp_path, vehicles=vehicles)
     interaction_files.write_map(tmp_path)
     recording = open_data(tmp_path)[0]

@@ -1,10 +1,8 @@
-"""Features of forecasts: what the networks encode."""
+"""Features of forecasts: what the networks encode. `test_export` has those of exported files."""
 
-from pathlib import Path
 from typing import Any
 
 import numpy as np
-import onnxruntime
 import pytest
 import torch
 
@@ -12,7 +10,6 @@ from asp_env.data.predictor import feature_size, load_predictor
 from asp_env.data.scene import Scene
 from asp_env.data.snippets import gather_scene, index_snippets
 from predictors.delayed import _scene_before
-from predictors.inference.onnx_file import input_names, inputs_of, write_onnx
 from predictors.inference.trained import TrainedPredictor
 from predictors.models.batch import make_batch
 from predictors.models.network import TrainingProgress
@@ -106,22 +103,3 @@ def test_physical_predictors_have_no_features() -> None:
     predictor = load_predictor("constant-velocity", horizon=15, dt_s=0.2)
     assert feature_size(predictor) == 0
     assert predictor.predict(scene()).features is None
-
-
-def test_the_file_has_them_as_a_last_output_if_asked_for(run: str, tmp_path: Path) -> None:
-    """Equal to the network's to 1e-4. `test_export` has the outputs without the option."""
-    predictor = load(run)
-    inputs = inputs_of(make_batch(scene(), predictor.view, predictor.history))
-    named = {
-        name: tensor.numpy() for name, tensor in zip(input_names(predictor), inputs, strict=True)
-    }
-    path = tmp_path / "file.onnx"
-    write_onnx(run, path, features=True)
-    session = onnxruntime.InferenceSession(path, providers=["CPUExecutionProvider"])
-    forecast = predictor.predict(scene())
-    actions = ["actions"] * bool(forecast.actions_valid.all())
-    names = [output.name for output in session.get_outputs()]
-    assert names == ["states", "log_probs", *actions, "features"]
-    (value,) = session.run(["features"], named)
-    assert forecast.features is not None
-    np.testing.assert_allclose(np.asarray(value), forecast.features, atol=1e-4)

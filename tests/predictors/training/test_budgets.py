@@ -118,6 +118,14 @@ def test_needed_costs_are_those_of_both_stages() -> None:
     ]
 
 
+def test_options_that_change_the_cost_have_costs_of_their_own() -> None:
+    short = command("dkm", precision="bf16-mixed", max_snippets=900).costly_configs()
+    assert [cost_key(each) for each in short] == [
+        "ssp-asp:cpu/vectors/3s/bf16-mixed/900-snippets",
+        "dkm:cpu/vectors/3s/bf16-mixed/900-snippets",
+    ]
+
+
 def test_parked_targets_have_costs_of_their_own(costs: Path) -> None:
     """With them an epoch has more snippets, so that the costs without them do not apply."""
     keys = [cost_key(each) for each in command("dkm", parked=True).costly_configs()]
@@ -203,7 +211,7 @@ def test_train_measures_once_and_trains_as_many_epochs(data: str, tmp_path: Path
     given.run()
     path = tmp_path / "run" / "epoch_costs.json"
     costs = EpochCosts.read(path, "dkm:cpu")
-    assert list(costs.epochs) == ["dkm:cpu/vectors/3s"]
+    assert list(costs.epochs) == ["dkm:cpu/vectors/3s/16-snippets"]
     provenance = json.loads((tmp_path / "run" / "config.json").read_text())["provenance"]
     assert provenance["config"]["budget"] == "cpu"
     assert provenance["trained_epochs"] == 2
