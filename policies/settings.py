@@ -64,16 +64,11 @@ class EnvironmentSettings:
                 f"forecast {', '.join(self.forecast)}: there are no forecasts without a predictor; "
                 "name one, such as constant-velocity"
             )
-        if self.raster_px is not None:
-            if self.view is None:
-                raise AspEnvError(
-                    f"raster_px {self.raster_px}: there are no rasters without a view; name one, "
-                    "such as chauffeurnet"
-                )
-            if min(self.raster_px) < MIN_RASTER_PX:
-                raise AspEnvError(
-                    f"raster_px {self.raster_px}: expected at least {MIN_RASTER_PX} each"
-                )
+        if self.raster_px is not None and self.view is None:
+            raise AspEnvError(
+                f"raster_px {self.raster_px}: there are no rasters without a view; name one, such "
+                "as chauffeurnet"
+            )
 
 
 MAX_NEIGHBOURS = 15
@@ -142,6 +137,9 @@ class PolicySettings:
             raise AspEnvError(
                 f"encoder {self.encoder}: it reads rasters; name the view that it was trained with"
             )
+        raster_px = self.environment.raster_px
+        if self.encoder is None and raster_px is not None and min(raster_px) < MIN_RASTER_PX:
+            raise AspEnvError(f"raster_px {raster_px}: expected at least {MIN_RASTER_PX} each")
 
     def _check_numbers(self) -> None:
         for name, least in (("steps", 1), ("num_envs", 1), ("width", 1), ("demonstrations", 0)):

@@ -67,7 +67,7 @@ def test_an_interrupted_training_is_resumed(
         restored.setdefault("first", steps)
 
     train_policy(settings, tmp_path / "run", resume=True, progress=note)
-    assert restored["first"] == int(saved["numbers"][0]) + settings.num_envs
+    assert restored["first"] == int(saved["numbers"][0])
     assert not (tmp_path / "run" / CHECKPOINT).exists()
     steps = int(saved["numbers"][0])
     assert {f"progress-{steps}.csv", "progress.csv"} <= {
@@ -194,7 +194,7 @@ class TestRefusals:
     def test_observations(self, fields: dict[str, Any]) -> None:
         """What nothing would use, and rasters of which the convolutions leave nothing."""
         with pytest.raises(AspEnvError, match=[*fields][-1]):
-            EnvironmentSettings(**fields)
+            PolicySettings(environment=EnvironmentSettings(**fields))
 
     @pytest.mark.parametrize(
         ("algorithm", "name", "value", "message"),

@@ -72,8 +72,8 @@ def test_bench_prints_latencies_of_named_predictors(
 ) -> None:
     """An unknown name is refused before anything is measured."""
     monkeypatch.setattr(timing, "COPY_BYTES", 2**20)
-    assert main(["bench", str(crossings), "--sections"]) == 0
-    assert "predict" not in capsys.readouterr().out
+    assert main(["bench", str(crossings), "--sections"]) == 2
+    assert "--sections: none given" in capsys.readouterr().err
     args = ["bench", str(crossings), "--sections", "--predictors"]
     assert main([*args, "constant-turn-rate"]) == 0
     output = capsys.readouterr().out

@@ -349,7 +349,7 @@ def test_a_run_writes_its_folder(crossings, tmp_path):
     [
         ({"traffic": "logs"}, r"unknown driver 'logs' \(did you mean 'log'"),
         ({"planner": "sampler"}, "unknown planner 'sampler'"),
-        ({"max_scenarios": 0}, "0 scenarios: expected at least 1"),
+        ({"max_scenarios": 0}, "--max-scenarios 0: expected at least 1"),
         ({"predictors": ()}, "none given"),
         ({"horizon": 0.1}, "no whole number of ticks"),
         ({"rules": "nuplna"}, r"unknown rules 'nuplna' \(did you mean 'nuplan'"),

@@ -296,8 +296,8 @@ def test_a_table_of_equal_cpu_time(data: str, tmp_path: Path) -> None:
     """The epochs follow from the stored costs: 3 · 2 s for the reference, 6 s / 4 s are 2."""
     costs = tmp_path / "costs.json"
     epochs = {
-        "mtp:cpu/vectors/3s": {"prediction_s": 2.0},
-        "dkm:cpu/vectors/3s": {"prediction_s": 4.0},
+        "mtp:cpu/vectors/3s/16-snippets": {"prediction_s": 2.0},
+        "dkm:cpu/vectors/3s/16-snippets": {"prediction_s": 4.0},
     }
     costs.write_text(json.dumps({"reference": "mtp:cpu", "epochs": epochs}))
     out = tmp_path / "table"
@@ -309,7 +309,9 @@ def test_a_table_of_equal_cpu_time(data: str, tmp_path: Path) -> None:
     assert "training, budget: CPU time of mtp:cpu" in text
     assert re.search(r"DKM +2; \d+ s", text)
     manifest = json.loads((out / "manifest.json").read_text())
-    assert manifest["epoch costs"]["epochs"]["dkm:cpu/vectors/3s"]["prediction_s"] == 4.0
+    assert (
+        manifest["epoch costs"]["epochs"]["dkm:cpu/vectors/3s/16-snippets"]["prediction_s"] == 4.0
+    )
     assert main(["table", data, "--out", str(out), *OPTIONS, "--epochs", "3"]) == 2
 
 
