@@ -125,7 +125,7 @@ class FeatureDistance:
             finite = np.isfinite(found.mean).all() and np.isfinite(found.whitening).all()
             if not (fits and finite and np.isfinite(found.threshold) and found.threshold > 0):
                 raise ValueError("its arrays do not fit the network")
-        except (OSError, KeyError, IndexError, ValueError, SafetensorError) as error:
+        except (OSError, KeyError, IndexError, TypeError, ValueError, SafetensorError) as error:
             raise CheckpointError(
                 f"{path} is damaged or of another network: replace it by {remedy}"
             ) from error

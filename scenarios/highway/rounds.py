@@ -66,9 +66,12 @@ Rows = Shaped[np.ndarray, " _"]
 FOLDER = "hidden"
 """Folder beside `data` and `maps`."""
 
-FARTHEST = {"x": 1e4, "y": 1e4, "heading": 1e3, "speed": 100.0, "target_speed": 100.0}
+FARTHEST = {
+    **{"x": 1e4, "y": 1e4, "heading": 1e3, "speed": 100.0, "target_speed": 100.0},
+    "delta": 10.0,
+}
 """Largest absolute values of fields of `HIDDEN`; others up to 1e6. Chosen by hand: far above those
-of the sites."""
+of the sites; `delta` is an exponent of about 4."""
 
 WANTED = "made by `asp-env synthesize OUT --site highway:…`"
 

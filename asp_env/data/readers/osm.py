@@ -76,7 +76,7 @@ def read_osm(path: Path) -> Osm:
         if isinstance(error, DataError):
             raise
         raise DataError(
-            f"{path}: is not XML ({error}); expected a lanelet2 map: copy the file again"
+            f"{path}: is not XML ({brief(error)}); expected a lanelet2 map: copy the file again"
         ) from error
     except OSError as error:
         raise DataError(f"{path}: cannot be read: {error.strerror or error}") from error

@@ -9,6 +9,9 @@ from asp_env.errors import DataError
 LENGTHS_M = (1.0, 40.0)
 """The median length of the vehicles of a recording lies in this range. Chosen by hand."""
 
+SMALLEST_M = 0.001
+"""A smaller length or width is unknown: no road user has it."""
+
 WIDTHS_M = (0.4, 5.0)
 """The median width of the vehicles of a recording lies in this range. Chosen by hand: cars of
 5.9 feet are outside."""
@@ -20,7 +23,7 @@ def with_footprints(
     source: str,
     repairs: list[str],
 ) -> Float[np.ndarray, "tracks 2"]:
-    """Sizes, with the default footprint of the class where length or width is not positive.
+    """Sizes, with the default footprint of the class where length or width is below `SMALLEST_M`.
 
     Args:
         sizes: length and width of the file, m; NaN or not positive where they are unknown.
@@ -31,7 +34,7 @@ def with_footprints(
     Raises:
         DataError: length and width of most vehicles are exchanged, or in another unit.
     """
-    known = np.asarray((sizes > 0).all(axis=-1))
+    known = np.asarray((sizes >= SMALLEST_M).all(axis=-1))
     vehicles = is_predicted(classes)
     _check(sizes[known & vehicles], source)
     unknown = int((vehicles & ~known).sum())

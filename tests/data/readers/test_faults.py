@@ -244,6 +244,10 @@ FAULTS = {
         set_map("<?xml version='1.0' encoding='none'?><osm/>"),
         ["location1.osm", "is not XML"],
     ),
+    "map in an encoding of a long name": (
+        set_map(f"<?xml version='1.0' encoding='U{10**3000}'?><osm/>"),
+        ["location1.osm: is not XML", "..."],
+    ),
     "map with entities": (
         set_map("<!DOCTYPE osm [<!ENTITY a 'x'><!ENTITY b '&a;&a;'>]><osm>&b;</osm>"),
         ["location1.osm", "declares the XML entity 'a'", "put the right file"],

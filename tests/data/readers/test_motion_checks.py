@@ -265,10 +265,10 @@ def test_positions_in_feet_are_reported_where_speeds_are_not_used(tmp_path: Path
 
 
 def test_default_footprints_of_vehicles_are_reported() -> None:
-    """A car with a size, a car without, a van without a width, and a pedestrian."""
+    """A car with a size, a car of no length, a van without a width, and a pedestrian."""
     kinds = [AgentClass.CAR, AgentClass.CAR, AgentClass.VAN, AgentClass.PEDESTRIAN]
     classes = np.array([int(kind) for kind in kinds])
-    sizes = np.array([(4.2, 1.7), (0.0, 0.0), (5.0, np.nan), (0.0, 0.0)])
+    sizes = np.array([(4.2, 1.7), (1e-30, 1.7), (5.0, np.nan), (0.0, 0.0)])
     repairs: list[str] = []
     found = with_footprints(sizes, classes, "file", repairs)
     expected = np.stack([np.array([4.2, 1.7], dtype=np.float32), *FOOTPRINTS_M[classes[1:]]])

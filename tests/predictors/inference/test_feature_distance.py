@@ -111,6 +111,11 @@ def test_missing_and_damaged_files_name_the_remedy(tmp_path: Path) -> None:
         {**whole, "threshold": np.array([0.0], dtype=np.float32)},
         {**whole, "whitening": np.full((2, 2), np.nan, dtype=np.float32)},
         {**whole, "mean": whole["mean"] + 1},  # has another checksum
+        # of two dimensions, in a file of before there were checksums
+        {
+            **{name: whole[name] for name in ("mean", "whitening")},
+            "threshold": np.ones((1, 2), dtype=np.float32),
+        },
     )
     for damage in damages:
         save_file(damage, path)

@@ -174,6 +174,7 @@ DAMAGE: dict[str, tuple[Callable[[Path], object], str]] = {
     ),
     "a long route": (lambda path: _changed(path, route_length=17), "is damaged"),
     "a position that is no number": (lambda path: _changed(path, x=np.nan), "is damaged"),
+    "an exponent": (lambda path: _changed(path, delta=1e5), "is damaged"),
     "a speed of light": (lambda path: _changed(path, speed=3e8), "is damaged"),
     "another site": (lambda path: _npz(path, site=np.array("motorway")), "of another version"),
     "other fields": (lambda path: _npz(path, rows=np.zeros(415)), "of another version"),
