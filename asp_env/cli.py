@@ -60,7 +60,7 @@ _CONSTRUCTORS = ConstructorRegistry()
 
 @_CONSTRUCTORS.primitive_rule
 def _path_rule(info: PrimitiveTypeInfo) -> PrimitiveConstructorSpec[Path] | None:
-    """A path is not empty: `Path("")` is the current folder, which nobody means by "$OUT"."""
+    """A path is not empty: `Path("")` is the current folder, not what an empty "$OUT" means."""
     return None if info.type is not Path else _PATH
 
 

@@ -241,7 +241,7 @@ def contradicting_share(motion: Motion, headings: Float[np.ndarray, " rows"]) ->
 def check_conventions(
     motion: Motion, headings: Float[np.ndarray, " rows"], source: str, *, unit: str
 ) -> None:
-    """As `check_headings`, where headings only tell which end of a vehicle is its front.
+    """As `check_headings`, where headings only state which end of a vehicle is its front.
 
     Raises:
         DataError: many headings contradict the motion, and one convention explains all of them.

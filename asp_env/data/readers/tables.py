@@ -357,7 +357,7 @@ def has_columns(path: Path, names: Iterable[str]) -> bool:
     """Whether a file is a table with all of some columns, in upper or lower case.
 
     The columns are found in tables of another encoding or with other separators, too, so that
-    reading such a table tells what is wrong with it.
+    reading such a table names what is wrong with it.
     """
     try:
         with open_table(path) as file:
