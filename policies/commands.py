@@ -7,11 +7,10 @@ from pathlib import Path
 from typing import Annotated, Any
 
 import tyro
-from rich.console import Console
 from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn
 from rich.table import Table
 
-from asp_env.console import table_console
+from asp_env.console import table_console, text_console
 from asp_env.data.predictor import feature_size, load_predictor
 from asp_env.data.recording import DEFAULT_DT_S, ticks
 from asp_env.data.source import open_data
@@ -129,7 +128,7 @@ class RLTrain:
     def run(self) -> None:
         """Trains, with a progress bar, and prints how to evaluate the policy."""
         train_policy = _training().train_policy
-        settings, console = self.settings(), Console()
+        settings, console = self.settings(), text_console()
         columns = (TextColumn("{task.description}"), BarColumn(), TimeRemainingColumn())
         bar = Progress(*columns, console=console)
         task = bar.add_task(f"{settings.algorithm}, {settings.steps:,} steps", total=settings.steps)
@@ -191,9 +190,8 @@ class RLEvaluate:
         console, results = table_console(), {}
         table = Table("run", "scenarios", *METRICS)
         table.columns[0].overflow = "fold"
-        with Progress(
-            TextColumn("{task.description}"), BarColumn(), console=console, transient=True
-        ) as bar:
+        columns = (TextColumn("{task.description}", markup=False), BarColumn())
+        with Progress(*columns, console=console, transient=True) as bar:
             for folder, trained in policies.items():
                 environment = dataclasses.replace(
                     trained.settings.environment,

@@ -10,10 +10,10 @@ import numpy as np
 import tyro
 from gymnasium import spaces
 from gymnasium.wrappers import FlattenObservation
-from rich.console import Console
 from rich.progress import track
 
 from asp_env.arguments import MAX_SEED
+from asp_env.console import text_console
 from asp_env.data.recording import DEFAULT_DT_S
 from asp_env.data.source import open_data, scheme_of
 from asp_env.envs.replay import ReplayEnv
@@ -92,7 +92,7 @@ class Demonstrations:
                 description=f"The logged drivers of {self.data}, scenario by scenario.",
             )
         found = ", ".join(f"{count} {name}" for name, count in endings.items() if count)
-        Console().print(
+        text_console().print(
             f"wrote {self.out}: {len(numbers)} episodes ({found}), {steps} steps, {clipped} of "
             "them with clipped actions",
             soft_wrap=True,

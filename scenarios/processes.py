@@ -3,9 +3,9 @@
 from collections.abc import Callable
 from contextlib import nullcontext
 
-from rich.console import Console
 from rich.progress import track
 
+from asp_env.console import text_console
 from asp_env.errors import AspEnvError
 from asp_env.workers import WorkerPool
 
@@ -30,6 +30,8 @@ def run_with_progress(
     processes = min(jobs, count)
     with WorkerPool(work, processes) if processes > 1 else nullcontext() as pool:
         done = pool.map(range(count)) if pool is not None else map(work, range(count))
-        shown = track(done, title, total=count, console=Console(stderr=True), disable=not progress)
+        shown = track(
+            done, title, total=count, console=text_console(stderr=True), disable=not progress
+        )
         for _ in shown:
             pass

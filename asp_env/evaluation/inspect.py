@@ -371,7 +371,7 @@ def _repairs(summaries: list[RecordingSummary], maps: list[RoadMap]) -> list[str
 def _print_lines(console: Console, title: str, lines: list[str]) -> None:
     console.print(f"{title}: {len(lines) or 'none'}", highlight=False)
     for line in lines:
-        console.print(f"  {line}", soft_wrap=True, highlight=False, markup=False)
+        console.print(f"  {line}", soft_wrap=True, highlight=False)
 
 
 def _summary(recordings: Recordings, faults: Mapping[str, str]) -> str:

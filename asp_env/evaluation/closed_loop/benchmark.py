@@ -15,10 +15,10 @@ from typing import Annotated
 import numpy as np
 import tyro
 from rich import box
-from rich.console import Console
 from rich.table import Table
 
 from asp_env import registry
+from asp_env.console import text_console
 from asp_env.data.cache import digest
 from asp_env.data.scenarios.selection import save_scenarios
 from asp_env.data.source import open_data, source_folder
@@ -108,7 +108,7 @@ class Benchmark:
             check_parquet_possible()
         with atomic_folder(self.out) as folder:
             rows, privileged = _write(self, folder)
-        console = Console()
+        console = text_console()
         console.print(benchmark_table(rows, privileged))
         first = rows[0]
         console.print(

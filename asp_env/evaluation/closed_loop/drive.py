@@ -9,9 +9,9 @@ from pathlib import Path
 from typing import Annotated, Any
 
 import tyro
-from rich.console import Console
 from rich.progress import Progress
 
+from asp_env.console import text_console
 from asp_env.data.recording import DEFAULT_DT_S
 from asp_env.data.road_map import RoadMap
 from asp_env.data.rollout import Rollout
@@ -124,7 +124,7 @@ class Drive:
             check_parquet_possible()
         note = HARD_NOTE if is_hard(self.scenarios) else ""
         if note:
-            Console().print(note)
+            text_console().print(note)
         with atomic_folder(self.out) as folder:
             result = drive(self)
             write_metrics(folder, result.rows)
@@ -136,7 +136,7 @@ class Drive:
             save_rollouts(folder, result)
             title = f"Driving on {Path(self.data).name}"
             write_report(folder, title=title, lead=note, maps=result.maps)
-        console = Console()
+        console = text_console()
         shown = RULES[self.rules].shown
         for table in driving_tables(result.rows, result.manifest["privileged"], shown):
             console.print(table)

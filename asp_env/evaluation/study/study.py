@@ -17,6 +17,7 @@ import tyro
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
+from asp_env.console import text_console
 from asp_env.data.scenarios.selection import save_scenarios
 from asp_env.errors import AspEnvError
 from asp_env.evaluation.closed_loop.comparison import EXPERT, EpisodeScores, Methods, joined_scores
@@ -140,7 +141,7 @@ class Study:
         check_report_possible()
         if self.parquet:
             check_parquet_possible()
-        console = Console()
+        console = text_console()
         drive = partial(drive_tasks, jobs=self.jobs)
         if self.ray is not None:
             drive = partial(drive_on_ray, address=self.ray, send_data=self.ray_send_data)
