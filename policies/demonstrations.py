@@ -111,11 +111,11 @@ class Demonstrations:
             raise AspEnvError(f"--max-scenarios {self.max_scenarios}: expected at least 1")
         if not 0 <= self.seed <= MAX_SEED:
             raise AspEnvError(f"--seed {self.seed}: expected 0 to {MAX_SEED}")
-        open_data(self.data)
         if world_class(self.data).traffic != "log":
             raise AspEnvError(
                 f"{self.data}: its traffic reacts and has no logged drivers; use recordings"
             )
+        open_data(self.data)
 
     def _options(self) -> dict[str, Any]:
         is_folder = scheme_of(self.data) is None
