@@ -10,6 +10,7 @@ import tyro
 from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn
 from rich.table import Table
 
+from asp_env.arguments import check_jobs, check_max_scenarios
 from asp_env.console import table_console, text_console
 from asp_env.data.predictor import feature_size, load_predictor
 from asp_env.data.recording import DEFAULT_DT_S, ticks
@@ -183,8 +184,7 @@ class RLEvaluate:
             check_new(self.out)
         if not self.runs:
             raise AspEnvError("--runs: none given; expected at least one run folder of a policy")
-        if self.max_scenarios is not None and self.max_scenarios < 1:
-            raise AspEnvError(f"--max-scenarios {self.max_scenarios}: expected at least 1")
+        check_max_scenarios(self.max_scenarios)
         open_data(self.data)
         policies = {folder: load_policy(folder) for folder in self.runs}
         console, results = table_console(), {}
@@ -267,9 +267,9 @@ class RLCompare:
                 raise unknown_name("row", name, rows)
         if len(set(names)) < len(names):
             raise AspEnvError(f"--rows {', '.join(names)}: name each once")
-        for option, number in (("seeds", self.seeds), ("jobs", self.jobs)):
-            if number < 1:
-                raise AspEnvError(f"--{option} {number}: expected at least 1")
+        if self.seeds < 1:
+            raise AspEnvError(f"--seeds {self.seeds}: expected at least 1")
+        check_jobs(self.jobs)
         horizon = ticks(c.HORIZON_S, DEFAULT_DT_S)
         learned = load_predictor(self.learned, horizon=horizon, dt_s=DEFAULT_DT_S)
         if not feature_size(learned):

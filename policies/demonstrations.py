@@ -12,7 +12,7 @@ from gymnasium import spaces
 from gymnasium.wrappers import FlattenObservation
 from rich.progress import track
 
-from asp_env.arguments import MAX_SEED
+from asp_env.arguments import MAX_SEED, check_max_scenarios
 from asp_env.console import text_console
 from asp_env.data.recording import DEFAULT_DT_S
 from asp_env.data.source import open_data, scheme_of
@@ -107,8 +107,7 @@ class Demonstrations:
             )
         if not is_vacant(self.out):
             raise AspEnvError(f"--out {self.out}: exists already; choose another or remove it")
-        if self.max_scenarios is not None and self.max_scenarios < 1:
-            raise AspEnvError(f"--max-scenarios {self.max_scenarios}: expected at least 1")
+        check_max_scenarios(self.max_scenarios)
         if not 0 <= self.seed <= MAX_SEED:
             raise AspEnvError(f"--seed {self.seed}: expected 0 to {MAX_SEED}")
         if world_class(self.data).traffic != "log":

@@ -12,7 +12,7 @@ from typing import Annotated, Any, Literal
 
 import tyro
 
-from asp_env.arguments import MAX_SEED
+from asp_env.arguments import MAX_SEED, check_jobs
 from asp_env.console import text_console
 from asp_env.data.recording import DEFAULT_DT_S, ticks
 from asp_env.errors import AspEnvError, MissingExtraError, unknown_name
@@ -169,8 +169,7 @@ class Table:
                 raise AspEnvError(f"--seeds {seed}: expected 0 to {MAX_SEED}")
         if "none" in self.ablations and len(self.ablations) > 1:
             raise AspEnvError(f"--ablations {' '.join(self.ablations)}: expected none alone")
-        if self.jobs < 0:
-            raise AspEnvError(f"--jobs {self.jobs}: expected 0 or more")
+        check_jobs(self.jobs, least=0)
         if self.per_recording is not None and self.per_recording < 1:
             raise AspEnvError(f"--per-recording {self.per_recording}: expected 1 or more")
 

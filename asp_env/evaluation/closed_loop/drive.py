@@ -11,6 +11,7 @@ from typing import Annotated, Any
 import tyro
 from rich.progress import Progress
 
+from asp_env.arguments import check_jobs, check_max_scenarios
 from asp_env.console import text_console
 from asp_env.data.recording import DEFAULT_DT_S
 from asp_env.data.road_map import RoadMap
@@ -181,10 +182,8 @@ def drive(config: Drive) -> ClosedLoopResult:
     Raises:
         AspEnvError: an option or the data are bad, or a worker process ended.
     """
-    if config.jobs < 1:
-        raise AspEnvError(f"--jobs {config.jobs}: expected at least 1 process")
-    if config.max_scenarios is not None and config.max_scenarios < 1:
-        raise AspEnvError(f"--max-scenarios {config.max_scenarios}: expected at least 1")
+    check_jobs(config.jobs)
+    check_max_scenarios(config.max_scenarios)
     config = _guarded(config) if config.fallback else config
     config = replace(config, traffic=config.traffic or world_class(config.data).traffic)
     runs = _runs_to_drive(config)
