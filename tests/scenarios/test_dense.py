@@ -114,16 +114,14 @@ def test_no_vehicle_overlaps_anything(dense: Path) -> None:
         assert moving >= 15
 
 
-@pytest.mark.parametrize("traffic", ["dense", "varied"])
-def test_bytes_do_not_depend_on_the_number_of_processes(tmp_path: Path, traffic: str) -> None:
-    """Three locations, written by one process and by two."""
+def test_bytes_do_not_depend_on_the_number_of_processes(tmp_path: Path) -> None:
+    """Three locations that differ, written by one process and by two."""
     contents = []
     for jobs in (1, 2):
         out = tmp_path / str(jobs)
         Synthesize(
-            out=out, recordings=3, locations=3, minutes=0.05, seed=2, jobs=jobs,
-            traffic=traffic,  # pyright: ignore
-        ).run()  # fmt: skip
+            out=out, recordings=3, locations=3, minutes=0.05, seed=2, jobs=jobs, traffic="varied"
+        ).run()
         contents.append(
             {
                 str(path.relative_to(out)): hashlib.sha256(path.read_bytes()).hexdigest()

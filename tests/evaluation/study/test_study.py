@@ -117,7 +117,7 @@ def test_the_same_bytes_by_any_number_of_processes_and_after_a_kill(
     config = tmp_path / "study.toml"
     config.write_text(
         f'data = ["{data}"]\nmethods = ["constant-turn-rate"]\ncontrols = false\n'
-        'traffic = ["log", "idm"]\nmax_scenarios = 3\n'
+        'traffic = ["log", "idm"]\nmax_scenarios = 2\n'
     )
     folders = [tmp_path / name for name in ("one", "two", "killed")]
     Study(config=config, out=folders[0]).run()
