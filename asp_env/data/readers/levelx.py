@@ -14,6 +14,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
+import pandas as pd
 from jaxtyping import Bool, Float, Int
 
 from asp_env.data.classes import VULNERABLE
@@ -103,6 +104,8 @@ _TRACKS: Mapping[str, Kind] = {
     "width": "number or empty",
     "length": "number or empty",
 }
+_TEXTS = ("orthoPxToMeter", "startTime", "weekday")
+"""Optional columns of `XX_recordingMeta.csv` that may contain anything."""
 _VULNERABLE = [int(kind) for kind in VULNERABLE]
 _ACCELERATIONS = ("xAcceleration", "yAcceleration", "lonAcceleration")
 _MEASURED = ("xCenter", "yCenter", "heading", "xVelocity", "yVelocity")
@@ -229,8 +232,9 @@ def read_recording_meta(path: Path) -> RecordingMeta:
             **dict.fromkeys(needed[2:], "number"),
             **dict.fromkeys(("latLocation", "lonLocation"), "number"),
             "speedLimit": "number or empty",
+            **dict.fromkeys(_TEXTS, "text"),
         },
-        optional=frozenset({"speedLimit"}),
+        optional=frozenset({"speedLimit", *_TEXTS}),
         limits=_LIMITS,
     )
     if len(table["frameRate"]) > 1:
@@ -243,20 +247,21 @@ def read_recording_meta(path: Path) -> RecordingMeta:
         raise DataError(
             f"{path}, line 2: frameRate is {rate:g}, expected {LOWEST_HZ:g} to {HIGHEST_HZ:g} Hz"
         )
+    texts = {name: str(table[name][0]).strip() if name in table else "" for name in _TEXTS}
     return RecordingMeta(
         number=int(table["recordingId"][0]),
         location=int(table["locationId"][0]),
         frame_rate_hz=rate,
         speed_limit_mps=_speed_limit(path, table.get("speedLimit")),
-        metres_per_ortho_pixel=_positive_or_none(path, "orthoPxToMeter"),
+        metres_per_ortho_pixel=_positive_or_none(texts["orthoPxToMeter"]),
         origin=Origin(
             x_m=float(table["xUtmOrigin"][0]),
             y_m=float(table["yUtmOrigin"][0]),
             longitude_deg=float(table["lonLocation"][0]),
             latitude_deg=float(table["latLocation"][0]),
         ),
-        start_hour=_hour(_text_or_none(path, "startTime")),
-        weekday=_text_or_none(path, "weekday"),
+        start_hour=_hour(texts["startTime"]),
+        weekday=texts["weekday"] or None,
     )
 
 
@@ -348,7 +353,7 @@ def _lie_in_image(xy: Float[np.ndarray, "rows 2"], size_px: tuple[int, int], sca
     )
 
 
-def read_levelx(files: LevelxFiles) -> TrackTable:
+def read_levelx(files: LevelxFiles, frame_rate_hz: float) -> TrackTable:
     """Reads a recording's tracks.
 
     The heading of a vehicle is that of the file; its speed is the norm of the velocity, negative if
@@ -357,6 +362,10 @@ def read_levelx(files: LevelxFiles) -> TrackTable:
     Accelerations are those of the file along the velocity, or along the heading below 0.3 m/s or
     without the columns `xAcceleration` and `yAcceleration`. A track with a gap in its frames is
     split there, and the later part gets a new id.
+
+    Args:
+        files: the recording's files.
+        frame_rate_hz: the frame rate in its metadata.
 
     Raises:
         DataError: a file is damaged, or the two tables list different tracks.
@@ -374,11 +383,12 @@ def read_levelx(files: LevelxFiles) -> TrackTable:
         rows.measured[:, :2], ("xCenter", "yCenter"), lambda row: _line(files, rows, row, numbered)
     )
     repairs = [*names.repairs(), *numbered.repairs]
-    rows, step = _count_frames(files, rows, meta, numbered, repairs)
+    rows, step = _count_frames(files, rows, meta, numbered, frame_rate_hz, repairs)
     begins = np.flatnonzero(np.diff(rows.track, prepend=rows.track[0] - 1))
     _compare_frames(rows, begins, meta, order, repairs)
     sizes = _sizes(files, rows.sizes[begins], meta, order, classes, repairs)
-    _check_motion(files, rows, step, is_vulnerable=np.isin(classes, _VULNERABLE), repairs=repairs)
+    is_vulnerable = np.isin(classes, _VULNERABLE)
+    _check_motion(files, rows, frame_rate_hz / step, is_vulnerable=is_vulnerable, repairs=repairs)
 
     starts, new_ids = _split_at_gaps(rows, begins, ids, repairs)
     lengths = np.diff(starts, append=len(rows.track))
@@ -461,13 +471,10 @@ def _maps_near(maps: list[Path], origin: Origin) -> list[Path]:
     return [path for _, path in sorted(found)]
 
 
-def _positive_or_none(path: Path, column: str) -> float | None:
-    """The cell of an optional column. Files write nothing, 0, -1 or NaN for an unknown value."""
-    try:
-        value = float(read_table(path, {column: "number"})[column][0])
-    except DataError:
-        return None
-    return value if value > 0 else None
+def _positive_or_none(text: str) -> float | None:
+    """The number in a cell. Files write nothing, 0, -1 or NaN for an unknown value."""
+    value = float(pd.to_numeric(pd.Series([text]), errors="coerce").iloc[0])
+    return value if 0 < value < math.inf else None
 
 
 def _speed_limit(path: Path, cells: np.ndarray | None) -> float | None:
@@ -485,17 +492,9 @@ def _speed_limit(path: Path, cells: np.ndarray | None) -> float | None:
     return limit if limit > 0 else None
 
 
-def _text_or_none(path: Path, column: str) -> str | None:
-    """The cell of an optional column, without spaces around it; None if it is empty."""
-    try:
-        return str(read_table(path, {column: "text"})[column][0]).strip() or None
-    except DataError:
-        return None
-
-
-def _hour(text: str | None) -> float | None:
+def _hour(text: str) -> float | None:
     """Hours after midnight of `11`, `11.5` or `11:30`; None for anything else."""
-    match = _TIME.match(text or "")
+    match = _TIME.match(text)
     if match is None:
         return None
     hour = float(match[1]) + int(match[2] or 0) / 60
@@ -581,6 +580,7 @@ def _count_frames(
     rows: _Rows,
     meta: dict[str, np.ndarray],
     numbered: NumberedIds,
+    rate_hz: float,
     repairs: list[str],
 ) -> tuple[_Rows, int]:
     """Rows with frames that count rows of a track, and the frames of the file per row.
@@ -600,7 +600,6 @@ def _count_frames(
     usual = int(np.median(steps)) if len(steps) else 1
     step = 1
     if usual > 1:
-        rate_hz = read_recording_meta(files.recording_meta).frame_rate_hz
         if abs(usual - 1000.0 / rate_hz) <= 1.0:
             frames = {
                 name: np.round(column * (rate_hz / 1000.0)).astype(np.int64)
@@ -682,7 +681,7 @@ def _sizes(
 def _check_motion(
     files: LevelxFiles,
     rows: _Rows,
-    step: int,
+    rate_hz: float,
     *,
     is_vulnerable: Bool[np.ndarray, " metas"],
     repairs: list[str],
@@ -692,7 +691,7 @@ def _check_motion(
     Args:
         files: the recording's files.
         rows: the rows, whose frames count rows.
-        step: frames of the file per frame of `rows`.
+        rate_hz: rows of a track per second.
         is_vulnerable: whether each track, in the order of `rows`, is that of a vulnerable road
             user, whose heading is not used.
         repairs: lines about single tracks are added.
@@ -700,7 +699,6 @@ def _check_motion(
     Raises:
         DataError: those of most moving tracks do not agree.
     """
-    rate_hz = read_recording_meta(files.recording_meta).frame_rate_hz / step
     motion = motion_of(rows.track, rows.frame, rows.measured[:, :2], rate_hz)
     repairs += check_velocities(
         motion, rows.measured[:, 3:], rate_hz, str(files.tracks), files.recording_meta.name

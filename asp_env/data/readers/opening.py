@@ -204,7 +204,7 @@ def _track_entry(files: LevelxFiles | InteractionFiles, meta: Meta) -> CacheEntr
     if isinstance(files, InteractionFiles):
         return _entry(*read_interaction(files), None)
     assert isinstance(meta, RecordingMeta)
-    table, scale = read_levelx(files), None
+    table, scale = read_levelx(files, meta.frame_rate_hz), None
     if files.background is not None:
         scale = _scale(files, files.background, meta, table)
         if scale is None:

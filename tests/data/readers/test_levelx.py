@@ -28,7 +28,7 @@ from tests.data.levelx_files import track_rows, write_folder, write_map, write_r
 def read(folder: Path) -> TrackTable:
     """The tracks of a folder's only recording."""
     (files,) = find_recordings(folder)
-    return read_levelx(files)
+    return read_levelx(files, read_recording_meta(files.recording_meta).frame_rate_hz)
 
 
 def recordings_with_metadata(folder: Path) -> list[tuple[LevelxFiles, RecordingMeta]]:
