@@ -10,7 +10,7 @@ import pytest
 
 from asp_env import registry
 from asp_env.data import cache
-from asp_env.data.readers import layout, levelx, opening
+from asp_env.data.readers import layout, levelx, levelx_meta, opening
 from asp_env.data.recording import Recording
 from asp_env.data.source import Recordings, join_data, load, open_data
 from asp_env.errors import AspEnvError, DataError
@@ -90,7 +90,8 @@ def test_metadata_are_read_once_for_each_opening(
         return read_table(path, *args, **options)
 
     read_table = levelx.read_table
-    monkeypatch.setattr(levelx, "read_table", table)
+    for module in (levelx, levelx_meta):
+        monkeypatch.setattr(module, "read_table", table)
     recordings = open_data(folder)
     recordings[0], recordings.hashes()
     assert [name for name in reads if name.startswith("00")] == [

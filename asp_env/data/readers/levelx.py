@@ -14,7 +14,6 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
-import pandas as pd
 from jaxtyping import Bool, Float, Int
 
 from asp_env.data.classes import VULNERABLE
@@ -32,6 +31,7 @@ from asp_env.data.readers.layout import (
     walk,
     with_parents,
 )
+from asp_env.data.readers.levelx_meta import RecordingMeta
 from asp_env.data.readers.motion_checks import check_headings, check_velocities, motion_of
 from asp_env.data.readers.osm import read_osm
 from asp_env.data.readers.positions import Origin, locate_nodes
@@ -48,7 +48,6 @@ from asp_env.data.readers.ranges import (
 )
 from asp_env.data.readers.sizes import with_footprints
 from asp_env.data.readers.tables import (
-    HIGHEST_HZ,
     LOWEST_HZ,
     Kind,
     NumberedIds,
@@ -73,9 +72,6 @@ DOWNSCALE = {"ind": 12, "round": 10, "exid": 6, "unid": 2}
 SCALES = (1, 2, 6, 10, 12)
 """Factors to try for a dataset that is not in `DOWNSCALE`."""
 
-HIGHEST_LIMIT_MPS = 45.0
-"""No speed limit is higher: 162 km/h. Larger numbers are km/h. Chosen by hand."""
-
 MARGIN_PX = 5.0
 """Distance by which positions may lie outside the image, for rounded scales and smoothed positions.
 Chosen by hand."""
@@ -84,7 +80,6 @@ _PART = re.compile(
     rf"^(.+)_(recordingMeta\.csv|tracksMeta\.csv|tracks{CSV}|background\.png)$",
     re.IGNORECASE,
 )
-_TIME = re.compile(r"^(\d{1,2}(?:\.\d*)?)(?::([0-5]\d)(?::[0-5]\d)?)?$", re.ASCII)
 _META: Mapping[str, Kind] = {
     "trackId": "id",
     "initialFrame": "whole",
@@ -104,8 +99,6 @@ _TRACKS: Mapping[str, Kind] = {
     "width": "number or empty",
     "length": "number or empty",
 }
-_TEXTS = ("orthoPxToMeter", "startTime", "weekday")
-"""Optional columns of `XX_recordingMeta.csv` that may contain anything."""
 _VULNERABLE = [int(kind) for kind in VULNERABLE]
 _ACCELERATIONS = ("xAcceleration", "yAcceleration", "lonAcceleration")
 _MEASURED = ("xCenter", "yCenter", "heading", "xVelocity", "yVelocity")
@@ -118,10 +111,6 @@ _LIMITS: Mapping[str, Limit] = {
     "width": SIZE,
     "length": SIZE,
     **dict.fromkeys(_ACCELERATIONS, ACCELERATION),
-    "xUtmOrigin": POSITION,
-    "yUtmOrigin": POSITION,
-    "latLocation": Limit(largest=90.0, unit="degrees"),
-    "lonLocation": Limit(largest=180.0, unit="degrees"),
 }
 
 
@@ -156,21 +145,6 @@ class LevelxFiles:
                     "copy it to the same folder or remove the recording"
                     f"{archive_hint(path.parent)}"
                 )
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class RecordingMeta:
-    """The content of `XX_recordingMeta.csv`."""
-
-    number: int
-    location: int
-    frame_rate_hz: float
-    speed_limit_mps: float | None
-    metres_per_ortho_pixel: float | None
-    origin: Origin
-    start_hour: float | None = None
-    """Time of day of the first frame, hours after midnight."""
-    weekday: str | None = None
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -216,53 +190,6 @@ def find_recordings(root: Path) -> tuple[LevelxFiles, ...]:
             )
         )
     return tuple(sorted(found, key=lambda files: natural_key(files.name)))
-
-
-def read_recording_meta(path: Path) -> RecordingMeta:
-    """Reads `XX_recordingMeta.csv`.
-
-    Raises:
-        DataError: the file is damaged, or its frame rate is not positive.
-    """
-    needed = ("recordingId", "locationId", "frameRate", "xUtmOrigin", "yUtmOrigin")
-    table = read_table(
-        path,
-        {
-            **dict.fromkeys(needed[:2], "whole"),
-            **dict.fromkeys(needed[2:], "number"),
-            **dict.fromkeys(("latLocation", "lonLocation"), "number"),
-            "speedLimit": "number or empty",
-            **dict.fromkeys(_TEXTS, "text"),
-        },
-        optional=frozenset({"speedLimit", *_TEXTS}),
-        limits=_LIMITS,
-    )
-    if len(table["frameRate"]) > 1:
-        raise DataError(
-            f"{path}, line 3: a second row (recordingId {table['recordingId'][1]}), expected one "
-            "row, of one recording; remove the others"
-        )
-    rate = float(table["frameRate"][0])
-    if not LOWEST_HZ <= rate <= HIGHEST_HZ:
-        raise DataError(
-            f"{path}, line 2: frameRate is {rate:g}, expected {LOWEST_HZ:g} to {HIGHEST_HZ:g} Hz"
-        )
-    texts = {name: str(table[name][0]).strip() if name in table else "" for name in _TEXTS}
-    return RecordingMeta(
-        number=int(table["recordingId"][0]),
-        location=int(table["locationId"][0]),
-        frame_rate_hz=rate,
-        speed_limit_mps=_speed_limit(path, table.get("speedLimit")),
-        metres_per_ortho_pixel=_positive_or_none(texts["orthoPxToMeter"]),
-        origin=Origin(
-            x_m=float(table["xUtmOrigin"][0]),
-            y_m=float(table["yUtmOrigin"][0]),
-            longitude_deg=float(table["lonLocation"][0]),
-            latitude_deg=float(table["latLocation"][0]),
-        ),
-        start_hour=_hour(texts["startTime"]),
-        weekday=texts["weekday"] or None,
-    )
 
 
 def find_map(
@@ -469,36 +396,6 @@ def _maps_near(maps: list[Path], origin: Origin) -> list[Path]:
         if distance < NEAR_M:
             found.append((distance, path))
     return [path for _, path in sorted(found)]
-
-
-def _positive_or_none(text: str) -> float | None:
-    """The number in a cell. Files write nothing, 0, -1 or NaN for an unknown value."""
-    value = float(pd.to_numeric(pd.Series([text]), errors="coerce").iloc[0])
-    return value if 0 < value < math.inf else None
-
-
-def _speed_limit(path: Path, cells: np.ndarray | None) -> float | None:
-    """The cell of the optional column `speedLimit`, m/s.
-
-    Raises:
-        DataError: no limit is that high.
-    """
-    limit = math.nan if cells is None else float(cells[0])
-    if limit > HIGHEST_LIMIT_MPS:
-        raise DataError(
-            f"{path}, line 2: speedLimit is {limit:g}, expected at most {HIGHEST_LIMIT_MPS:g} m/s, "
-            "or -1 for none: convert the cell to m/s"
-        )
-    return limit if limit > 0 else None
-
-
-def _hour(text: str) -> float | None:
-    """Hours after midnight of `11`, `11.5` or `11:30`; None for anything else."""
-    match = _TIME.match(text)
-    if match is None:
-        return None
-    hour = float(match[1]) + int(match[2] or 0) / 60
-    return hour if hour < 24 else None
 
 
 def _check_unique(

@@ -20,7 +20,8 @@ from asp_env.data.readers.interaction import InteractionFiles, InteractionMeta, 
 from asp_env.data.readers.interaction_cases import CaseFiles, read_case
 from asp_env.data.readers.lanelet2 import Lanelet2File, make_road_map, parse_lanelet2
 from asp_env.data.readers.layout import TrackTable
-from asp_env.data.readers.levelx import LevelxFiles, RecordingMeta, read_levelx
+from asp_env.data.readers.levelx import LevelxFiles, read_levelx
+from asp_env.data.readers.levelx_meta import RecordingMeta, read_recording_meta
 from asp_env.data.readers.measurements import derive_tracks
 from asp_env.data.readers.placing import (
     Box,
@@ -82,7 +83,7 @@ class ReaderState:
     """By file, frame and part; by a table of cases, which have one map; or by a hash of their
     content."""
     places: dict[str, tuple[Meta, Path, tuple[str, ...]]] = field(default_factory=dict)
-    """Metadata and path of the map of each recording, and lines about guesses."""
+    """Metadata and path of the map of each recording, and lines about repairs and guesses."""
     hashes: dict[str, str] = field(default_factory=dict)
     tables: dict[Path, CacheEntry] = field(default_factory=dict)
     """Tables of several recordings."""
@@ -157,8 +158,9 @@ def _place(
             return state.places[files.name]
         files.check_complete()
         if isinstance(files, LevelxFiles):
-            meta = levelx.read_recording_meta(files.recording_meta)
+            meta = read_recording_meta(files.recording_meta)
             map_path, guesses = levelx.find_map(files, meta, state.maps_by_folder)
+            guesses = (*meta.repairs, *guesses)
         else:
             meta = interaction.read_meta(files)
             map_path, guesses = interaction.find_map(files, meta, state.maps_by_folder), ()
