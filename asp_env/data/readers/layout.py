@@ -10,6 +10,7 @@ import pandas as pd
 from jaxtyping import Bool, Float, Int
 
 from asp_env.data.classes import AgentClass, parse_class
+from asp_env.data.readers.compressed import one_of_each
 from asp_env.errors import DataError
 from asp_env.geometry import wrap_angle
 
@@ -61,7 +62,8 @@ def walk(root: Path) -> list[tuple[Path, list[str]]]:
     """Every folder in and below `root` with the names of its files.
 
     Hidden and temporary files and folders are left out, and so are pipes and devices, at which a
-    reader might wait forever; links are followed, but no folder is visited twice.
+    reader might wait forever, and all files of a table but one (`one_of_each`). Links are followed,
+    but no folder is visited twice.
     """
     visited: set[str] = set()
     found = []
@@ -73,7 +75,8 @@ def walk(root: Path) -> list[tuple[Path, list[str]]]:
         visited.add(real)
         folders[:] = sorted(name for name in folders if not is_hidden(name))
         shown = (name for name in names if not is_hidden(name))
-        found.append((Path(folder), sorted(n for n in shown if may_be_read(Path(folder) / n))))
+        files = sorted(n for n in shown if may_be_read(Path(folder) / n))
+        found.append((Path(folder), one_of_each(files)))
     return found
 
 

@@ -14,12 +14,13 @@ import numpy as np
 from asp_env.data import cache
 from asp_env.data.readers import interaction, levelx
 from asp_env.data.readers.caching import CacheEntry, cached
+from asp_env.data.readers.compressed import unread_copies
 from asp_env.data.readers.driven_area import driven_area
 from asp_env.data.readers.found import FoundRecording
 from asp_env.data.readers.interaction import InteractionFiles, InteractionMeta, read_interaction
 from asp_env.data.readers.interaction_cases import CaseFiles, read_case
 from asp_env.data.readers.lanelet2 import Lanelet2File, make_road_map, parse_lanelet2
-from asp_env.data.readers.layout import TrackTable
+from asp_env.data.readers.layout import TrackTable, shorten
 from asp_env.data.readers.levelx import LevelxFiles, read_levelx
 from asp_env.data.readers.levelx_meta import RecordingMeta, read_recording_meta
 from asp_env.data.readers.measurements import derive_tracks
@@ -89,6 +90,8 @@ class ReaderState:
     """Tables of several recordings."""
     maps_by_folder: dict[Path, list[Path]] = field(default_factory=dict)
     """Map files by folder. Without it, opening N recordings would list N² files."""
+    copies: dict[Path, dict[str, list[str]]] = field(default_factory=dict)
+    """By folder: names of files that are not read, by that of the file that is."""
 
 
 def open_recording(files: RecordingFiles, state: ReaderState) -> Recording:
@@ -103,6 +106,7 @@ def open_recording(files: RecordingFiles, state: ReaderState) -> Recording:
         AspEnvError: its frames are too far apart for the tick.
     """
     if files.name not in state.recordings:
+        unread = _unread(files, state)
         if isinstance(files, FoundRecording):
             recording = _open_found(files, state)
         else:
@@ -111,8 +115,24 @@ def open_recording(files: RecordingFiles, state: ReaderState) -> Recording:
             road_map, lines = _road_map(files, recording, map_path, meta.origin, state)
             repairs = (*recording.repairs, *guesses, *lines)
             recording = replace(recording, road_map=road_map, repairs=repairs)
+        if unread:
+            recording = replace(recording, repairs=(*recording.repairs, *unread))
         state.recordings[files.name] = recording
     return state.recordings[files.name]
+
+
+def _unread(files: RecordingFiles, state: ReaderState) -> list[str]:
+    """A line for each other file of a recording's tables; for cases, only at the first one."""
+    if isinstance(files, CaseFiles) and files.tracks in state.maps:
+        return []
+    lines = []
+    for path in files.tables:
+        if path.parent not in state.copies:
+            state.copies[path.parent] = unread_copies(path.parent)
+        if others := state.copies[path.parent].get(path.name):
+            verb = "is" if len(others) == 1 else "are"
+            lines.append(f"{shorten(others)} {verb} not read, since {path.name} is")
+    return lines
 
 
 def content_hash(files: RecordingFiles, state: ReaderState) -> str:
