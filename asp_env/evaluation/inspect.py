@@ -124,7 +124,9 @@ class Inspect:
             AspEnvError: the data do not exist, some recordings cannot be read, or a tick is
                 shorter than a frame.
         """
-        recordings = open_data(self.data, dt_s=self.dt)
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore", RepairWarning)  # repairs are listed
+            recordings = open_data(self.data, dt_s=self.dt)
         console = table_console()
         summaries, faults = self._examine(recordings, console)
         if summaries:
@@ -133,7 +135,8 @@ class Inspect:
             console.print(_map_table(list(maps.values())))
             console.print(_drift_table(summaries, self.dt))
             console.print(_scenario_table(summaries))
-            _print_lines(console, "Repairs", _repairs(summaries, list(maps.values())))
+            lines = [*recordings.repairs, *_repairs(summaries, list(maps.values()))]
+            _print_lines(console, "Repairs", lines)
         _print_lines(console, "Faults", list(faults.values()))
         if faults:
             raise DataError(_summary(recordings, faults))

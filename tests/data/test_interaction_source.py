@@ -14,6 +14,7 @@ from asp_env.errors import DataError
 from tests.data import levelx_files
 from tests.data.interaction_files import (
     PLACE,
+    some_cars,
     walk,
     write_folder,
     write_map,
@@ -93,6 +94,8 @@ def test_locations_of_one_name_have_their_own_maps(tmp_path: Path) -> None:
     """The nearest map, and names that include the path."""
     for year in ("2019", "2020"):
         write_folder(tmp_path / "data" / year)
+    later = some_cars().assign(timestamp_ms=lambda table: table["timestamp_ms"] + 100)
+    write_recording(tmp_path / "data" / "2020", vehicles=later)
     write_map(
         tmp_path / "data" / "2019",
         text=levelx_files.two_lane_road(

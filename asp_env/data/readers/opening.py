@@ -90,7 +90,7 @@ class ReaderState:
     """Tables of several recordings."""
     maps_by_folder: dict[Path, list[Path]] = field(default_factory=dict)
     """Map files by folder. Without it, opening N recordings would list N² files."""
-    copies: dict[Path, dict[str, list[str]]] = field(default_factory=dict)
+    unread: dict[Path, dict[str, list[str]]] = field(default_factory=dict)
     """By folder: names of files that are not read, by that of the file that is."""
 
 
@@ -127,9 +127,9 @@ def _unread(files: RecordingFiles, state: ReaderState) -> list[str]:
         return []
     lines = []
     for path in files.tables:
-        if path.parent not in state.copies:
-            state.copies[path.parent] = unread_copies(path.parent)
-        if others := state.copies[path.parent].get(path.name):
+        if path.parent not in state.unread:
+            state.unread[path.parent] = unread_copies(path.parent)
+        if others := state.unread[path.parent].get(path.name):
             verb = "is" if len(others) == 1 else "are"
             lines.append(f"{shorten(others)} {verb} not read, since {path.name} is")
     return lines
@@ -156,17 +156,57 @@ def content_hash(files: RecordingFiles, state: ReaderState) -> str:
     return state.hashes[files.name]
 
 
+def find_copies(found: Sequence[RecordingFiles]) -> dict[int, int]:
+    """The recordings whose tables have the same content as those of an earlier one, byte for byte.
+
+    Only tables of equal sizes are read, and the hashes of their content are cached.
+
+    Returns:
+        Index of the earliest recording with that content, by index of each later one.
+    """
+    by_size: dict[tuple[object, ...], list[int]] = {}
+    for number, files in enumerate(found):
+        case = files.case if isinstance(files, CaseFiles) else None
+        sizes = _sizes(files.tables)
+        if sizes and sizes[0]:
+            by_size.setdefault((type(files), case, *sizes), []).append(number)
+    copies: dict[int, int] = {}
+    for numbers in by_size.values():
+        first: dict[str, int] = {}
+        for number in numbers if len(numbers) > 1 else ():
+            files = found[number]
+            try:
+                content = _hash_of(files.tracks, files.tables, "hash of tables")
+            except DataError:  # reported when the recording is opened
+                continue
+            if first.setdefault(content, number) != number:
+                copies[number] = first[content]
+    return dict(sorted(copies.items()))
+
+
+def _sizes(paths: Sequence[Path]) -> tuple[int, ...] | None:
+    """The sizes of files in bytes; None if one is missing."""
+    try:
+        return tuple(path.stat().st_size for path in paths)
+    except OSError:
+        return None
+
+
 def _files_hash(path: Path, sources: tuple[Path, ...], state: ReaderState) -> str:
     key = " ".join(map(str, sources))
     if key not in state.hashes:
-
-        def make() -> CacheEntry:
-            digests = "".join(cache.digest(path) for path in sources)
-            return {"hash": hashlib.sha256(digests.encode()).hexdigest()}, {}
-
-        facts, _ = cached(path, sources, make, "hash")
-        state.hashes[key] = str(facts["hash"])
+        state.hashes[key] = _hash_of(path, sources, "hash")
     return state.hashes[key]
+
+
+def _hash_of(path: Path, sources: Sequence[Path], salt: str) -> str:
+    """A hash of the content of files, from the cache if it is there; see `cached`."""
+
+    def make() -> CacheEntry:
+        digests = "".join(cache.digest(path) for path in sources)
+        return {"hash": hashlib.sha256(digests.encode()).hexdigest()}, {}
+
+    return str(cached(path, sources, make, salt)[0]["hash"])
 
 
 def _place(
