@@ -4,6 +4,7 @@ from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
+import pandas as pd
 import pytest
 
 from asp_env import registry
@@ -72,6 +73,59 @@ def test_a_bad_time_names_its_line(tmp_path: Path) -> None:
     path = write_geo_trax(tmp_path / "songdo")
     path.write_text(path.read_text().replace("17:52:13.500,0,1,2,170190", "noon,0,1,2,170190"))
     with pytest.raises(DataError, match=r"line 3: Timestamp is '2022-10-07 noon'"):
+        open_data(tmp_path / "songdo")[0]
+
+
+def coarse_times(path: Path, digits: int, columns: list[str]) -> None:
+    """Cuts the fractions of the seconds of time stamps, and keeps some columns."""
+    table = pd.read_csv(path)
+    width = len("2022-10-07 17:52:13") + (digits and digits + 1)
+    table["Timestamp"] = table["Timestamp"].str[:width]
+    table[columns].to_csv(path, index=False)
+
+
+@pytest.mark.parametrize(("digits", "seconds"), [(0, 45.0), (1, 45.0), (0, 11.0)])
+def test_times_of_whole_seconds_follow_from_frames(
+    tmp_path: Path, digits: int, seconds: float
+) -> None:
+    """10 m/s and 29.97 Hz, or 30 Hz within 11 s, which differs by 0.1 %; the guess is reported."""
+    path = write_geo_trax(tmp_path / "songdo", seconds=seconds)
+    exact = open_data(tmp_path / "songdo")[0]
+    coarse_times(path, digits, GEO_TRAX.split(","))
+    (recording,) = open_data(tmp_path / "songdo")
+    rate_hz = 29.97 if seconds > 40 else 30.0
+    (line,) = [line for line in recording.repairs if "a guess" in line]
+    assert f"at {rate_hz:g} Hz, a guess from " in line
+    np.testing.assert_allclose(recording.track(0)[:, 3], 10.0, atol=0.06)
+    np.testing.assert_allclose(recording.track(0)[-1], exact.track(0)[-1], atol=0.12)
+    assert len(recording.track(0)) == pytest.approx(len(exact.track(0)), abs=1)
+
+
+@pytest.mark.parametrize(
+    ("seconds", "without", "change", "expected"),
+    [
+        (20.0, "Frame_Number", {}, "and there is no column Frame_Number; expected fractions of"),
+        (5.0, "", {}, r"lasts 120 frames from .* to its last change; expected at least 200"),
+        (20.0, "", {"Frame_Number": 0}, "and so has Frame_Number; expected one row for each"),
+    ],
+)
+def test_times_of_whole_seconds_without_a_rate(
+    tmp_path: Path, seconds: float, without: str, change: dict[str, int], expected: str
+) -> None:
+    path = write_geo_trax(tmp_path / "songdo", seconds=seconds)
+    coarse_times(path, 0, [name for name in GEO_TRAX.split(",") if name != without])
+    pd.read_csv(path).assign(**change).to_csv(path, index=False)
+    with pytest.raises(DataError, match=f"same time in several rows of a track, .*{expected}"):
+        open_data(tmp_path / "songdo")[0]
+
+
+def test_times_of_whole_seconds_that_no_camera_has(tmp_path: Path) -> None:
+    """Every frame counts as seven: 210 Hz."""
+    path = write_geo_trax(tmp_path / "songdo", seconds=20.0)
+    coarse_times(path, 0, GEO_TRAX.split(","))
+    table = pd.read_csv(path)
+    table.assign(Frame_Number=7 * table["Frame_Number"]).to_csv(path, index=False)
+    with pytest.raises(DataError, match=r"makes 210\.00 Hz, which is no camera's rate"):
         open_data(tmp_path / "songdo")[0]
 
 
