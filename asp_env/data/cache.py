@@ -106,6 +106,35 @@ def get_or_create(group: str, name: str, make: Callable[[Path], None]) -> Path:
     return folder
 
 
+def array_of(kind: str, version: int, content: str, make: Callable[[], np.ndarray]) -> np.ndarray:
+    """An array that follows from some content, from the cache if it is there and not damaged.
+
+    If the cache cannot be written, one line is logged, and `make` is called every time.
+
+    Args:
+        kind: what the array is; the file's name begins with it.
+        version: version of `make`. Raise it whenever the result is another one.
+        content: a hash of the content that the array follows from.
+        make: computes the array.
+    """
+    made_from = [[kind, version, content]]
+    try:
+        path = cache_folder() / f"{kind}-{content[:20]}.bin"
+    except DataError as error:
+        note_uncached(error)
+        return make()
+    found = load(path, made_from)
+    if found is None:
+        array = make()
+        try:
+            save(path, made_from, {}, {"array": array})
+        except OSError as error:
+            note_uncached(error, path)
+        found = load(path, made_from) or ({}, {"array": array})
+    (array,) = found[1].values()
+    return array
+
+
 def entry_path(folder: Path, source: Path, *salt: object) -> Path:
     """The cache file for data read from `source`; `salt` distinguishes several of one source."""
     key = hashlib.sha256(repr((str(source.resolve()), salt)).encode()).hexdigest()[:20]
