@@ -20,7 +20,7 @@ import numpy as np
 from asp_env.errors import AspEnvError, DataError
 from asp_env.files import atomic_file, atomic_folder
 
-FORMAT = 11
+FORMAT = 12
 """Version of the readers. Raise it whenever a reader gives other results for the same files."""
 
 _logger = logging.getLogger("asp_env")

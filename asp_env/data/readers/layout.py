@@ -53,9 +53,16 @@ ARCHIVE = re.compile(
 """The end of the name of an archive, which has to be unpacked before it can be read."""
 
 
+_OF_SYSTEMS = frozenset(
+    {"__macosx", "$recycle.bin", "system volume information", "lost+found"}
+    | {"#recycle", "#snapshot", "@eadir"}
+)
+"""Names of folders of operating systems and network storages, which keep deleted files there."""
+
+
 def is_hidden(name: str) -> bool:
     """Whether a file or folder is hidden or temporary, such as `._NAME`, `__MACOSX`, `~$NAME`."""
-    return name.startswith((".", "~")) or name.upper() == "__MACOSX"
+    return name.startswith((".", "~")) or name.lower() in _OF_SYSTEMS
 
 
 def walk(root: Path) -> list[tuple[Path, list[str]]]:

@@ -507,6 +507,13 @@ def _count_frames(
             step = usual
             frames = {name: column // step for name, column in frames.items()}
             repairs.append(f"rows have one of {step} frames at {rate_hz:g} Hz: these are counted")
+        else:
+            raise DataError(
+                f"{files.tracks}: most rows are {usual:,} frames after the row before of their "
+                "track; expected every frame, milliseconds, or every n-th frame with the same n "
+                f"and the same first frame in all tracks, at {LOWEST_HZ:g} Hz or more: number the "
+                "rows of all tracks by the frames that they have in common"
+            )
     meta |= {name: frames[name] for name in names}
     same = (np.diff(rows.track) == 0) & (np.diff(frames["frame"]) == 0)
     if same.any():

@@ -42,7 +42,8 @@ def test_hidden_and_temporary_files_are_ignored(folder: Path, prefix: str) -> No
     for path in [path for path in folder.rglob("*") if path.is_file()]:
         path.with_name(prefix + path.name).write_bytes(FORK)
     (folder / ".DS_Store").write_bytes(FORK)
-    shutil.copytree(folder / "data", folder / "__MACOSX" / "data")
+    for name in ("__MACOSX", "$RECYCLE.BIN", "#recycle", "lost+found"):
+        shutil.copytree(folder / "data", folder / name / "data")
     found = open_data(folder)
     assert found.names == ("00",)
     np.testing.assert_array_equal(found[0].states, expected.states)
