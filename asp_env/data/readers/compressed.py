@@ -22,6 +22,12 @@ _TABLE = re.compile(r"^(.+\.csv)(|\.gz|\.xz)$")
 _BLOCK_BYTES = 1 << 16
 
 
+def plain_name(name: str) -> str:
+    """A table's name in lower case, without the suffix of its compression."""
+    match = _TABLE.match(name.lower())
+    return match[1] if match else name.lower()
+
+
 def one_of_each(names: Iterable[str]) -> list[str]:
     """Names of a folder's files with one for each table: that which is not compressed, if any.
 

@@ -75,7 +75,12 @@ def read_geo_trax(paths: tuple[Path, ...]) -> RecordingTables:
     table = read_table(path, columns, optional=frozenset(_SPEED), limits=_LIMITS)
     numbered = number_ids(table["Vehicle_ID"])
     track = numbered.columns[0]
-    times = pd.to_datetime(pd.Series(table["Timestamp"]), format="ISO8601", errors="coerce")
+    try:
+        times = pd.to_datetime(pd.Series(table["Timestamp"]), format="ISO8601", errors="coerce")
+    except ValueError as error:
+        raise DataError(
+            f"{path}: Timestamp has several time zones, expected one or none: convert the column"
+        ) from error
     if times.isna().any():
         text = str(table["Timestamp"][int(times.isna().to_numpy().argmax())])
         line = find_line(path, {"Timestamp": text})
@@ -84,10 +89,11 @@ def read_geo_trax(paths: tuple[Path, ...]) -> RecordingTables:
             "2022-10-07 17:52:13.500"
         )
     names = ClassNames()
-    classes = [
+    given = [
         CLASSES.get(re.sub(r"\.0*$", "", str(name).strip()), name)
         for name in table["Vehicle_Class"]
     ]
+    classes = names.classes(np.array(given, dtype=object), track)
     positions = np.stack([table["Local_X"], table["Local_Y"]], axis=-1)
     origin = np.floor(positions.min(axis=0) / _ROUND_M) * _ROUND_M
     sizes = np.stack([table["Vehicle_Length"], table["Vehicle_Width"]], axis=-1)
@@ -104,7 +110,7 @@ def read_geo_trax(paths: tuple[Path, ...]) -> RecordingTables:
         measurements=Measurements(
             track=track,
             time_ms=time_ms,
-            classes=names.classes(np.array(classes, dtype=object), track),
+            classes=classes,
             positions=positions - origin,
             heading=np.full(len(track), np.nan),
             sizes=np.nan_to_num(sizes, nan=0.0),

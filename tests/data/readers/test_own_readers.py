@@ -1,5 +1,6 @@
 """Readers of geo-trax and SinD, and readers of other packages."""
 
+import gzip
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -73,6 +74,21 @@ def test_a_bad_time_names_its_line(tmp_path: Path) -> None:
     path = write_geo_trax(tmp_path / "songdo")
     path.write_text(path.read_text().replace("17:52:13.500,0,1,2,170190", "noon,0,1,2,170190"))
     with pytest.raises(DataError, match=r"line 3: Timestamp is '2022-10-07 noon'"):
+        open_data(tmp_path / "songdo")[0]
+
+
+def test_unknown_classes_and_time_zones(tmp_path: Path) -> None:
+    """Unknown numbers become `other` and are counted; several time zones are an error."""
+    path = write_geo_trax(tmp_path / "songdo")
+    table = pd.read_csv(path).assign(Vehicle_Class=-1)
+    table.to_csv(path, index=False)
+    recording = open_data(tmp_path / "songdo")[0]
+    assert recording.classes.tolist() == [AgentClass.OTHER] * 2
+    assert "2 tracks of the unknown class '-1' are read as 'other'" in recording.repairs
+    table.loc[::2, "Timestamp"] += "+09:00"
+    table.loc[1::2, "Timestamp"] += "Z"
+    table.to_csv(path, index=False)
+    with pytest.raises(DataError, match="Timestamp has several time zones, expected one or none"):
         open_data(tmp_path / "songdo")[0]
 
 
@@ -178,6 +194,28 @@ def write_sind(folder: Path, *, stop_lines: bool) -> Path:
     if stop_lines:
         (place / "stop_lines.csv").write_text("signal,x1,y1,x2,y2\n2,40,-23.5,40,-20\n")
     return folder
+
+
+def test_sind_with_compressed_tables_and_several_files_of_lights(tmp_path: Path) -> None:
+    """The states are those of the plain tables; the file of lights that is not read is named."""
+    folder = write_sind(tmp_path / "sind", stop_lines=False)
+    plain = open_data(folder)[0]
+    place = folder / "Tianjin" / "8_2_1"
+    for path in list(place.glob("*_smoothed_tracks.csv")):
+        path.with_name(f"{path.name}.gz").write_bytes(gzip.compress(path.read_bytes()))
+        path.unlink()
+    (place / "Traffic_Lights_2.csv").write_bytes((place / "Traffic_Lights.csv").read_bytes())
+    (recording,) = open_data(folder)
+    np.testing.assert_array_equal(recording.states, plain.states)
+    assert "1 other files of lights not read: Traffic_Lights_2.csv" in recording.repairs
+
+
+def test_two_stop_lines_of_one_signal(tmp_path: Path) -> None:
+    folder = write_sind(tmp_path / "sind", stop_lines=True)
+    path = folder / "Tianjin" / "8_2_1" / "stop_lines.csv"
+    path.write_text(path.read_text() + "2,50,-23.5,50,-20\n")
+    with pytest.raises(DataError, match=r"line 3: a second stop line of signal 2, expected one"):
+        open_data(folder)[0]
 
 
 @pytest.mark.parametrize("stop_lines", [False, True])
