@@ -113,7 +113,9 @@ def test_case_ids_that_are_not_exact_are_refused(tmp_path: Path) -> None:
     path.parent.mkdir()
     pd.concat([cars.assign(case_id=2**53 + n) for n in range(2)]).to_csv(path, index=False)
     interaction_files.write_map(tmp_path)
-    with pytest.raises(DataError, match="case_id is '9007199254740992', .* expected a number from"):
+    with pytest.raises(
+        DataError, match=r"case_id is '9007199254740992', .* expected a number from"
+    ):
         open_data(tmp_path)[0]
 
 
