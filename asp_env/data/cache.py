@@ -152,6 +152,11 @@ def stamp(files: Iterable[Path]) -> list[list[Any]]:
         try:
             status = path.stat()
         except OSError as error:
+            if path.is_symlink():
+                raise DataError(
+                    f"{path}: is a link to a file that does not exist; fetch that file, such as by "
+                    "`git annex get`"
+                ) from error
             raise DataError(f"{path}: {error.strerror}; expected a file to read") from error
         rows.append([path.name, status.st_size, status.st_mtime_ns])
     return rows

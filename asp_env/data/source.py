@@ -1,6 +1,7 @@
 """Sources of data: `open_data` finds the recordings that a folder or a source's name stands for."""
 
 import hashlib
+import os
 import re
 import warnings
 from collections.abc import Iterable, Iterator, Sequence
@@ -432,9 +433,10 @@ def find_by_reader(folder: Path) -> dict[str, list[RecordingFiles] | AspEnvError
 
 def _is_taken(files: RecordingFiles, taken: set[Path]) -> bool:
     """Whether files with the names of inD are those of another layout: Veh_smoothed_tracks.csv."""
-    return isinstance(files, LevelxFiles) and (
-        {path for path in files.tables if path.is_file()} <= taken
-    )
+    if not isinstance(files, LevelxFiles):
+        return False
+    present = {path for path in files.tables if os.path.lexists(path)}
+    return bool(present) and present <= taken
 
 
 def _find(folder: Path) -> tuple[RecordingFiles, ...]:

@@ -324,6 +324,8 @@ def read_measurements(
 def measurements_of(columns: Mapping[str, np.ndarray]) -> Measurements:
     """Measurements of the columns of the layout's tables, all rows of which have numbers as ids."""
     sizes = np.stack([columns["length"], columns["width"]], axis=-1)
+    with np.errstate(over="ignore"):  # velocities are only compared with the positions
+        speed = np.hypot(columns["vx"], columns["vy"])
     return Measurements(
         track=columns["track_id"].astype(np.int64),
         time_ms=columns["timestamp_ms"],
@@ -331,7 +333,7 @@ def measurements_of(columns: Mapping[str, np.ndarray]) -> Measurements:
         positions=np.stack([columns["x"], columns["y"]], axis=-1),
         heading=columns["psi_rad"],
         sizes=np.nan_to_num(sizes, nan=0.0),
-        speed=np.hypot(columns["vx"], columns["vy"]),
+        speed=speed,
     )
 
 

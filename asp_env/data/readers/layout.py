@@ -95,6 +95,27 @@ def may_be_read(path: Path) -> bool:
         return True
 
 
+def check_content(path: Path, start: bytes) -> None:
+    """Refuses what downloads leave in the place of a file.
+
+    Args:
+        path: the file.
+        start: its first bytes.
+
+    Raises:
+        DataError: it is a pointer of Git LFS or a web page.
+    """
+    text = start.lstrip(b"\xef\xbb\xbf \t\r\n").lower()
+    if text.startswith(b"version https://git-lfs"):
+        raise DataError(
+            f"{path}: is a pointer of Git LFS instead of the file: fetch it by `git lfs pull`"
+        )
+    if text.startswith((b"<!doctype html", b"<html")):
+        raise DataError(
+            f"{path}: is a web page instead of the file, such as a login: download it again"
+        )
+
+
 def archive_hint(folder: Path) -> str:
     """The end of an error message that names the archives in and below a folder; may be empty."""
     if not folder.is_dir():

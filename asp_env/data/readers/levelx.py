@@ -80,6 +80,7 @@ _PART = re.compile(
     rf"^(.+)_(recordingMeta\.csv|tracksMeta\.csv|tracks{CSV}|background\.png)$",
     re.IGNORECASE,
 )
+_OWN_LOCATION = re.compile(r"location[_-]?0*(\d+)$", re.IGNORECASE | re.ASCII)
 _META: Mapping[str, Kind] = {
     "trackId": "id",
     "initialFrame": "whole",
@@ -139,12 +140,18 @@ class LevelxFiles:
         """
         present = [path.name for path in self.tables if path.is_file()]
         for path in self.tables:
-            if path.name not in present:
+            if path.name in present:
+                continue
+            if path.is_symlink():
                 raise DataError(
-                    f"{path}: no such file, though {', '.join(present)} exists; "
-                    "copy it to the same folder or remove the recording"
-                    f"{archive_hint(path.parent)}"
+                    f"{path}: is a link to a file that does not exist; fetch that file, such as by "
+                    "`git annex get`, or remove the recording"
                 )
+            raise DataError(
+                f"{path}: no such file, though {', '.join(present)} exists; "
+                "copy it to the same folder or remove the recording"
+                f"{archive_hint(path.parent)}"
+            )
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -221,6 +228,8 @@ def find_map(
         preferred = [path for path in fitting if _is_construction(path) == under_construction]
         chosen = preferred or fitting or _maps_near(maps, meta.origin)
         if chosen:
+            if fitting:  # `location1.osm` before other names in the folder `01_bendplatz`
+                chosen = sorted(chosen, key=lambda path: not _OWN_LOCATION.search(path.stem))
             return chosen[0], _guess(chosen, folder, meta.location, named=bool(fitting))
     raise DataError(
         f"{files.root}: no map for location {meta.location} of recording {files.name}; "
@@ -361,8 +370,7 @@ def _along_motion(
 
 
 def _names_location(path: Path, location: int) -> bool:
-    own = re.search(r"location[_-]?0*(\d+)$", path.stem, re.IGNORECASE | re.ASCII)
-    if own:
+    if own := _OWN_LOCATION.search(path.stem):
         return int(own[1]) == location
     folder = re.match(r"0*([0-9]+)[_-]", path.parent.name)
     return bool(folder) and int(folder[1]) == location

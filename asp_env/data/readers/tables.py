@@ -16,6 +16,7 @@ import pandas as pd
 from jaxtyping import Bool, Float, Int
 
 from asp_env.data.readers.compressed import open_table
+from asp_env.data.readers.layout import check_content
 from asp_env.data.readers.ranges import Limit
 from asp_env.errors import DataError
 from asp_env.stored import brief
@@ -381,9 +382,10 @@ def header_of(path: Path) -> list[str]:
 
 
 def _check_encoding(path: Path) -> None:
-    """Refuses encodings and line ends that spreadsheets may write but no table here has."""
+    """Refuses web pages, and encodings and line ends that no table here has."""
     with open_table(path) as file:
         start = file.read(1 << 10)
+    check_content(path, start)
     if start.startswith(_UTF16) or b"\0" in start[:4]:
         raise DataError(
             f"{path}: is encoded in UTF-16 or UTF-32, expected UTF-8: save it as CSV in UTF-8"

@@ -129,6 +129,9 @@ def test_a_choice_between_maps_is_reported(tmp_path: Path) -> None:
         "map maps/lanelets/01_place/location1.osm is used, the first one, not "
         "maps/old/location1.osm"
     )
+    second.rename(folder / "maps" / "lanelets" / "01_place" / "location1 (1).osm")
+    (line,) = open_data(folder)[0].repairs
+    assert line.startswith("map maps/lanelets/01_place/location1.osm is used, the first one, not ")
 
 
 def test_a_map_that_is_found_by_its_place_is_reported(tmp_path: Path) -> None:

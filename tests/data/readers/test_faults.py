@@ -229,6 +229,8 @@ FAULTS = {
     "another kind of file": (binary_tracks, [TRACKS]),
     "no map": (remove_map, ["no map for location 1", "location1.osm"]),
     "map without lanelets": (set_map("<osm></osm>"), ["location1.osm", "has no lanelets"]),
+    "map is a pointer": (set_map("version https://git-lfs.github.com/spec/v1\n"), ["git lfs pull"]),
+    "map is a web page": (set_map("\n<!DOCTYPE html>\n<html></html>"), ["is a web page"]),
     "map without bounds": (
         set_map(two_lane_road().replace("role='left'", "role='Left'")),
         ["location1.osm", "none of its 2 lanelets has both bounds", "roles 'left' and 'right'"],
