@@ -93,7 +93,8 @@ def test_metadata_are_read_once_for_each_opening(
     for module in (levelx, levelx_meta):
         monkeypatch.setattr(module, "read_table", table)
     recordings = open_data(folder)
-    recordings[0], recordings.hashes()
+    assert len(recordings[0]) == 3
+    recordings.hashes()
     assert [name for name in reads if name.startswith("00")] == [
         "00_recordingMeta.csv",
         "00_tracksMeta.csv",

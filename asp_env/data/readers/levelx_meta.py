@@ -104,8 +104,13 @@ def read_recording_meta(path: Path) -> RecordingMeta:
 
 def _positive_or_none(text: str) -> float | None:
     """The number in a cell. Files write nothing, 0, -1 or NaN for an unknown value."""
-    value = float(pd.to_numeric(pd.Series([text]), errors="coerce").iloc[0])
+    value = _number(text)
     return value if 0 < value < math.inf else None
+
+
+def _number(text: str) -> float:
+    """The number of a text as in columns of numbers; NaN if it is none."""
+    return float(np.asarray(pd.to_numeric(pd.Series([text]), errors="coerce"), dtype=float)[0])
 
 
 def _speed_limit(path: Path, cells: np.ndarray | None) -> float | None:
@@ -125,7 +130,7 @@ def _speed_limit(path: Path, cells: np.ndarray | None) -> float | None:
 
 def _unreadable(file_name: str, scale: str, hour: str, weekday: str | None) -> Iterator[str]:
     """A line for each optional cell that is not empty and cannot be read."""
-    if math.isnan(pd.to_numeric(pd.Series([scale or 0]), errors="coerce").iloc[0]):
+    if scale and math.isnan(_number(scale)):
         yield (f"{file_name}: orthoPxToMeter is {brief(repr(scale))}, expected a number: left out")
     if hour and _hour(hour) is None:
         yield (

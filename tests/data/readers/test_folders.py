@@ -252,7 +252,7 @@ def test_a_table_without_rows_has_no_tracks(tmp_path: Path, empty: str) -> None:
         ),
         (
             "<!DOCTYPE html>\n<html><body>Login</body></html>\n",
-            "is a web page, such as that of a l",
+            "is a web page instead of",
         ),
     ],
 )

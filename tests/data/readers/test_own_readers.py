@@ -1,7 +1,7 @@
 """Readers of geo-trax and SinD, and readers of other packages."""
 
 import gzip
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 
 import numpy as np
@@ -92,12 +92,12 @@ def test_unknown_classes_and_time_zones(tmp_path: Path) -> None:
         open_data(tmp_path / "songdo")[0]
 
 
-def coarse_times(path: Path, digits: int, columns: list[str]) -> None:
+def coarse_times(path: Path, digits: int, columns: Sequence[str]) -> None:
     """Cuts the fractions of the seconds of time stamps, and keeps some columns."""
     table = pd.read_csv(path)
     width = len("2022-10-07 17:52:13") + (digits and digits + 1)
     table["Timestamp"] = table["Timestamp"].str[:width]
-    table[columns].to_csv(path, index=False)
+    table[list(columns)].to_csv(path, index=False)
 
 
 @pytest.mark.parametrize(("digits", "seconds"), [(0, 45.0), (1, 45.0), (0, 11.0)])
