@@ -32,6 +32,7 @@ from asp_env.errors import (
     StaleInstallError,
     unknown_name,
 )
+from asp_env.stored import brief
 
 _FIRST = ("levelx", "interaction")
 """Readers whose recordings stand before those of others."""
@@ -410,6 +411,9 @@ def find_by_reader(folder: Path) -> dict[str, list[RecordingFiles] | AspEnvError
     for name in names:
         try:
             found[name] = list(registry.find("readers", name)(folder))
+            for each in found[name]:
+                if not isinstance(each, RecordingFiles):
+                    raise TypeError(f"it yields {brief(repr(each))}, expected FoundRecording")
         except StaleInstallError:
             raise
         except OSError as error:

@@ -166,10 +166,12 @@ def find_copies(found: Sequence[RecordingFiles]) -> dict[int, int]:
     """
     by_size: dict[tuple[object, ...], list[int]] = {}
     for number, files in enumerate(found):
-        case = files.case if isinstance(files, CaseFiles) else None
+        about: object = files.case if isinstance(files, CaseFiles) else None
+        if isinstance(files, FoundRecording):  # several recordings may be of one file
+            about = id(files.read)
         sizes = _sizes(files.tables)
         if sizes and sizes[0]:
-            by_size.setdefault((type(files), case, *sizes), []).append(number)
+            by_size.setdefault((type(files), about, *sizes), []).append(number)
     copies: dict[int, int] = {}
     for numbers in by_size.values():
         first: dict[str, int] = {}
