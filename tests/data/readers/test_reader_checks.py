@@ -167,6 +167,6 @@ def test_a_reader_that_yields_something_else_is_left_out(
 
 def test_recordings_without_files_are_refused() -> None:
     for fields in ({"name": ""}, {"tables": ()}):
-        given = {"name": "a", "tables": (Path("a"),), "read": read_case}
+        given: dict[str, Any] = {"name": "a", "tables": (Path("a"),), "read": read_case}
         with pytest.raises(ValueError, match="expected"):
             FoundRecording(**given | fields)
