@@ -166,7 +166,7 @@ def test_a_reader_that_yields_something_else_is_left_out(
 
 
 def test_recordings_without_files_are_refused() -> None:
-    for fields in ({"name": ""}, {"tables": ()}):
-        given: dict[str, Any] = {"name": "a", "tables": (Path("a"),), "read": read_case}
-        with pytest.raises(ValueError, match="expected"):
-            FoundRecording(**given | fields)
+    with pytest.raises(ValueError, match="name: '', expected a text"):
+        FoundRecording(name="", tables=(Path("a"),), read=partial(read_case, speed_mps=1.0))
+    with pytest.raises(ValueError, match=r"tables of a: \(\), expected paths of files"):
+        FoundRecording(name="a", tables=(), read=partial(read_case, speed_mps=1.0))
