@@ -10,13 +10,10 @@ import numpy as np
 import pandas as pd
 
 from asp_env.data.readers.positions import Origin
-from asp_env.data.readers.ranges import POSITION, Limit
+from asp_env.data.readers.ranges import HIGHEST_LIMIT_MPS, POSITION, Limit
 from asp_env.data.readers.tables import EMPTY, HIGHEST_HZ, LOWEST_HZ, read_table
 from asp_env.errors import DataError
 from asp_env.stored import brief
-
-HIGHEST_LIMIT_MPS = 45.0
-"""No speed limit is higher: 162 km/h. Larger numbers are km/h. Chosen by hand."""
 
 _TIME = re.compile(r"^(\d{1,2}(?:\.\d*)?)(?::([0-5]\d)(?::[0-5]\d)?)?$", re.ASCII)
 _WEEKDAY = re.compile(

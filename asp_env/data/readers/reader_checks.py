@@ -8,9 +8,15 @@ import numpy as np
 
 from asp_env.data.classes import AgentClass
 from asp_env.data.readers.lanelet2 import Lanelet2File
-from asp_env.data.readers.levelx_meta import HIGHEST_LIMIT_MPS
 from asp_env.data.readers.measurements import Measurements
-from asp_env.data.readers.ranges import HEADING_RAD, POSITION, SIZE, TIME_MS, Limit
+from asp_env.data.readers.ranges import (
+    HEADING_RAD,
+    HIGHEST_LIMIT_MPS,
+    POSITION,
+    SIZE,
+    TIME_MS,
+    Limit,
+)
 from asp_env.data.road_map import RoadMap
 
 _FLOATS: dict[str, tuple[int | None, Limit, bool]] = {
