@@ -410,10 +410,11 @@ def find_by_reader(folder: Path) -> dict[str, list[RecordingFiles] | AspEnvError
     found: dict[str, list[RecordingFiles] | AspEnvError] = {}
     for name in names:
         try:
-            found[name] = list(registry.find("readers", name)(folder))
-            for each in found[name]:
+            recordings = list(registry.find("readers", name)(folder))
+            for each in recordings:
                 if not isinstance(each, RecordingFiles):
                     raise TypeError(f"it yields {brief(repr(each))}, expected FoundRecording")
+            found[name] = recordings
         except StaleInstallError:
             raise
         except OSError as error:
