@@ -7,7 +7,6 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-import pandas as pd
 
 from asp_env.data.readers.positions import Origin
 from asp_env.data.readers.ranges import HIGHEST_LIMIT_MPS, POSITION, Limit
@@ -106,8 +105,11 @@ def _positive_or_none(text: str) -> float | None:
 
 
 def _number(text: str) -> float:
-    """The number of a text as in columns of numbers; NaN if it is none."""
-    return float(np.asarray(pd.to_numeric(pd.Series([text]), errors="coerce"), dtype=float)[0])
+    """The number of a text; NaN if it is none."""
+    try:
+        return float(text)
+    except ValueError:
+        return math.nan
 
 
 def _speed_limit(path: Path, cells: np.ndarray | None) -> float | None:
