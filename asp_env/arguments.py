@@ -13,6 +13,9 @@ from asp_env.errors import AspEnvError
 MAX_SEED = 2**32 - 1
 """Largest seed that the generators of all packages take: those of NumPy, torch and SB3."""
 
+MAX_JOBS = 1024
+"""Largest number of processes of a command. Chosen by hand: above the cores of one machine."""
+
 _LONGEST = 80
 """Longest value, in characters, that a message shows in full."""
 
@@ -120,3 +123,23 @@ def path(name: str, value: object) -> Path:
     if isinstance(value, Path) or (isinstance(value, str) and value):
         return Path(value)
     raise AspEnvError(f"{name} {shown(value)}: expected a path")
+
+
+def check_jobs(jobs: int, *, least: int = 1) -> None:
+    """Checks a number of processes, the option `--jobs` of commands.
+
+    Raises:
+        AspEnvError: it is below `least` or above `MAX_JOBS`.
+    """
+    if not least <= jobs <= MAX_JOBS:
+        raise AspEnvError(f"--jobs {jobs}: expected {least} to {MAX_JOBS} processes")
+
+
+def check_max_scenarios(count: int | None) -> None:
+    """Checks a largest number of scenarios, the option `--max-scenarios` of commands.
+
+    Raises:
+        AspEnvError: it is below 1.
+    """
+    if count is not None and count < 1:
+        raise AspEnvError(f"--max-scenarios {count}: expected at least 1")

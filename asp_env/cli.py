@@ -11,11 +11,11 @@ from pathlib import Path
 from typing import Any
 
 import tyro
-from rich.console import Console
 from rich.table import Table
 from tyro.constructors import ConstructorRegistry, PrimitiveConstructorSpec, PrimitiveTypeInfo
 
 from asp_env import registry
+from asp_env.console import text_console
 from asp_env.errors import AspEnvError, LeftOutWarning
 from asp_env.installation.version import version_line
 
@@ -225,7 +225,7 @@ def _print_commands(group: str = "") -> None:
         except AspEnvError as error:
             description = str(error)
         table.add_row(name, description.strip().partition("\n")[0])
-    console = Console()
+    console = text_console()
     prog = f"asp-env {group}".strip()
     console.print(f"usage: {prog} COMMAND …    ({prog} COMMAND --help lists its options)\n")
     console.print(table)

@@ -7,11 +7,11 @@ from pathlib import Path
 from typing import Annotated, Any
 
 import tyro
-from rich.console import Console
 from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn
 from rich.table import Table
 
-from asp_env.console import table_console
+from asp_env.arguments import check_jobs, check_max_scenarios
+from asp_env.console import table_console, text_console
 from asp_env.data.predictor import feature_size, load_predictor
 from asp_env.data.recording import DEFAULT_DT_S, ticks
 from asp_env.data.source import open_data
@@ -129,7 +129,7 @@ class RLTrain:
     def run(self) -> None:
         """Trains, with a progress bar, and prints how to evaluate the policy."""
         train_policy = _training().train_policy
-        settings, console = self.settings(), Console()
+        settings, console = self.settings(), text_console()
         columns = (TextColumn("{task.description}"), BarColumn(), TimeRemainingColumn())
         bar = Progress(*columns, console=console)
         task = bar.add_task(f"{settings.algorithm}, {settings.steps:,} steps", total=settings.steps)
@@ -184,16 +184,14 @@ class RLEvaluate:
             check_new(self.out)
         if not self.runs:
             raise AspEnvError("--runs: none given; expected at least one run folder of a policy")
-        if self.max_scenarios is not None and self.max_scenarios < 1:
-            raise AspEnvError(f"--max-scenarios {self.max_scenarios}: expected at least 1")
+        check_max_scenarios(self.max_scenarios)
         open_data(self.data)
         policies = {folder: load_policy(folder) for folder in self.runs}
         console, results = table_console(), {}
         table = Table("run", "scenarios", *METRICS)
         table.columns[0].overflow = "fold"
-        with Progress(
-            TextColumn("{task.description}"), BarColumn(), console=console, transient=True
-        ) as bar:
+        columns = (TextColumn("{task.description}", markup=False), BarColumn())
+        with Progress(*columns, console=console, transient=True) as bar:
             for folder, trained in policies.items():
                 environment = dataclasses.replace(
                     trained.settings.environment,
@@ -269,9 +267,9 @@ class RLCompare:
                 raise unknown_name("row", name, rows)
         if len(set(names)) < len(names):
             raise AspEnvError(f"--rows {', '.join(names)}: name each once")
-        for option, number in (("seeds", self.seeds), ("jobs", self.jobs)):
-            if number < 1:
-                raise AspEnvError(f"--{option} {number}: expected at least 1")
+        if self.seeds < 1:
+            raise AspEnvError(f"--seeds {self.seeds}: expected at least 1")
+        check_jobs(self.jobs)
         horizon = ticks(c.HORIZON_S, DEFAULT_DT_S)
         learned = load_predictor(self.learned, horizon=horizon, dt_s=DEFAULT_DT_S)
         if not feature_size(learned):

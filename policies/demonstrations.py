@@ -10,10 +10,10 @@ import numpy as np
 import tyro
 from gymnasium import spaces
 from gymnasium.wrappers import FlattenObservation
-from rich.console import Console
 from rich.progress import track
 
-from asp_env.arguments import MAX_SEED
+from asp_env.arguments import MAX_SEED, check_max_scenarios
+from asp_env.console import text_console
 from asp_env.data.recording import DEFAULT_DT_S
 from asp_env.data.source import open_data, scheme_of
 from asp_env.envs.replay import ReplayEnv
@@ -92,7 +92,7 @@ class Demonstrations:
                 description=f"The logged drivers of {self.data}, scenario by scenario.",
             )
         found = ", ".join(f"{count} {name}" for name, count in endings.items() if count)
-        Console().print(
+        text_console().print(
             f"wrote {self.out}: {len(numbers)} episodes ({found}), {steps} steps, {clipped} of "
             "them with clipped actions",
             soft_wrap=True,
@@ -107,15 +107,14 @@ class Demonstrations:
             )
         if not is_vacant(self.out):
             raise AspEnvError(f"--out {self.out}: exists already; choose another or remove it")
-        if self.max_scenarios is not None and self.max_scenarios < 1:
-            raise AspEnvError(f"--max-scenarios {self.max_scenarios}: expected at least 1")
+        check_max_scenarios(self.max_scenarios)
         if not 0 <= self.seed <= MAX_SEED:
             raise AspEnvError(f"--seed {self.seed}: expected 0 to {MAX_SEED}")
-        open_data(self.data)
         if world_class(self.data).traffic != "log":
             raise AspEnvError(
                 f"{self.data}: its traffic reacts and has no logged drivers; use recordings"
             )
+        open_data(self.data)
 
     def _options(self) -> dict[str, Any]:
         is_folder = scheme_of(self.data) is None

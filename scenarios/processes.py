@@ -3,10 +3,10 @@
 from collections.abc import Callable
 from contextlib import nullcontext
 
-from rich.console import Console
 from rich.progress import track
 
-from asp_env.errors import AspEnvError
+from asp_env.arguments import check_jobs
+from asp_env.console import text_console
 from asp_env.workers import WorkerPool
 
 
@@ -23,13 +23,14 @@ def run_with_progress(
         progress: whether to show the progress bar.
 
     Raises:
-        AspEnvError: `jobs` is below 1, a process has ended, or as the function raises it.
+        AspEnvError: `jobs` is out of range, a process has ended, or as the function raises it.
     """
-    if jobs < 1:
-        raise AspEnvError(f"--jobs {jobs}: expected at least 1 process")
+    check_jobs(jobs)
     processes = min(jobs, count)
     with WorkerPool(work, processes) if processes > 1 else nullcontext() as pool:
         done = pool.map(range(count)) if pool is not None else map(work, range(count))
-        shown = track(done, title, total=count, console=Console(stderr=True), disable=not progress)
+        shown = track(
+            done, title, total=count, console=text_console(stderr=True), disable=not progress
+        )
         for _ in shown:
             pass

@@ -3,6 +3,7 @@
 import gc
 import os
 import shutil
+import sys
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -14,6 +15,9 @@ from tests import checked_calls
 
 # Several test processes share the cores, and sums by several threads differ in their last bits.
 os.environ.setdefault("OMP_NUM_THREADS", "1")
+# Compiled modules are kept, since hundreds of processes import this package.
+sys.dont_write_bytecode = False
+os.environ.pop("PYTHONDONTWRITEBYTECODE", None)
 # Windows are invisible; tests that need a screen start their own.
 os.environ["SDL_VIDEODRIVER"] = "dummy"
 

@@ -13,6 +13,7 @@ from typing import Any
 from rich.console import Console
 
 from asp_env import registry
+from asp_env.console import text_console
 from asp_env.data.scenarios.selection import save_scenarios
 from asp_env.errors import AspEnvError
 from asp_env.evaluation.closed_loop.drive import ClosedLoopResult, Drive, drive, save_rollouts
@@ -88,7 +89,7 @@ class Demo:
             AspEnvError: a package is missing, or the folder contains something else.
         """
         check_report_possible()
-        console = Console()
+        console = text_console()
         _claim(self.out)
         held_out, run = self.out / "held-out", self.out / "trained"
         _simulate(console, held_out, HELD_OUT)

@@ -1,7 +1,7 @@
 """`asp-env inspect`: the contents of DATA, the drift of inferred actions, and all faults."""
 
 import warnings
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Annotated, Literal
 
@@ -128,22 +128,51 @@ class Inspect:
             warnings.simplefilter("ignore", RepairWarning)  # repairs are listed
             recordings = open_data(self.data, dt_s=self.dt)
         console = table_console()
-        summaries, faults = self._examine(recordings, console)
+        summaries, faults = self.examine(recordings, console)
         if summaries:
-            maps = {id(each.recording.road_map): each.recording.road_map for each in summaries}
             console.print(_recording_table(self.data, summaries))
-            console.print(_map_table(list(maps.values())))
+            console.print(_map_table(_maps(summaries)))
             console.print(_drift_table(summaries, self.dt))
             console.print(_scenario_table(summaries))
-            lines = [*recordings.repairs, *_repairs(summaries, list(maps.values()))]
-            _print_lines(console, "Repairs", lines)
-        _print_lines(console, "Faults", list(faults.values()))
+        self.show_notes(recordings.repairs, summaries, faults, console)
         if faults:
             raise DataError(_summary(recordings, faults))
 
-    def _examine(
+    def show_notes(
+        self,
+        copies: Sequence[str],
+        summaries: Sequence[RecordingSummary],
+        faults: Mapping[str, str],
+        console: Console,
+    ) -> None:
+        """Prints the repairs and the faults, below the tables.
+
+        Args:
+            copies: lines about recordings that are left out, since they are in `data` twice.
+            summaries: the recordings that can be read.
+            faults: why the others cannot, by name.
+            console: prints the lines.
+        """
+        if summaries or copies:
+            lines = [*copies, *_repairs(summaries, _maps(summaries))]
+            _print_lines(console, "Repairs", lines)
+        _print_lines(console, "Faults", list(faults.values()))
+
+    def examine(
         self, recordings: Recordings, console: Console
     ) -> tuple[list[RecordingSummary], dict[str, str]]:
+        """Reads the recordings and computes what the tables show.
+
+        Args:
+            recordings: the recordings of `data`.
+            console: a terminal shows the progress.
+
+        Returns:
+            The recordings that can be read, and why the others cannot, by name.
+
+        Raises:
+            AspEnvError: a tick of the only recording is shorter than a frame.
+        """
         opened: list[Recording] = []
         faults: dict[str, str] = {}
         numbers = track(
@@ -183,6 +212,12 @@ class Inspect:
         return summaries, faults
 
 
+def _maps(summaries: Sequence[RecordingSummary]) -> list[RoadMap]:
+    """The maps, each once."""
+    maps = {id(each.recording.road_map): each.recording.road_map for each in summaries}
+    return list(maps.values())
+
+
 def _drifts(recording: Recording, dt_s: float) -> Drifts:
     metres, euler_metres, moves = {}, {}, {}
     for horizon_s in HORIZONS_S:
@@ -210,7 +245,7 @@ def _on_road(recording: Recording) -> float:
     return float((field.distance_m(points) <= 0).mean())
 
 
-def _recording_table(data: str, summaries: list[RecordingSummary]) -> Table:
+def _recording_table(data: str, summaries: Sequence[RecordingSummary]) -> Table:
     table = Table(
         title=f"Recordings of {data}",
         title_justify="left",
@@ -287,7 +322,7 @@ def _class_counts(recording: Recording) -> str:
     return ", ".join(f"{counts[kind]} {kind.name.lower()}" for kind in AgentClass if counts[kind])
 
 
-def _map_table(maps: list[RoadMap]) -> Table:
+def _map_table(maps: Sequence[RoadMap]) -> Table:
     table = Table(title="Maps", title_justify="left")
     table.add_column("name")
     for name in ("lanes", "successors", "lines", "drivable m²", "repairs"):
@@ -305,7 +340,7 @@ def _map_table(maps: list[RoadMap]) -> Table:
     return table
 
 
-def _drift_table(summaries: list[RecordingSummary], dt_s: float) -> Table:
+def _drift_table(summaries: Sequence[RecordingSummary], dt_s: float) -> Table:
     table = Table(
         title=f"Drift of inferred actions ({dt_s:g} s) in metres: median / 90 % / 99 %",
         title_justify="left",
@@ -342,7 +377,7 @@ def _drift_cells(drifts: list[Drifts], method: Literal["metres", "euler_metres"]
     return cells
 
 
-def _scenario_table(summaries: list[RecordingSummary]) -> Table:
+def _scenario_table(summaries: Sequence[RecordingSummary]) -> Table:
     table = Table(title="Scenarios by tag, with medians of their measures", title_justify="left")
     for name in ("tag", "n", *COLUMNS):
         table.add_column(name, justify="left" if name == "tag" else "right")
@@ -362,7 +397,7 @@ def _percentiles(metres: Float[np.ndarray, " n"]) -> str:
     return " / ".join(f"{value:.2f}" for value in np.percentile(metres, PERCENTILES))
 
 
-def _repairs(summaries: list[RecordingSummary], maps: list[RoadMap]) -> list[str]:
+def _repairs(summaries: Sequence[RecordingSummary], maps: Sequence[RoadMap]) -> list[str]:
     of_maps = [f"map {road_map.name}: {line}" for road_map in maps for line in road_map.repairs]
     return of_maps + [
         f"recording {each.recording.name}: {line}"
@@ -374,7 +409,7 @@ def _repairs(summaries: list[RecordingSummary], maps: list[RoadMap]) -> list[str
 def _print_lines(console: Console, title: str, lines: list[str]) -> None:
     console.print(f"{title}: {len(lines) or 'none'}", highlight=False)
     for line in lines:
-        console.print(f"  {line}", soft_wrap=True, highlight=False, markup=False)
+        console.print(f"  {line}", soft_wrap=True, highlight=False)
 
 
 def _summary(recordings: Recordings, faults: Mapping[str, str]) -> str:

@@ -32,14 +32,13 @@ class Datasets:
                 "check it.\nNothing is needed to start: sample:intersection and sample:roundabout "
                 "are part of this package.",
                 highlight=False,
-                markup=False,
             )
             return
         by_name = {each.name.lower(): each for each in DATASETS}
         if self.name.lower() not in by_name:
             raise unknown_name("data set", self.name, [each.name for each in DATASETS])
         for line in description(by_name[self.name.lower()]):
-            console.print(line, highlight=False, markup=False, soft_wrap=True)
+            console.print(line, highlight=False, soft_wrap=True)
 
 
 def description(dataset: PublicDataset) -> list[str]:

@@ -146,7 +146,7 @@ def _gpu() -> tuple[str, str | None]:
 
 def _show(diagnosis: Diagnosis, console: Console) -> None:
     def line(text: str) -> None:
-        console.print(text, markup=False, highlight=False, soft_wrap=True)
+        console.print(text, highlight=False, soft_wrap=True)
 
     line(diagnosis.version)
     line(f"required: {', '.join(map(str, diagnosis.required))}")
@@ -187,7 +187,7 @@ def _extra_table(extras: Sequence[ExtraState]) -> Table:
         packages = ", ".join(map(str, extra.packages))
         if not extra.complete:
             packages += f": pip install 'asp-env[{extra.name}]'"
-        table.add_row(extra.name, escape(packages), extra.purpose)
+        table.add_row(extra.name, packages, extra.purpose)
     return table
 
 
@@ -203,7 +203,7 @@ def _plug_table(plugs: Sequence[PlugState]) -> Table:
 def _data_table(findings: FolderFindings) -> Table:
     names = ("reader", "recordings", "readable", "tracks", "duration s", "repairs")
     table = Table(
-        title=f"Data in {escape(findings.data)}",
+        title=f"Data in {findings.data}",
         title_justify="left",
         caption="repairs: lines under Repairs in asp-env inspect",
         caption_justify="left",

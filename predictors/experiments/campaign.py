@@ -121,7 +121,7 @@ class Campaign:
         if not processes:
             return
         columns = (
-            TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(),
+            TextColumn("{task.description}", markup=False), BarColumn(), MofNCompleteColumn(),
             TimeRemainingColumn(),
         )  # fmt: skip
         hidden = not self._console.is_terminal
@@ -211,9 +211,7 @@ class Campaign:
         state = f"finished, {self._costs.cpu_s(cell.name):.0f} s of CPU time"
         if cell in self._failed:
             state = f"failed: {self._failed[cell]}"
-        self._console.print(
-            f"{cell.name}: {state} ({left} left)", soft_wrap=True, highlight=False, markup=False
-        )
+        self._console.print(f"{cell.name}: {state} ({left} left)", soft_wrap=True, highlight=False)
 
 
 def _reason(error: BaseException, log: Path) -> str:

@@ -11,9 +11,9 @@ from pathlib import Path
 from typing import Annotated, Any, Literal
 
 import tyro
-from rich.console import Console
 
-from asp_env.arguments import MAX_SEED
+from asp_env.arguments import MAX_SEED, check_jobs
+from asp_env.console import text_console
 from asp_env.data.recording import DEFAULT_DT_S, ticks
 from asp_env.errors import AspEnvError, MissingExtraError, unknown_name
 from asp_env.files import atomic_file, is_temporary
@@ -115,7 +115,7 @@ class Table:
         self._check()
         cells = self._plan()
         sites = {site.name: site for site in open_sites(self.data, self.validation, self.test)}
-        console = Console()
+        console = text_console()
         with _claimed(self.out, self._fixed(list(sites.values())), exclusive=self.jobs > 0):
             self._measure(cells, next(iter(sites.values())))
             jobs = {cell: self._job(cell, sites[cell.site]) for cell in cells}
@@ -144,7 +144,7 @@ class Table:
         console.print(f"wrote {self.out}/report.html; CPU times are in {self.out / COST}")
         for cell, reason in campaign.failed.items():
             line = f"failed: {cell.name}: {reason}"
-            console.print(line, style="red", soft_wrap=True, markup=False)
+            console.print(line, style="red", soft_wrap=True)
         if campaign.failed:
             raise SystemExit(1)
 
@@ -169,8 +169,7 @@ class Table:
                 raise AspEnvError(f"--seeds {seed}: expected 0 to {MAX_SEED}")
         if "none" in self.ablations and len(self.ablations) > 1:
             raise AspEnvError(f"--ablations {' '.join(self.ablations)}: expected none alone")
-        if self.jobs < 0:
-            raise AspEnvError(f"--jobs {self.jobs}: expected 0 or more")
+        check_jobs(self.jobs, least=0)
         if self.per_recording is not None and self.per_recording < 1:
             raise AspEnvError(f"--per-recording {self.per_recording}: expected 1 or more")
 

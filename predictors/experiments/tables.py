@@ -6,18 +6,17 @@ of 3 s and 6 s. The tables here have the same shape: a line for each view and pr
 for each site and horizon. The first site is compared with inD, the second one with rounD.
 """
 
-import io
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
 from types import MappingProxyType
 from typing import Any, NamedTuple
 
 from rich import box
-from rich.console import Console
 from rich.table import Table
 from rich.terminal_theme import DEFAULT_TERMINAL_THEME
 from rich.text import Text
 
+from asp_env.console import page_console
 from asp_env.evaluation.results import Row, write_manifest, write_metrics
 from asp_env.evaluation.statistics import Estimate
 from asp_env.files import atomic_file
@@ -571,7 +570,7 @@ def export(
         shown: tables of `report.html` and `table.txt`.
         manifest: content of `manifest.json`.
     """
-    page = Console(record=True, width=PAGE_WIDTH, file=io.StringIO())
+    page = page_console(PAGE_WIDTH)
     for table in shown:
         page.print(table, "")
     text = page.export_text(clear=False)

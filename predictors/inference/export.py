@@ -5,8 +5,8 @@ from pathlib import Path
 from typing import Annotated
 
 import tyro
-from rich.console import Console
 
+from asp_env.console import text_console
 from asp_env.errors import AspEnvError, MissingExtraError
 
 
@@ -37,7 +37,7 @@ class Export:
             raise MissingExtraError(str(error.name), "export", "export to ONNX") from error
 
         difference = write_onnx(self.predictor, self.out, features=self.features)
-        Console().print(
+        text_console().print(
             f"wrote {self.out}: differs from the network by at most {difference:.0e} on random "
             "inputs",
             soft_wrap=True,

@@ -14,9 +14,9 @@ from typing import Annotated, Any
 import numpy as np
 import tyro
 from jaxtyping import Bool, Float
-from rich.console import Console
 
 from asp_env import registry
+from asp_env.console import text_console
 from asp_env.data.histories import histories
 from asp_env.data.recording import Recording
 from asp_env.data.snippets import SnippetIndex, gather_scene, index_snippets
@@ -68,7 +68,7 @@ class FitFeatures:
             raise AspEnvError(f"{self.run_name}: expected a finished run, such as ssp-asp:RUN")
         folder, _ = folder_and_chaining(name, argument)
         add_feature_distance(folder, self.data)
-        Console().print(f"wrote {folder / FEATURES}", soft_wrap=True)
+        text_console().print(f"wrote {folder / FEATURES}", soft_wrap=True)
 
 
 def add_feature_distance(folder: Path, data: Sequence[str]) -> FeatureDistance:

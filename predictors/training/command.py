@@ -6,8 +6,8 @@ from pathlib import Path
 from typing import Annotated, Any, Literal
 
 import tyro
-from rich.console import Console
 
+from asp_env.console import text_console
 from asp_env.data.histories import History
 from asp_env.data.snippets import HISTORY_S
 from asp_env.data.split import Split
@@ -165,7 +165,7 @@ class Train:
             config = self.config_for(self.horizon_s)
             run = train(config, self.data, self.out, start=start, hardware=hardware)
         if is_first_process():
-            Console().print(f"wrote {run}: name it as {self.predictor}:{run}")
+            text_console().print(f"wrote {run}: name it as {self.predictor}:{run}")
 
     def _fine_tune(self, name: str) -> None:
         """Fine-tunes a run.
@@ -204,7 +204,7 @@ class Train:
             max_snippets=self.max_snippets,
         )
         run = fine_tune(self.predictor, start, self.data, self.out, options)
-        Console().print(f"wrote {run}: name it as {self.predictor}:{run}")
+        text_console().print(f"wrote {run}: name it as {self.predictor}:{run}")
 
     def config_for(self, horizon_s: float) -> Any:
         """The configuration of a run for a horizon in seconds.

@@ -6,7 +6,6 @@ a fault.
 
 import contextlib
 import functools
-import io
 import json
 import os
 import shutil
@@ -21,6 +20,7 @@ import numpy as np
 import pandas as pd
 
 from asp_env import ReplayEnv
+from asp_env.console import page_console
 from asp_env.data.predictor import load_predictor
 from asp_env.data.recording import Recording
 from asp_env.data.rollout import Rollout
@@ -87,8 +87,17 @@ def use_recordings(folder: Path) -> None:
     if scenarios:
         _drive(recordings, scenarios[-1:])
         _step(folder)
-    with contextlib.redirect_stdout(io.StringIO()):
-        Inspect(data=str(folder)).run()
+    _inspect(folder)
+
+
+def _inspect(folder: Path) -> None:
+    """What `inspect` shows, without the drawing of its tables, which hold no text of files."""
+    inspect, console = Inspect(data=str(folder)), page_console(160)
+    recordings = open_data(folder)
+    summaries, faults = inspect.examine(recordings, console)
+    for each in summaries:
+        check_finite("drift", *each.drifts.metres.values(), *each.drifts.euler_metres.values())
+    inspect.show_notes(recordings.repairs, summaries, faults, console)
 
 
 def _drive(recordings: Recordings, scenarios: list[Any]) -> None:

@@ -197,8 +197,12 @@ def test_invalid_options_are_rejected(capsys: pytest.CaptureFixture[str], tmp_pa
     assert [path.name for path in tmp_path.iterdir()] == ["taken-v0"]
 
 
-def test_reacting_traffic_has_no_demonstrations(tmp_path: Path) -> None:
+def test_reacting_traffic_has_no_demonstrations(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Which is known before the traffic is made."""
     pytest.importorskip("highway_env")
+    monkeypatch.setattr("policies.demonstrations.open_data", None)
     command = Demonstrations(data="highway:intersection", out=tmp_path / "a-v0")
     with pytest.raises(AspEnvError, match="its traffic reacts and has no logged drivers"):
         command.run()

@@ -11,6 +11,7 @@ import tyro
 from rich.console import Console
 from rich.table import Table
 
+from asp_env.console import text_console
 from asp_env.data.recording import DEFAULT_DT_S
 from asp_env.data.scenarios.scenario import Scenario, find_scenarios
 from asp_env.data.snippets import gather_scene, index_snippets
@@ -68,7 +69,7 @@ class Bench:
         if not self.sections and not self.predictors:
             raise AspEnvError(f"--sections: none given; expected some of {', '.join(SECTIONS)}")
         sections = [_current_section(name) for name in self.sections]
-        console = Console(width=max(Console().width, 120))
+        console = text_console(width=max(text_console().width, 120))
         recordings = open_readable(self.data, dt_s=DEFAULT_DT_S)
         latencies: list[Latency] = []
         if self.predictors:

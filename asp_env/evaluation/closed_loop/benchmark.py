@@ -15,10 +15,11 @@ from typing import Annotated
 import numpy as np
 import tyro
 from rich import box
-from rich.console import Console
 from rich.table import Table
 
 from asp_env import registry
+from asp_env.arguments import check_jobs, check_max_scenarios
+from asp_env.console import text_console
 from asp_env.data.cache import digest
 from asp_env.data.scenarios.selection import save_scenarios
 from asp_env.data.source import open_data, source_folder
@@ -108,7 +109,7 @@ class Benchmark:
             check_parquet_possible()
         with atomic_folder(self.out) as folder:
             rows, privileged = _write(self, folder)
-        console = Console()
+        console = text_console()
         console.print(benchmark_table(rows, privileged))
         first = rows[0]
         console.print(
@@ -203,10 +204,8 @@ def benchmark(config: Benchmark) -> tuple[list[BenchmarkRow], list[ClosedLoopRes
         raise AspEnvError("no METHOD: expected at least one, such as constant-velocity")
     # The traffic of a suite takes minutes to make; what is bad is refused before.
     find_rules(config.rules)
-    if config.jobs < 1:
-        raise AspEnvError(f"--jobs {config.jobs}: expected at least 1 process")
-    if config.max_scenarios is not None and config.max_scenarios < 1:
-        raise AspEnvError(f"--max-scenarios {config.max_scenarios}: expected at least 1")
+    check_jobs(config.jobs)
+    check_max_scenarios(config.max_scenarios)
     data = _data(config)
     parsed = {name: parse_method(name) for name in config.methods}
     if config.fallback:

@@ -9,9 +9,10 @@ from pathlib import Path
 from typing import Annotated, Any
 
 import tyro
-from rich.console import Console
 from rich.progress import Progress
 
+from asp_env.arguments import check_jobs, check_max_scenarios
+from asp_env.console import text_console
 from asp_env.data.recording import DEFAULT_DT_S
 from asp_env.data.road_map import RoadMap
 from asp_env.data.rollout import Rollout
@@ -124,7 +125,7 @@ class Drive:
             check_parquet_possible()
         note = HARD_NOTE if is_hard(self.scenarios) else ""
         if note:
-            Console().print(note)
+            text_console().print(note)
         with atomic_folder(self.out) as folder:
             result = drive(self)
             write_metrics(folder, result.rows)
@@ -136,7 +137,7 @@ class Drive:
             save_rollouts(folder, result)
             title = f"Driving on {Path(self.data).name}"
             write_report(folder, title=title, lead=note, maps=result.maps)
-        console = Console()
+        console = text_console()
         shown = RULES[self.rules].shown
         for table in driving_tables(result.rows, result.manifest["privileged"], shown):
             console.print(table)
@@ -181,10 +182,8 @@ def drive(config: Drive) -> ClosedLoopResult:
     Raises:
         AspEnvError: an option or the data are bad, or a worker process ended.
     """
-    if config.jobs < 1:
-        raise AspEnvError(f"--jobs {config.jobs}: expected at least 1 process")
-    if config.max_scenarios is not None and config.max_scenarios < 1:
-        raise AspEnvError(f"--max-scenarios {config.max_scenarios}: expected at least 1")
+    check_jobs(config.jobs)
+    check_max_scenarios(config.max_scenarios)
     config = _guarded(config) if config.fallback else config
     config = replace(config, traffic=config.traffic or world_class(config.data).traffic)
     runs = _runs_to_drive(config)

@@ -7,10 +7,10 @@ from typing import Annotated
 
 import numpy as np
 import tyro
-from rich.console import Console
 from rich.progress import track
 from rich.table import Table
 
+from asp_env.console import text_console
 from asp_env.data.recording import Recording, frames_per_tick
 from asp_env.data.rollout import Rollout
 from asp_env.data.snippets import gather_window
@@ -57,7 +57,7 @@ class Watch:
         """
         self._check()
         rollouts = load_rollouts(self.rollout)
-        console = Console()
+        console = text_console()
         if self.list:
             console.print(_table(self.rollout, rollouts))
             return

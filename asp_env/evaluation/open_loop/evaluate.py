@@ -9,8 +9,8 @@ from typing import Annotated, Any
 import numpy as np
 import tyro
 from jaxtyping import Bool, Int
-from rich.console import Console
 
+from asp_env.console import text_console
 from asp_env.data.histories import History, histories
 from asp_env.data.predictor import Predictor
 from asp_env.data.recording import DEFAULT_DT_S, ticks
@@ -127,7 +127,7 @@ class Evaluate:
             write_report(
                 folder, title=f"Open loop on {Path(self.data).name}", examples=result.examples
             )
-        console = Console()
+        console = text_console()
         privileged = result.manifest["privileged"]
         for table in (
             *open_loop_tables(result.rows, privileged),

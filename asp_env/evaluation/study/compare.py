@@ -10,9 +10,9 @@ import numpy as np
 import tyro
 from jaxtyping import Float
 from rich import box
-from rich.console import Console
 from rich.table import Table
 
+from asp_env.console import text_console
 from asp_env.errors import AspEnvError, DataError, unknown_name
 from asp_env.evaluation.closed_loop.scenario_table import COLUMNS
 from asp_env.evaluation.results import SCORE
@@ -68,7 +68,7 @@ class Compare:
             raise AspEnvError(
                 f"{self.a} and {self.b} have no scenario in common in the same traffic and latency"
             )
-        console = Console()
+        console = text_console()
         console.print(difference_table(found, self.metric))
         for each in found if len(found) == 1 else []:
             console.print(deciding_table(each, self.metric))

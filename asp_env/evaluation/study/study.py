@@ -17,6 +17,8 @@ import tyro
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
+from asp_env.arguments import check_jobs
+from asp_env.console import text_console
 from asp_env.data.scenarios.selection import save_scenarios
 from asp_env.errors import AspEnvError
 from asp_env.evaluation.closed_loop.comparison import EXPERT, EpisodeScores, Methods, joined_scores
@@ -124,8 +126,7 @@ class Study:
         Raises:
             AspEnvError: an option, the file or the data are bad, or a package is missing.
         """
-        if self.jobs < 1:
-            raise AspEnvError(f"--jobs {self.jobs}: expected at least 1 process")
+        check_jobs(self.jobs)
         if self.ray is not None and self.jobs > 1:
             raise AspEnvError("--ray and --jobs: give one of them; a cluster uses all its cores")
         if self.ray is None and self.ray_send_data:
@@ -140,7 +141,7 @@ class Study:
         check_report_possible()
         if self.parquet:
             check_parquet_possible()
-        console = Console()
+        console = text_console()
         drive = partial(drive_tasks, jobs=self.jobs)
         if self.ray is not None:
             drive = partial(drive_on_ray, address=self.ray, send_data=self.ray_send_data)

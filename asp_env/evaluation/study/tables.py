@@ -5,6 +5,7 @@ from collections.abc import Collection, Iterator, Sequence
 
 from rich import box
 from rich.table import Table
+from rich.text import Text
 
 from asp_env.evaluation.closed_loop.scenario_table import DrivenScenarios
 from asp_env.evaluation.results import SCORE, Row, difference_of
@@ -81,11 +82,11 @@ def _cell(rows: Sequence[Row], condition: tuple[str, int]) -> str:
     return text
 
 
-def answer_lines(answers: Sequence[Answer]) -> Iterator[str]:
+def answer_lines(answers: Sequence[Answer]) -> Iterator[str | Text]:
     """Each question, with the first sentences of its answer."""
     for answer in answers:
         if answer.sentences:
-            yield f"\n[bold]{answer.question}[/bold]"
+            yield Text(f"\n{answer.question}", style="bold")
             yield from (f"  {sentence}" for sentence in answer.sentences[:MOST_SENTENCES])
             if (more := len(answer.sentences) - MOST_SENTENCES) > 0:
                 yield f"  {more} more in manifest.json and metrics.csv"

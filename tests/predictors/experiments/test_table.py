@@ -385,7 +385,7 @@ def test_failed_cells_end_with_status_1(
         (["--views", "raster"], "unknown view 'raster'"),
         (["--ablations", "skip"], "unknown ablation 'skip'"),
         (["--horizons", "0.3"], "0.3"),
-        (["--jobs", "-1"], "--jobs -1: expected 0 or more"),
+        (["--jobs", "-1"], "--jobs -1: expected 0 to 1024 processes"),
         (["--per-recording", "0"], "--per-recording 0: expected 1 or more"),
         (["--horizons", "3", "6", "3"], "--horizons: 3.0 is given twice; give it once"),
         (["--seeds", "-1"], "--seeds -1: expected 0 to 4294967295"),

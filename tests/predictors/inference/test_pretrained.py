@@ -17,7 +17,6 @@ from asp_env.errors import AspEnvError, CheckpointError
 from asp_env.evaluation.open_loop.evaluate import Evaluate, evaluate
 from asp_env.evaluation.selection import ticks_to_evaluate
 from predictors.inference.checkpoint import weights_hash
-from predictors.inference.onnx_file import write_onnx
 from predictors.inference.pretrained import PRETRAINED, pretrained_folder, pretrained_names
 from tests.predictors.tiny import save_random
 
@@ -161,9 +160,3 @@ def test_weights_are_rounded_to_half_precision() -> None:
     for name in pretrained_names():
         stored = load_file(pretrained_folder(name) / "weights.safetensors")
         assert {tensor.dtype for tensor in stored.values()} == {np.dtype(np.float16)}
-
-
-@every
-def test_pretrained_weights_are_exported(name: str, tmp_path: Path) -> None:
-    """Onnxruntime agrees with the network, the standing mode included."""
-    assert write_onnx(f"{name}:{PRETRAINED}", tmp_path / "network.onnx") <= 1e-4
