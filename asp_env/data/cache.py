@@ -20,7 +20,7 @@ import numpy as np
 from asp_env.errors import AspEnvError, DataError
 from asp_env.files import atomic_file, atomic_folder
 
-FORMAT = 11
+FORMAT = 12
 """Version of the readers. Raise it whenever a reader gives other results for the same files."""
 
 _logger = logging.getLogger("asp_env")
@@ -106,6 +106,35 @@ def get_or_create(group: str, name: str, make: Callable[[Path], None]) -> Path:
     return folder
 
 
+def array_of(kind: str, version: int, content: str, make: Callable[[], np.ndarray]) -> np.ndarray:
+    """An array that follows from some content, from the cache if it is there and not damaged.
+
+    If the cache cannot be written, one line is logged, and `make` is called every time.
+
+    Args:
+        kind: what the array is; the file's name begins with it.
+        version: version of `make`. Raise it whenever the result is another one.
+        content: a hash of the content that the array follows from.
+        make: computes the array.
+    """
+    made_from = [[kind, version, content]]
+    try:
+        path = cache_folder() / f"{kind}-{content[:20]}.bin"
+    except DataError as error:
+        note_uncached(error)
+        return make()
+    found = load(path, made_from)
+    if found is None:
+        array = make()
+        try:
+            save(path, made_from, {}, {"array": array})
+        except OSError as error:
+            note_uncached(error, path)
+        found = load(path, made_from) or ({}, {"array": array})
+    (array,) = found[1].values()
+    return array
+
+
 def entry_path(folder: Path, source: Path, *salt: object) -> Path:
     """The cache file for data read from `source`; `salt` distinguishes several of one source."""
     key = hashlib.sha256(repr((str(source.resolve()), salt)).encode()).hexdigest()[:20]
@@ -123,6 +152,11 @@ def stamp(files: Iterable[Path]) -> list[list[Any]]:
         try:
             status = path.stat()
         except OSError as error:
+            if path.is_symlink():
+                raise DataError(
+                    f"{path}: is a link to a file that does not exist; fetch that file, such as by "
+                    "`git annex get`"
+                ) from error
             raise DataError(f"{path}: {error.strerror}; expected a file to read") from error
         rows.append([path.name, status.st_size, status.st_mtime_ns])
     return rows

@@ -33,7 +33,6 @@ from asp_env.data import cache
 from asp_env.data.classes import VULNERABLE
 from asp_env.data.recording import Recording
 from asp_env.dynamics.bicycle import AXLE_SHARE_OF_LENGTH
-from asp_env.errors import DataError
 from asp_env.geometry import wrap_scalar
 
 VERSION = 1
@@ -198,26 +197,8 @@ def _measure(
 
 
 def _cached_states(recording: Recording) -> Float[np.ndarray, "rows 4"]:
-    """The causal states, read-only, from the cache if they are there.
-
-    If the cache cannot be written, one line is logged, and the tracks are filtered every time.
-    """
-    content = _digest(recording)
-    stamp = [["causal", VERSION, content]]
-    try:
-        path = cache.cache_folder() / f"causal-{content[:20]}.bin"
-    except DataError as error:
-        cache.note_uncached(error)
-        return causal_states(recording)
-    if (found := cache.load(path, stamp)) is not None:
-        return found[1]["states"]
-    states = causal_states(recording)
-    try:
-        cache.save(path, stamp, {}, {"states": states})
-    except OSError as error:
-        cache.note_uncached(error, path)
-    found = cache.load(path, stamp)
-    return states if found is None else found[1]["states"]
+    """The causal states, read-only if the cache can be written, from there if they are there."""
+    return cache.array_of("causal", VERSION, _digest(recording), lambda: causal_states(recording))
 
 
 def _digest(recording: Recording) -> str:

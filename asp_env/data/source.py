@@ -1,9 +1,9 @@
 """Sources of data: `open_data` finds the recordings that a folder or a source's name stands for."""
 
 import hashlib
+import os
 import re
 import warnings
-from collections import Counter
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import replace
 from functools import partial
@@ -16,7 +16,13 @@ from asp_env.arguments import shown
 from asp_env.data.readers.compressed import CSV
 from asp_env.data.readers.layout import ARCHIVE, archive_hint, shorten, walk
 from asp_env.data.readers.levelx import LevelxFiles
-from asp_env.data.readers.opening import ReaderState, RecordingFiles, content_hash, open_recording
+from asp_env.data.readers.opening import (
+    ReaderState,
+    RecordingFiles,
+    content_hash,
+    find_copies,
+    open_recording,
+)
 from asp_env.data.recording import DEFAULT_DT_S, Recording, check_duration
 from asp_env.errors import (
     AspEnvError,
@@ -26,6 +32,7 @@ from asp_env.errors import (
     StaleInstallError,
     unknown_name,
 )
+from asp_env.stored import brief
 
 _FIRST = ("levelx", "interaction")
 """Readers whose recordings stand before those of others."""
@@ -44,6 +51,8 @@ class Recordings(Sequence[Any]):  # not of Recording: run-time checks of its ite
         names: the recordings' ids, such as `00`.
         files: the files of each recording.
         dt_s: seconds per tick that the recordings are opened for.
+        repairs: one line for each recording that `open_data` leaves out, since its tables are
+            those of another one.
     """
 
     def __init__(
@@ -54,6 +63,7 @@ class Recordings(Sequence[Any]):  # not of Recording: run-time checks of its ite
         dt_s: float = DEFAULT_DT_S,
         opened: ReaderState | None = None,
         quiet: bool = False,
+        repairs: tuple[str, ...] = (),
     ) -> None:
         """Creates the sequence without reading any recording.
 
@@ -65,11 +75,13 @@ class Recordings(Sequence[Any]):  # not of Recording: run-time checks of its ite
             opened: the recordings that are already open, for the same `dt_s`.
             quiet: whether repairs of maps are not warned of when a recording is opened, because
                 the caller reports them.
+            repairs: one line for each recording that is left out.
         """
         self.source = source
         self.names = tuple(each.name for each in files)
         self.files = tuple(files)
         self.dt_s = dt_s
+        self.repairs = repairs
         self._opened = ReaderState(dt_s=dt_s, quiet=quiet) if opened is None else opened
 
     def __deepcopy__(self, memo: dict[int, Any]) -> "Recordings":
@@ -165,7 +177,8 @@ def open_data(data: str | Path, *, dt_s: float = DEFAULT_DT_S) -> Recordings:
     """Finds recordings; each is read at its first access.
 
     Recordings of which a tick is a whole number of frames are read as they are. The others are
-    resampled to the nearest frame rate for which it is.
+    resampled to the nearest frame rate for which it is. A recording whose tables have the same
+    content as those of an earlier one, byte for byte, is left out with a warning.
 
     Args:
         data: a folder with recordings in layouts of the registered readers, such as those of inD,
@@ -203,13 +216,38 @@ def open_data(data: str | Path, *, dt_s: float = DEFAULT_DT_S) -> Recordings:
             f"files of another reader ({', '.join(registry.names('readers'))}), in the folder or "
             f"below{_tables_hint(folder)}{archive_hint(folder)}"
         )
-    counts = Counter(each.name for each in files)
-    if duplicate := next((name for name, count in counts.items() if count > 1), None):
-        raise DataError(
-            f"data {source!r}: two recordings are called {duplicate}, expected unique names; "
-            "put each layout in a folder of its own"
+    once, repairs = _without_copies(files)
+    by_name: dict[str, RecordingFiles] = {}
+    for each in once:
+        other = by_name.setdefault(each.name, each)
+        if other is not each:
+            raise DataError(
+                f"data {source!r}: two recordings are called {each.name}, expected unique names: "
+                f"{other.tracks} and {each.tracks}; rename the file or folder of one, or give "
+                "their folders one at a time"
+            )
+    if repairs:
+        warnings.warn(
+            f"data {source!r}: {len(repairs)} of {len(files)} recordings are in it twice: "
+            f"{shorten(repairs, SHOWN_REPAIRS)} (asp-env inspect lists all repairs)",
+            RepairWarning,
+            stacklevel=2,
         )
-    return Recordings(source, files, dt_s=dt_s)
+    return Recordings(source, once, dt_s=dt_s, repairs=tuple(repairs))
+
+
+def _without_copies(
+    files: Sequence[RecordingFiles],
+) -> tuple[list[RecordingFiles], list[str]]:
+    """The recordings without those whose tables are those of another one, and a line for these."""
+    copies = find_copies(files)
+    lines = []
+    for copy, first in copies.items():
+        name, other = files[copy].name, files[first].name
+        if name == other:
+            name, other = (f"{name} ({files[each].tracks})" for each in (copy, first))
+        lines.append(f"recording {name}: left out, since its tables are those of {other}")
+    return [each for number, each in enumerate(files) if number not in copies], lines
 
 
 def _tables_hint(folder: Path) -> str:
@@ -372,7 +410,11 @@ def find_by_reader(folder: Path) -> dict[str, list[RecordingFiles] | AspEnvError
     found: dict[str, list[RecordingFiles] | AspEnvError] = {}
     for name in names:
         try:
-            found[name] = list(registry.find("readers", name)(folder))
+            recordings = list(registry.find("readers", name)(folder))
+            for each in recordings:
+                if not isinstance(each, RecordingFiles):
+                    raise TypeError(f"it yields {brief(repr(each))}, expected FoundRecording")
+            found[name] = recordings
         except StaleInstallError:
             raise
         except OSError as error:
@@ -396,9 +438,10 @@ def find_by_reader(folder: Path) -> dict[str, list[RecordingFiles] | AspEnvError
 
 def _is_taken(files: RecordingFiles, taken: set[Path]) -> bool:
     """Whether files with the names of inD are those of another layout: Veh_smoothed_tracks.csv."""
-    return isinstance(files, LevelxFiles) and (
-        {path for path in files.tables if path.is_file()} <= taken
-    )
+    if not isinstance(files, LevelxFiles):
+        return False
+    present = {path for path in files.tables if os.path.lexists(path)}
+    return bool(present) and present <= taken
 
 
 def _find(folder: Path) -> tuple[RecordingFiles, ...]:

@@ -9,12 +9,11 @@ regret of constant velocity states where it fails: a selection by it favours all
 import hashlib
 from collections.abc import Sequence
 from functools import partial
-from pathlib import Path
 
 import numpy as np
 from jaxtyping import Bool, Float
 
-from asp_env.data.cache import get_or_create
+from asp_env.data.cache import array_of
 from asp_env.data.predictor import Predictor, load_predictor
 from asp_env.data.recording import ticks
 from asp_env.data.scenarios.scenario import ScenarioSet
@@ -122,35 +121,30 @@ def scenario_regrets(
         rows = np.flatnonzero(scenarios.recording == number)
         for column, predictor in enumerate(loaded):
             make = partial(
-                _save_regrets, recordings, scenarios.select(rows), predictor, planner, horizon
+                _largest_regrets, recordings, scenarios.select(rows), predictor, planner, horizon
             )
             table = [
                 getattr(scenarios, field)[rows] for field in ("ego_id", "start_tick", "length")
             ]
             identity = (
-                *(VERSION, recordings.subset([number]).hashes(), scenarios.dt_s),
+                *(recordings.subset([number]).hashes(), scenarios.dt_s),
                 *(scenarios.history, horizon, planner),
                 *(predictors[column], sorted(predictor.metadata.items())),
                 np.stack(table).astype(np.int64).tobytes(),
             )
-            key = hashlib.sha256(repr(identity).encode()).hexdigest()[:20]
-            folder = get_or_create("regrets", key, make)
-            largest[rows, column] = np.load(folder / _FILE, allow_pickle=False)
+            content = hashlib.sha256(repr(identity).encode()).hexdigest()
+            largest[rows, column] = array_of("regrets", VERSION, content, make)
     return largest
 
 
-_FILE = "largest.npy"
-
-
-def _save_regrets(
+def _largest_regrets(
     recordings: Recordings,
     scenarios: ScenarioSet,
     predictor: Predictor,
     planner: str,
     horizon: int,
-    folder: Path,
-) -> None:
-    """Writes the largest regret of a predictor in each scenario."""
+) -> Float[np.ndarray, " n"]:
+    """The largest regret of a predictor in each scenario."""
     states = logged_states(scenarios)
     regrets = regrets_at(
         states,
@@ -163,7 +157,7 @@ def _save_regrets(
     )[predictor.name]
     largest = np.zeros(len(scenarios))
     np.maximum.at(largest, states.scenario, regrets)
-    np.save(folder / _FILE, largest)
+    return largest
 
 
 def _clauses(selection: str) -> list[str]:

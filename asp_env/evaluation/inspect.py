@@ -124,7 +124,9 @@ class Inspect:
             AspEnvError: the data do not exist, some recordings cannot be read, or a tick is
                 shorter than a frame.
         """
-        recordings = open_data(self.data, dt_s=self.dt)
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore", RepairWarning)  # repairs are listed
+            recordings = open_data(self.data, dt_s=self.dt)
         console = table_console()
         summaries, faults = self.examine(recordings, console)
         if summaries:
@@ -132,16 +134,28 @@ class Inspect:
             console.print(_map_table(_maps(summaries)))
             console.print(_drift_table(summaries, self.dt))
             console.print(_scenario_table(summaries))
-        self.show_notes(summaries, faults, console)
+        self.show_notes(recordings.repairs, summaries, faults, console)
         if faults:
             raise DataError(_summary(recordings, faults))
 
     def show_notes(
-        self, summaries: Sequence[RecordingSummary], faults: Mapping[str, str], console: Console
+        self,
+        copies: Sequence[str],
+        summaries: Sequence[RecordingSummary],
+        faults: Mapping[str, str],
+        console: Console,
     ) -> None:
-        """Prints the repairs and the faults, below the tables."""
-        if summaries:
-            _print_lines(console, "Repairs", _repairs(summaries, _maps(summaries)))
+        """Prints the repairs and the faults, below the tables.
+
+        Args:
+            copies: lines about recordings that are left out, since they are in `data` twice.
+            summaries: the recordings that can be read.
+            faults: why the others cannot, by name.
+            console: prints the lines.
+        """
+        if summaries or copies:
+            lines = [*copies, *_repairs(summaries, _maps(summaries))]
+            _print_lines(console, "Repairs", lines)
         _print_lines(console, "Faults", list(faults.values()))
 
     def examine(

@@ -4,7 +4,6 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal
-from zipfile import BadZipFile
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
@@ -13,7 +12,7 @@ from asp_env.data.predictor import Predictor
 from asp_env.data.snippets import SnippetIndex, gather_scene, index_snippets
 from asp_env.data.source import Recordings
 from asp_env.data.split import snippet_parts
-from asp_env.errors import AspEnvError
+from asp_env.errors import AspEnvError, DataError
 from asp_env.evaluation.open_loop.ground_truth import gather_ground_truth
 from asp_env.evaluation.open_loop.scoring import (
     BATCH,
@@ -24,6 +23,7 @@ from asp_env.evaluation.open_loop.scoring import (
 )
 from asp_env.files import atomic_file
 from asp_env.metrics.forecast.errors import SELECTIONS, moving, open_loop_errors
+from asp_env.stored import read_arrays
 
 METRICS = ("MAE", "MSE", "ADE", "FDE")
 
@@ -67,9 +67,13 @@ class Errors:
 
     @classmethod
     def load(cls, path: Path) -> "Errors":
-        """Reads a file that `save` wrote."""
-        with np.load(path, allow_pickle=False) as file:
-            has_violations = "violations" in file.files
+        """Reads a file that `save` wrote.
+
+        Raises:
+            DataError: the file is missing or damaged.
+        """
+        try:
+            file = read_arrays(path)
             nothing = np.zeros((len(VIOLATIONS), len(file["moving"])), dtype=bool)
             return cls(
                 values=file["values"],
@@ -78,18 +82,22 @@ class Errors:
                 track=file["track"],
                 tick=file["tick"],
                 stamp=str(file["stamp"]),
-                violations=file["violations"] if has_violations else nothing.astype(np.float32),
-                violations_valid=file["violations_valid"] if has_violations else nothing,
+                violations=file.get("violations", nothing.astype(np.float32)),
+                violations_valid=file.get("violations_valid", nothing),
             )
+        except (OSError, KeyError, ValueError, TypeError) as error:
+            reason = str(error) or type(error).__name__
+            raise DataError(
+                f"{path}: not readable errors of forecasts ({reason}); remove the file, and they "
+                "are computed again"
+            ) from error
 
 
 def stamp_of(path: Path) -> str | None:
     """The stamp of a file of errors; None if the file does not exist or is damaged."""
     try:
-        # NumPy does not close a damaged file that it has opened by its path.
-        with path.open("rb") as opened, np.load(opened, allow_pickle=False) as file:
-            return str(file["stamp"])
-    except (OSError, KeyError, ValueError, BadZipFile):
+        return str(read_arrays(path)["stamp"])
+    except (OSError, KeyError, ValueError):
         return None
 
 

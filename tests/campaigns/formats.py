@@ -93,10 +93,11 @@ def use_recordings(folder: Path) -> None:
 def _inspect(folder: Path) -> None:
     """What `inspect` shows, without the drawing of its tables, which hold no text of files."""
     inspect, console = Inspect(data=str(folder)), page_console(160)
-    summaries, faults = inspect.examine(open_data(folder), console)
+    recordings = open_data(folder)
+    summaries, faults = inspect.examine(recordings, console)
     for each in summaries:
         check_finite("drift", *each.drifts.metres.values(), *each.drifts.euler_metres.values())
-    inspect.show_notes(summaries, faults, console)
+    inspect.show_notes(recordings.repairs, summaries, faults, console)
 
 
 def _drive(recordings: Recordings, scenarios: list[Any]) -> None:

@@ -131,9 +131,11 @@ def write_map(
 
 
 def write_folder(folder: Path, *, recordings: int = 1, place: str = PLACE) -> Path:
-    """Writes recordings of one location, and its map."""
+    """Writes recordings of one location, whose clocks begin at other times, and its map."""
     for number in range(recordings):
-        write_recording(folder, number=f"{number:03d}", place=place)
+        vehicles = some_cars()
+        vehicles["timestamp_ms"] += 100 * number
+        write_recording(folder, number=f"{number:03d}", place=place, vehicles=vehicles)
     write_map(folder, place=place)
     return folder
 

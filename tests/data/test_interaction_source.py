@@ -1,5 +1,6 @@
 """Opening folders in the INTERACTION layout: names, maps and their frames, and the cache."""
 
+import gzip
 import shutil
 from collections.abc import Callable
 from pathlib import Path
@@ -14,6 +15,7 @@ from asp_env.errors import DataError
 from tests.data import levelx_files
 from tests.data.interaction_files import (
     PLACE,
+    some_cars,
     walk,
     write_folder,
     write_map,
@@ -93,6 +95,8 @@ def test_locations_of_one_name_have_their_own_maps(tmp_path: Path) -> None:
     """The nearest map, and names that include the path."""
     for year in ("2019", "2020"):
         write_folder(tmp_path / "data" / year)
+    later = some_cars().assign(timestamp_ms=lambda table: table["timestamp_ms"] + 100)
+    write_recording(tmp_path / "data" / "2020", vehicles=later)
     write_map(
         tmp_path / "data" / "2019",
         text=levelx_files.two_lane_road(
@@ -176,3 +180,21 @@ def test_commands_take_this_layout(tmp_path: Path, capsys: pytest.CaptureFixture
         table = pd.read_csv(tmp_path / out / "metrics.csv")
         assert set(table["data"].dropna()) == {folder}
         assert table["n"].to_numpy().max() > 0
+
+
+@pytest.mark.parametrize("number", ["4", "004", "4.0"])
+@pytest.mark.parametrize(("limit", "expected"), [("50", 50 / 3.6), ("", None), ("-1", None)])
+def test_rows_of_metadata(tmp_path: Path, number: str, limit: str, expected: float | None) -> None:
+    """Numbers as spreadsheets write them, an empty speed limit, and a compressed file."""
+    location = write_taf_bw(tmp_path / "data", id=number, speedLimit_kmh=limit)
+    path = location / "meta_data.csv"
+    path.with_name("meta_data.csv.gz").write_bytes(gzip.compress(path.read_bytes()))
+    path.unlink()
+    (recording,) = open_data(tmp_path / "data")
+    assert recording.speed_limit_mps == (None if expected is None else pytest.approx(expected))
+
+
+def test_an_implausible_speed_limit_in_metadata(tmp_path: Path) -> None:
+    write_taf_bw(tmp_path / "data", speedLimit_kmh=300)
+    with pytest.raises(DataError, match="speedLimit_kmh is '300', expected km/h from -162 to 162"):
+        open_data(tmp_path / "data")[0]

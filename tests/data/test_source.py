@@ -10,7 +10,7 @@ import pytest
 
 from asp_env import registry
 from asp_env.data import cache
-from asp_env.data.readers import layout, opening
+from asp_env.data.readers import layout, levelx, levelx_meta, opening
 from asp_env.data.recording import Recording
 from asp_env.data.source import Recordings, join_data, load, open_data
 from asp_env.errors import AspEnvError, DataError
@@ -37,9 +37,9 @@ def reads(monkeypatch: pytest.MonkeyPatch) -> list[str]:
     names: list[str] = []
     read_levelx, parse_lanelet2 = opening.read_levelx, opening.parse_lanelet2
 
-    def tracks(files):
+    def tracks(files, frame_rate_hz):
         names.append(files.tracks.name)
-        return read_levelx(files)
+        return read_levelx(files, frame_rate_hz)
 
     def lanelets(path, origin):
         names.append(path.name)
@@ -77,6 +77,31 @@ def test_recordings_and_maps_are_read_at_first_access(folder: Path, reads: list[
     assert reads == ["01_tracks.csv", "location1.osm", "00_tracks.csv"]
     with pytest.raises(IndexError):
         recordings[3]
+
+
+def test_metadata_are_read_once_for_each_opening(
+    folder: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Without the cache, and with it."""
+    reads: list[str] = []
+
+    def table(path: Path, *args: Any, **options: Any) -> dict[str, np.ndarray]:
+        reads.append(path.name)
+        return read_table(path, *args, **options)
+
+    read_table = levelx.read_table
+    for module in (levelx, levelx_meta):
+        monkeypatch.setattr(module, "read_table", table)
+    recordings = open_data(folder)
+    assert len(recordings[0]) == 3
+    recordings.hashes()
+    assert [name for name in reads if name.startswith("00")] == [
+        "00_recordingMeta.csv",
+        "00_tracksMeta.csv",
+    ]
+    del reads[:]
+    open_data(folder)[0]
+    assert reads == ["00_recordingMeta.csv"]
 
 
 def test_second_time_comes_from_the_cache(

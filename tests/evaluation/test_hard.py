@@ -58,6 +58,12 @@ def test_the_largest_over_all_states_and_cached(
     np.testing.assert_array_equal(scenario_regrets(sample, interactive, names), largest)
     with pytest.raises(TypeError):  # other scenarios are another entry
         scenario_regrets(sample, interactive.select(np.arange(1, len(interactive))), names)
+    for path in cache_folder().glob("regrets-*"):
+        damaged = bytearray(path.read_bytes())
+        damaged[-1] ^= 1
+        path.write_bytes(damaged)
+    with pytest.raises(TypeError):  # damaged entries are computed again
+        scenario_regrets(sample, interactive, names)
 
 
 def test_hard_scenarios(sample: Recordings, interactive: ScenarioSet) -> None:
@@ -76,7 +82,7 @@ def test_without_hard_nothing_is_computed(sample: Recordings) -> None:
     assert len(select_scenarios(sample, "", dt_s=0.2, history=15)) == len(
         find_scenarios(sample, source=sample.source, dt_s=0.2, history=15)
     )
-    assert not (cache_folder() / "regrets").exists()
+    assert not list(cache_folder().glob("regrets-*"))
     assert not is_hard("left,density>5")
     assert is_hard("left, hard")
 

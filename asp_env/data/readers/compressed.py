@@ -2,6 +2,9 @@
 
 import gzip
 import io
+import os
+import re
+from collections.abc import Iterable
 from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
@@ -15,7 +18,43 @@ MEMORY_BYTES = 1 << 28
 """Memory that an `.xz` file may require. `xz -9` requires 65 MiB; a damaged or forged file may
 require 4 GiB."""
 
+_TABLE = re.compile(r"^(.+\.csv)(|\.gz|\.xz)$")
 _BLOCK_BYTES = 1 << 16
+
+
+def plain_name(name: str) -> str:
+    """A table's name in lower case, without the suffix of its compression."""
+    match = _TABLE.match(name.lower())
+    return match[1] if match else name.lower()
+
+
+def one_of_each(names: Iterable[str]) -> list[str]:
+    """Names of a folder's files with one for each table: that which is not compressed, if any.
+
+    The names of a table's files differ in their compression or in case. If all are compressed, the
+    first of `.csv.gz` and `.csv.xz` is used.
+    """
+    others = {name for files in _tables(names).values() for name in files[1:]}
+    return [name for name in names if name not in others]
+
+
+def unread_copies(folder: Path) -> dict[str, list[str]]:
+    """The files of a folder that are not read, by the name of that which `one_of_each` prefers."""
+    try:
+        with os.scandir(folder) as entries:
+            names = [entry.name for entry in entries if entry.is_file()]
+    except OSError:
+        return {}
+    return {first: others for first, *others in _tables(names).values() if others}
+
+
+def _tables(names: Iterable[str]) -> dict[str, list[str]]:
+    """The names of each table's files, that which is read first."""
+    ranked: dict[str, list[tuple[str, str]]] = {}
+    for name in names:
+        if match := _TABLE.match(name.lower()):
+            ranked.setdefault(match[1], []).append((match[2], name))
+    return {table: [name for _, name in sorted(files)] for table, files in ranked.items()}
 
 
 def open_table(path: Path) -> io.BufferedIOBase:

@@ -5,7 +5,7 @@ folder and yields a `FoundRecording` for each recording in or below it; `docs/re
 """
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -13,6 +13,7 @@ from jaxtyping import Float, Int8
 
 from asp_env.data.readers.lanelet2 import Lanelet2File
 from asp_env.data.readers.measurements import Measurements
+from asp_env.data.readers.reader_checks import check_properties, checked_measurements
 from asp_env.data.road_map import RoadMap
 from asp_env.data.signals import SignalState
 from asp_env.errors import DataError
@@ -29,6 +30,20 @@ class SignalChanges:
     """When the states begin, on the clock of the measurements; increasing."""
     states: Int8[np.ndarray, "signals changes"]
     """`SignalState` of each signal from that time on. It is `UNKNOWN` before the first time."""
+
+    def __post_init__(self) -> None:
+        """Checks that the arrays fit each other.
+
+        Raises:
+            ValueError: they have other shapes, or the times decrease.
+        """
+        shape, times = np.shape(self.states), np.asarray(self.time_ms)
+        if len(shape) != 2 or np.shape(self.stop_lines) != (shape[0], 2, 2):
+            raise ValueError(
+                "stop_lines and states: expected (signals, 2, 2) and (signals, changes)"
+            )
+        if times.shape != shape[1:] or not (np.diff(times) >= 0).all():
+            raise ValueError(f"time_ms: expected {shape[1]} increasing times, one for each change")
 
     def at(self, time_ms: Float[np.ndarray, " frames"]) -> Int8[np.ndarray, "signals frames"]:
         """The states at some times, ms."""
@@ -70,6 +85,19 @@ class FoundRecording:
     read: Callable[[tuple[Path, ...]], RecordingTables]
     """Reads `tables`: a function of a module, so that worker processes can import it."""
 
+    def __post_init__(self) -> None:
+        """Checks the fields, which another package has given.
+
+        Raises:
+            ValueError: there are no files, or a field has another type.
+        """
+        if not isinstance(self.name, str) or not self.name:
+            raise ValueError(f"name: {self.name!r}, expected a text")
+        if not self.tables or not all(isinstance(path, Path) for path in self.tables):
+            raise ValueError(f"tables of {self.name}: {self.tables!r}, expected paths of files")
+        if not callable(self.read):
+            raise ValueError(f"read of {self.name}: {self.read!r}, expected a function")
+
     @property
     def tracks(self) -> Path:
         """The file with the tracks."""
@@ -87,12 +115,19 @@ class FoundRecording:
             DataError: the files are damaged, or the reader fails.
         """
         try:
-            return self.read(self.tables)
+            tables = self.read(self.tables)
+            if not isinstance(tables, RecordingTables):
+                raise ValueError(f"{type(tables).__name__}, expected RecordingTables")
+            check_properties(tables)
+            repairs = tuple(" ".join(line.split()) for line in tables.repairs)
+            measurements = checked_measurements(tables.measurements)
+            return replace(tables, measurements=measurements, repairs=repairs)
         except DataError:
             raise
-        except Exception as error:  # a reader of another package may raise anything
+        except (Exception, SystemExit) as error:  # other packages may raise anything
             reason = " ".join(f"{type(error).__name__}: {error}".split())
+            module = getattr(self.read, "__module__", type(self.read).__module__)
             raise DataError(
-                f"{self.tracks}: the reader {self.read.__module__} failed ({reason}); mend the "
+                f"{self.tracks}: the reader {module} failed ({reason}); mend the "
                 "reader or remove the recording"
             ) from error

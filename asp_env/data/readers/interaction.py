@@ -21,7 +21,7 @@ from pathlib import Path
 import numpy as np
 import pandas as pd
 
-from asp_env.data.readers.compressed import CSV
+from asp_env.data.readers.compressed import CSV, plain_name
 from asp_env.data.readers.layout import (
     MAP_SUFFIXES,
     ClassNames,
@@ -35,7 +35,14 @@ from asp_env.data.readers.layout import (
 )
 from asp_env.data.readers.measurements import Measurements, derive_tracks
 from asp_env.data.readers.positions import Origin
-from asp_env.data.readers.ranges import HEADING_RAD, POSITION, SIZE, SPEED, TIME_MS, Limit
+from asp_env.data.readers.ranges import (
+    HEADING_RAD,
+    HIGHEST_LIMIT_MPS,
+    POSITION,
+    SIZE,
+    TIME_MS,
+    Limit,
+)
 from asp_env.data.readers.tables import Kind, find_line, number_ids, read_columns, read_table
 from asp_env.errors import DataError
 
@@ -47,7 +54,7 @@ _META_COLUMNS: dict[str, Kind] = {
     "id": "text",
     "originLat": "number",
     "originLon": "number",
-    "speedLimit_kmh": "number",
+    "speedLimit_kmh": "number or empty",
     "locationId": "text",
 }
 _OPTIONAL_META = frozenset({"speedLimit_kmh", "locationId"})
@@ -71,7 +78,7 @@ LIMITS: Mapping[str, Limit] = {
     "psi_rad": HEADING_RAD,
     "length": SIZE,
     "width": SIZE,
-    "speedLimit_kmh": Limit(largest=SPEED.largest * KMH_PER_MPS, unit="km/h"),
+    "speedLimit_kmh": Limit(largest=HIGHEST_LIMIT_MPS * KMH_PER_MPS, unit="km/h"),
 }
 
 
@@ -136,7 +143,7 @@ def find_recordings(root: Path) -> tuple[InteractionFiles, ...]:
         for name in names:
             if match := _PART.match(name):
                 parts.setdefault((folder, match[2]), {})[match[1].lower()] = folder / name
-            elif name.lower() == META:
+            elif plain_name(name) == META:
                 metas[folder] = folder / name
     folders = Counter(folder.name for folder in {folder for folder, _ in parts})
     found = []
@@ -324,6 +331,8 @@ def read_measurements(
 def measurements_of(columns: Mapping[str, np.ndarray]) -> Measurements:
     """Measurements of the columns of the layout's tables, all rows of which have numbers as ids."""
     sizes = np.stack([columns["length"], columns["width"]], axis=-1)
+    with np.errstate(over="ignore"):  # velocities are only compared with the positions
+        speed = np.hypot(columns["vx"], columns["vy"])
     return Measurements(
         track=columns["track_id"].astype(np.int64),
         time_ms=columns["timestamp_ms"],
@@ -331,7 +340,7 @@ def measurements_of(columns: Mapping[str, np.ndarray]) -> Measurements:
         positions=np.stack([columns["x"], columns["y"]], axis=-1),
         heading=columns["psi_rad"],
         sizes=np.nan_to_num(sizes, nan=0.0),
-        speed=np.hypot(columns["vx"], columns["vy"]),
+        speed=speed,
     )
 
 
@@ -346,4 +355,5 @@ def _origin(path: Path, latitude_deg: float, longitude_deg: float) -> Origin:
 
 
 def _same_number(one: str, other: str) -> bool:
-    return one.strip().lstrip("0") == other.lstrip("0")
+    """Whether two numbers of a recording are equal, such as 4, 004 and the 4.0 of spreadsheets."""
+    return re.sub(r"\.0*$", "", one.strip()).lstrip("0") == other.lstrip("0")

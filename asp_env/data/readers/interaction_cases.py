@@ -27,12 +27,21 @@ from asp_env.data.readers.interaction import (
 from asp_env.data.readers.layout import ClassNames, TrackTable, natural_key, walk
 from asp_env.data.readers.measurements import derive_tracks
 from asp_env.data.readers.positions import Origin
-from asp_env.data.readers.tables import Kind, find_line, has_columns, number_texts, read_table
+from asp_env.data.readers.ranges import Limit
+from asp_env.data.readers.tables import (
+    EXACT,
+    Kind,
+    find_line,
+    has_columns,
+    number_texts,
+    read_table,
+)
 from asp_env.errors import DataError
 from asp_env.stored import brief
 
 _TABLE = re.compile(rf"^(.+?)(?:_(?:train|val|test|obs))?{CSV}$", re.IGNORECASE)
 _NEEDED = ("case_id", "track_id", "timestamp_ms", "agent_type", "x", "y")
+_LIMITS = {"case_id": Limit(largest=float(EXACT - 1), unit="a number")}
 _CASES: Mapping[str, Kind] = {"case_id": "number", **TRACKS, "track_id": "text"}
 _COLUMNS = ("track_ids", "classes", "sizes", "first_frames")
 
@@ -148,12 +157,13 @@ def _shown(case: float) -> str:
 
 
 def _list_cases(path: Path) -> CacheEntry:
-    return {}, {"case_ids": np.unique(read_table(path, {"case_id": "number"})["case_id"])}
+    table = read_table(path, {"case_id": "number"}, limits=_LIMITS)
+    return {}, {"case_ids": np.unique(table["case_id"])}
 
 
 def _read_cases(path: Path) -> CacheEntry:
     names = ClassNames()
-    columns = read_measurements(path, names, _CASES, optional=OPTIONAL_TRACKS)
+    columns = read_measurements(path, names, _CASES, optional=OPTIONAL_TRACKS, limits=_LIMITS)
     if not len(columns["track_id"]):
         raise DataError(f"{path}: has a header but no rows; copy it again or remove the recording")
     ids = number_texts(columns["track_id"])

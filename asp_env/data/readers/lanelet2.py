@@ -151,7 +151,8 @@ def parse_lanelet2(path: Path, origin: Origin) -> Lanelet2File:
         DataError: the file is not a map, has no lanelets, or lies at another location.
     """
     osm = read_osm(path)
-    if not any(relation.tags.get("type") == "lanelet" for relation in osm.relations):
+    num_lanelets = sum(relation.tags.get("type") == "lanelet" for relation in osm.relations)
+    if not num_lanelets:
         raise DataError(
             f"{path}: has no lanelets among its {len(osm.relations)} relations; "
             "expected a lanelet2 map: put the right file in its place"
@@ -160,6 +161,12 @@ def parse_lanelet2(path: Path, origin: Origin) -> Lanelet2File:
     points = locate_nodes(osm, origin, repairs)
     ways = complete_ways(osm.ways.values(), points, repairs)
     lanelets = _lanelets(osm, ways, points, repairs)
+    if not lanelets:
+        raise DataError(
+            f"{path}: none of its {num_lanelets} lanelets has both bounds; expected members with "
+            "the roles 'left' and 'right', which are ways of the file: put the right file in its "
+            "place"
+        )
     return Lanelet2File(
         path=path,
         osm=osm,
@@ -368,7 +375,10 @@ def _use(relation: Relation, subtype: str, unknown: dict[str, list[str]]) -> Use
     for use, subtypes in known:
         if subtype in subtypes:
             of_subtype = use
-    allowed = vehicles_allowed(relation.tags)
+    allowed, are_all_known = vehicles_allowed(relation.tags)
+    if not are_all_known:
+        what = "with an unknown value of a participant, which is not used"
+        unknown.setdefault(what, []).append(relation.id)
     shown = brief(repr(subtype or "road"))
     if allowed and of_subtype != "along":
         what = f"of subtype {shown} are roads, since a participant tag allows vehicles"

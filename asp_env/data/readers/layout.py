@@ -10,6 +10,7 @@ import pandas as pd
 from jaxtyping import Bool, Float, Int
 
 from asp_env.data.classes import AgentClass, parse_class
+from asp_env.data.readers.compressed import one_of_each
 from asp_env.errors import DataError
 from asp_env.geometry import wrap_angle
 
@@ -52,16 +53,24 @@ ARCHIVE = re.compile(
 """The end of the name of an archive, which has to be unpacked before it can be read."""
 
 
+_OF_SYSTEMS = frozenset(
+    {"__macosx", "$recycle.bin", "system volume information", "lost+found"}
+    | {"#recycle", "#snapshot", "@eadir"}
+)
+"""Names of folders of operating systems and network storages, which keep deleted files there."""
+
+
 def is_hidden(name: str) -> bool:
     """Whether a file or folder is hidden or temporary, such as `._NAME`, `__MACOSX`, `~$NAME`."""
-    return name.startswith((".", "~")) or name.upper() == "__MACOSX"
+    return name.startswith((".", "~")) or name.lower() in _OF_SYSTEMS
 
 
 def walk(root: Path) -> list[tuple[Path, list[str]]]:
     """Every folder in and below `root` with the names of its files.
 
     Hidden and temporary files and folders are left out, and so are pipes and devices, at which a
-    reader might wait forever; links are followed, but no folder is visited twice.
+    reader might wait forever, and all files of a table but one (`one_of_each`). Links are followed,
+    but no folder is visited twice.
     """
     visited: set[str] = set()
     found = []
@@ -73,7 +82,8 @@ def walk(root: Path) -> list[tuple[Path, list[str]]]:
         visited.add(real)
         folders[:] = sorted(name for name in folders if not is_hidden(name))
         shown = (name for name in names if not is_hidden(name))
-        found.append((Path(folder), sorted(n for n in shown if may_be_read(Path(folder) / n))))
+        files = sorted(n for n in shown if may_be_read(Path(folder) / n))
+        found.append((Path(folder), one_of_each(files)))
     return found
 
 
@@ -83,6 +93,27 @@ def may_be_read(path: Path) -> bool:
         return not path.exists() or path.is_file()
     except OSError:
         return True
+
+
+def check_content(path: Path, start: bytes) -> None:
+    """Refuses what downloads leave in the place of a file.
+
+    Args:
+        path: the file.
+        start: its first bytes.
+
+    Raises:
+        DataError: it is a pointer of Git LFS or a web page.
+    """
+    text = start.lstrip(b"\xef\xbb\xbf \t\r\n").lower()
+    if text.startswith(b"version https://git-lfs"):
+        raise DataError(
+            f"{path}: is a pointer of Git LFS instead of the file: fetch it by `git lfs pull`"
+        )
+    if text.startswith((b"<!doctype html", b"<html")):
+        raise DataError(
+            f"{path}: is a web page instead of the file, such as a login: download it again"
+        )
 
 
 def archive_hint(folder: Path) -> str:

@@ -31,6 +31,7 @@ from asp_env.data.readers.layout import (
     walk,
     with_parents,
 )
+from asp_env.data.readers.levelx_meta import RecordingMeta
 from asp_env.data.readers.motion_checks import check_headings, check_velocities, motion_of
 from asp_env.data.readers.osm import read_osm
 from asp_env.data.readers.positions import Origin, locate_nodes
@@ -47,7 +48,6 @@ from asp_env.data.readers.ranges import (
 )
 from asp_env.data.readers.sizes import with_footprints
 from asp_env.data.readers.tables import (
-    HIGHEST_HZ,
     LOWEST_HZ,
     Kind,
     NumberedIds,
@@ -72,9 +72,6 @@ DOWNSCALE = {"ind": 12, "round": 10, "exid": 6, "unid": 2}
 SCALES = (1, 2, 6, 10, 12)
 """Factors to try for a dataset that is not in `DOWNSCALE`."""
 
-HIGHEST_LIMIT_MPS = 45.0
-"""No speed limit is higher: 162 km/h. Larger numbers are km/h. Chosen by hand."""
-
 MARGIN_PX = 5.0
 """Distance by which positions may lie outside the image, for rounded scales and smoothed positions.
 Chosen by hand."""
@@ -83,7 +80,7 @@ _PART = re.compile(
     rf"^(.+)_(recordingMeta\.csv|tracksMeta\.csv|tracks{CSV}|background\.png)$",
     re.IGNORECASE,
 )
-_TIME = re.compile(r"^(\d{1,2}(?:\.\d*)?)(?::([0-5]\d)(?::[0-5]\d)?)?$", re.ASCII)
+_OWN_LOCATION = re.compile(r"location[_-]?0*(\d+)$", re.IGNORECASE | re.ASCII)
 _META: Mapping[str, Kind] = {
     "trackId": "id",
     "initialFrame": "whole",
@@ -115,10 +112,6 @@ _LIMITS: Mapping[str, Limit] = {
     "width": SIZE,
     "length": SIZE,
     **dict.fromkeys(_ACCELERATIONS, ACCELERATION),
-    "xUtmOrigin": POSITION,
-    "yUtmOrigin": POSITION,
-    "latLocation": Limit(largest=90.0, unit="degrees"),
-    "lonLocation": Limit(largest=180.0, unit="degrees"),
 }
 
 
@@ -147,27 +140,18 @@ class LevelxFiles:
         """
         present = [path.name for path in self.tables if path.is_file()]
         for path in self.tables:
-            if path.name not in present:
+            if path.name in present:
+                continue
+            if path.is_symlink():
                 raise DataError(
-                    f"{path}: no such file, though {', '.join(present)} exists; "
-                    "copy it to the same folder or remove the recording"
-                    f"{archive_hint(path.parent)}"
+                    f"{path}: is a link to a file that does not exist; fetch that file, such as by "
+                    "`git annex get`, or remove the recording"
                 )
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class RecordingMeta:
-    """The content of `XX_recordingMeta.csv`."""
-
-    number: int
-    location: int
-    frame_rate_hz: float
-    speed_limit_mps: float | None
-    metres_per_ortho_pixel: float | None
-    origin: Origin
-    start_hour: float | None = None
-    """Time of day of the first frame, hours after midnight."""
-    weekday: str | None = None
+            raise DataError(
+                f"{path}: no such file, though {', '.join(present)} exists; "
+                "copy it to the same folder or remove the recording"
+                f"{archive_hint(path.parent)}"
+            )
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -215,51 +199,6 @@ def find_recordings(root: Path) -> tuple[LevelxFiles, ...]:
     return tuple(sorted(found, key=lambda files: natural_key(files.name)))
 
 
-def read_recording_meta(path: Path) -> RecordingMeta:
-    """Reads `XX_recordingMeta.csv`.
-
-    Raises:
-        DataError: the file is damaged, or its frame rate is not positive.
-    """
-    needed = ("recordingId", "locationId", "frameRate", "xUtmOrigin", "yUtmOrigin")
-    table = read_table(
-        path,
-        {
-            **dict.fromkeys(needed[:2], "whole"),
-            **dict.fromkeys(needed[2:], "number"),
-            **dict.fromkeys(("latLocation", "lonLocation"), "number"),
-            "speedLimit": "number or empty",
-        },
-        optional=frozenset({"speedLimit"}),
-        limits=_LIMITS,
-    )
-    if len(table["frameRate"]) > 1:
-        raise DataError(
-            f"{path}, line 3: a second row (recordingId {table['recordingId'][1]}), expected one "
-            "row, of one recording; remove the others"
-        )
-    rate = float(table["frameRate"][0])
-    if not LOWEST_HZ <= rate <= HIGHEST_HZ:
-        raise DataError(
-            f"{path}, line 2: frameRate is {rate:g}, expected {LOWEST_HZ:g} to {HIGHEST_HZ:g} Hz"
-        )
-    return RecordingMeta(
-        number=int(table["recordingId"][0]),
-        location=int(table["locationId"][0]),
-        frame_rate_hz=rate,
-        speed_limit_mps=_speed_limit(path, table.get("speedLimit")),
-        metres_per_ortho_pixel=_positive_or_none(path, "orthoPxToMeter"),
-        origin=Origin(
-            x_m=float(table["xUtmOrigin"][0]),
-            y_m=float(table["yUtmOrigin"][0]),
-            longitude_deg=float(table["lonLocation"][0]),
-            latitude_deg=float(table["latLocation"][0]),
-        ),
-        start_hour=_hour(_text_or_none(path, "startTime")),
-        weekday=_text_or_none(path, "weekday"),
-    )
-
-
 def find_map(
     files: LevelxFiles, meta: RecordingMeta, maps_by_folder: dict[Path, list[Path]]
 ) -> tuple[Path, tuple[str, ...]]:
@@ -289,6 +228,8 @@ def find_map(
         preferred = [path for path in fitting if _is_construction(path) == under_construction]
         chosen = preferred or fitting or _maps_near(maps, meta.origin)
         if chosen:
+            if fitting:  # `location1.osm` before other names in the folder `01_bendplatz`
+                chosen = sorted(chosen, key=lambda path: not _OWN_LOCATION.search(path.stem))
             return chosen[0], _guess(chosen, folder, meta.location, named=bool(fitting))
     raise DataError(
         f"{files.root}: no map for location {meta.location} of recording {files.name}; "
@@ -348,7 +289,7 @@ def _lie_in_image(xy: Float[np.ndarray, "rows 2"], size_px: tuple[int, int], sca
     )
 
 
-def read_levelx(files: LevelxFiles) -> TrackTable:
+def read_levelx(files: LevelxFiles, frame_rate_hz: float) -> TrackTable:
     """Reads a recording's tracks.
 
     The heading of a vehicle is that of the file; its speed is the norm of the velocity, negative if
@@ -357,6 +298,10 @@ def read_levelx(files: LevelxFiles) -> TrackTable:
     Accelerations are those of the file along the velocity, or along the heading below 0.3 m/s or
     without the columns `xAcceleration` and `yAcceleration`. A track with a gap in its frames is
     split there, and the later part gets a new id.
+
+    Args:
+        files: the recording's files.
+        frame_rate_hz: the frame rate in its metadata.
 
     Raises:
         DataError: a file is damaged, or the two tables list different tracks.
@@ -374,11 +319,12 @@ def read_levelx(files: LevelxFiles) -> TrackTable:
         rows.measured[:, :2], ("xCenter", "yCenter"), lambda row: _line(files, rows, row, numbered)
     )
     repairs = [*names.repairs(), *numbered.repairs]
-    rows, step = _count_frames(files, rows, meta, numbered, repairs)
+    rows, step = _count_frames(files, rows, meta, numbered, frame_rate_hz, repairs)
     begins = np.flatnonzero(np.diff(rows.track, prepend=rows.track[0] - 1))
     _compare_frames(rows, begins, meta, order, repairs)
     sizes = _sizes(files, rows.sizes[begins], meta, order, classes, repairs)
-    _check_motion(files, rows, step, is_vulnerable=np.isin(classes, _VULNERABLE), repairs=repairs)
+    is_vulnerable = np.isin(classes, _VULNERABLE)
+    _check_motion(files, rows, frame_rate_hz / step, is_vulnerable=is_vulnerable, repairs=repairs)
 
     starts, new_ids = _split_at_gaps(rows, begins, ids, repairs)
     lengths = np.diff(starts, append=len(rows.track))
@@ -424,8 +370,7 @@ def _along_motion(
 
 
 def _names_location(path: Path, location: int) -> bool:
-    own = re.search(r"location[_-]?0*(\d+)$", path.stem, re.IGNORECASE | re.ASCII)
-    if own:
+    if own := _OWN_LOCATION.search(path.stem):
         return int(own[1]) == location
     folder = re.match(r"0*([0-9]+)[_-]", path.parent.name)
     return bool(folder) and int(folder[1]) == location
@@ -459,47 +404,6 @@ def _maps_near(maps: list[Path], origin: Origin) -> list[Path]:
         if distance < NEAR_M:
             found.append((distance, path))
     return [path for _, path in sorted(found)]
-
-
-def _positive_or_none(path: Path, column: str) -> float | None:
-    """The cell of an optional column. Files write nothing, 0, -1 or NaN for an unknown value."""
-    try:
-        value = float(read_table(path, {column: "number"})[column][0])
-    except DataError:
-        return None
-    return value if value > 0 else None
-
-
-def _speed_limit(path: Path, cells: np.ndarray | None) -> float | None:
-    """The cell of the optional column `speedLimit`, m/s.
-
-    Raises:
-        DataError: no limit is that high.
-    """
-    limit = math.nan if cells is None else float(cells[0])
-    if limit > HIGHEST_LIMIT_MPS:
-        raise DataError(
-            f"{path}, line 2: speedLimit is {limit:g}, expected at most {HIGHEST_LIMIT_MPS:g} m/s, "
-            "or -1 for none: convert the cell to m/s"
-        )
-    return limit if limit > 0 else None
-
-
-def _text_or_none(path: Path, column: str) -> str | None:
-    """The cell of an optional column, without spaces around it; None if it is empty."""
-    try:
-        return str(read_table(path, {column: "text"})[column][0]).strip() or None
-    except DataError:
-        return None
-
-
-def _hour(text: str | None) -> float | None:
-    """Hours after midnight of `11`, `11.5` or `11:30`; None for anything else."""
-    match = _TIME.match(text or "")
-    if match is None:
-        return None
-    hour = float(match[1]) + int(match[2] or 0) / 60
-    return hour if hour < 24 else None
 
 
 def _check_unique(
@@ -581,6 +485,7 @@ def _count_frames(
     rows: _Rows,
     meta: dict[str, np.ndarray],
     numbered: NumberedIds,
+    rate_hz: float,
     repairs: list[str],
 ) -> tuple[_Rows, int]:
     """Rows with frames that count rows of a track, and the frames of the file per row.
@@ -600,7 +505,6 @@ def _count_frames(
     usual = int(np.median(steps)) if len(steps) else 1
     step = 1
     if usual > 1:
-        rate_hz = read_recording_meta(files.recording_meta).frame_rate_hz
         if abs(usual - 1000.0 / rate_hz) <= 1.0:
             frames = {
                 name: np.round(column * (rate_hz / 1000.0)).astype(np.int64)
@@ -611,6 +515,13 @@ def _count_frames(
             step = usual
             frames = {name: column // step for name, column in frames.items()}
             repairs.append(f"rows have one of {step} frames at {rate_hz:g} Hz: these are counted")
+        else:
+            raise DataError(
+                f"{files.tracks}: most rows are {usual:,} frames after the row before of their "
+                "track; expected every frame, milliseconds, or every n-th frame with the same n "
+                f"and the same first frame in all tracks, at {LOWEST_HZ:g} Hz or more: number the "
+                "rows of all tracks by the frames that they have in common"
+            )
     meta |= {name: frames[name] for name in names}
     same = (np.diff(rows.track) == 0) & (np.diff(frames["frame"]) == 0)
     if same.any():
@@ -682,7 +593,7 @@ def _sizes(
 def _check_motion(
     files: LevelxFiles,
     rows: _Rows,
-    step: int,
+    rate_hz: float,
     *,
     is_vulnerable: Bool[np.ndarray, " metas"],
     repairs: list[str],
@@ -692,7 +603,7 @@ def _check_motion(
     Args:
         files: the recording's files.
         rows: the rows, whose frames count rows.
-        step: frames of the file per frame of `rows`.
+        rate_hz: rows of a track per second.
         is_vulnerable: whether each track, in the order of `rows`, is that of a vulnerable road
             user, whose heading is not used.
         repairs: lines about single tracks are added.
@@ -700,7 +611,6 @@ def _check_motion(
     Raises:
         DataError: those of most moving tracks do not agree.
     """
-    rate_hz = read_recording_meta(files.recording_meta).frame_rate_hz / step
     motion = motion_of(rows.track, rows.frame, rows.measured[:, :2], rate_hz)
     repairs += check_velocities(
         motion, rows.measured[:, 3:], rate_hz, str(files.tracks), files.recording_meta.name

@@ -164,6 +164,10 @@ def check_velocities(
     return [_of_some("velocities contradict the motion", ids[wrong])] if count else []
 
 
+HIGHEST_MPS = 1e9
+"""Speeds above are as wrong as this one, whose ratios to slow motion are finite."""
+
+
 def check_speeds(
     motion: Motion, speeds_mps: Float[np.ndarray, " rows"], rate_hz: float, source: str
 ) -> list[str]:
@@ -181,7 +185,8 @@ def check_speeds(
     Raises:
         DataError: they do by a factor that only positions in other units than metres explain.
     """
-    speeds, moved = speeds_mps[motion.row], np.hypot(*motion.moved.T)
+    speeds = np.minimum(speeds_mps[motion.row], HIGHEST_MPS)
+    moved = np.hypot(*motion.moved.T)
     moves = np.isfinite(speeds) & ((moved > MOVES_ABOVE_MPS) | (speeds > MOVES_ABOVE_MPS))
     ids, of_id = np.unique(motion.track[moves], return_inverse=True)
     if not len(ids):

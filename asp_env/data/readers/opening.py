@@ -14,13 +14,15 @@ import numpy as np
 from asp_env.data import cache
 from asp_env.data.readers import interaction, levelx
 from asp_env.data.readers.caching import CacheEntry, cached
+from asp_env.data.readers.compressed import unread_copies
 from asp_env.data.readers.driven_area import driven_area
 from asp_env.data.readers.found import FoundRecording
 from asp_env.data.readers.interaction import InteractionFiles, InteractionMeta, read_interaction
 from asp_env.data.readers.interaction_cases import CaseFiles, read_case
 from asp_env.data.readers.lanelet2 import Lanelet2File, make_road_map, parse_lanelet2
-from asp_env.data.readers.layout import TrackTable
-from asp_env.data.readers.levelx import LevelxFiles, RecordingMeta, read_levelx
+from asp_env.data.readers.layout import TrackTable, shorten
+from asp_env.data.readers.levelx import LevelxFiles, read_levelx
+from asp_env.data.readers.levelx_meta import RecordingMeta, read_recording_meta
 from asp_env.data.readers.measurements import derive_tracks
 from asp_env.data.readers.placing import (
     Box,
@@ -82,12 +84,14 @@ class ReaderState:
     """By file, frame and part; by a table of cases, which have one map; or by a hash of their
     content."""
     places: dict[str, tuple[Meta, Path, tuple[str, ...]]] = field(default_factory=dict)
-    """Metadata and path of the map of each recording, and lines about guesses."""
+    """Metadata and path of the map of each recording, and lines about repairs and guesses."""
     hashes: dict[str, str] = field(default_factory=dict)
     tables: dict[Path, CacheEntry] = field(default_factory=dict)
     """Tables of several recordings."""
     maps_by_folder: dict[Path, list[Path]] = field(default_factory=dict)
     """Map files by folder. Without it, opening N recordings would list N² files."""
+    unread: dict[Path, dict[str, list[str]]] = field(default_factory=dict)
+    """By folder: names of files that are not read, by that of the file that is."""
 
 
 def open_recording(files: RecordingFiles, state: ReaderState) -> Recording:
@@ -102,6 +106,7 @@ def open_recording(files: RecordingFiles, state: ReaderState) -> Recording:
         AspEnvError: its frames are too far apart for the tick.
     """
     if files.name not in state.recordings:
+        unread = _unread(files, state)
         if isinstance(files, FoundRecording):
             recording = _open_found(files, state)
         else:
@@ -110,8 +115,24 @@ def open_recording(files: RecordingFiles, state: ReaderState) -> Recording:
             road_map, lines = _road_map(files, recording, map_path, meta.origin, state)
             repairs = (*recording.repairs, *guesses, *lines)
             recording = replace(recording, road_map=road_map, repairs=repairs)
+        if unread:
+            recording = replace(recording, repairs=(*recording.repairs, *unread))
         state.recordings[files.name] = recording
     return state.recordings[files.name]
+
+
+def _unread(files: RecordingFiles, state: ReaderState) -> list[str]:
+    """A line for each other file of a recording's tables; for cases, only at the first one."""
+    if isinstance(files, CaseFiles) and files.tracks in state.maps:
+        return []
+    lines = []
+    for path in files.tables:
+        if path.parent not in state.unread:
+            state.unread[path.parent] = unread_copies(path.parent)
+        if others := state.unread[path.parent].get(path.name):
+            verb = "is" if len(others) == 1 else "are"
+            lines.append(f"{shorten(others)} {verb} not read, since {path.name} is")
+    return lines
 
 
 def content_hash(files: RecordingFiles, state: ReaderState) -> str:
@@ -135,17 +156,59 @@ def content_hash(files: RecordingFiles, state: ReaderState) -> str:
     return state.hashes[files.name]
 
 
+def find_copies(found: Sequence[RecordingFiles]) -> dict[int, int]:
+    """The recordings whose tables have the same content as those of an earlier one, byte for byte.
+
+    Only tables of equal sizes are read, and the hashes of their content are cached.
+
+    Returns:
+        Index of the earliest recording with that content, by index of each later one.
+    """
+    by_size: dict[tuple[object, ...], list[int]] = {}
+    for number, files in enumerate(found):
+        about: object = files.case if isinstance(files, CaseFiles) else None
+        if isinstance(files, FoundRecording):  # several recordings may be of one file
+            about = id(files.read)
+        sizes = _sizes(files.tables)
+        if sizes and sizes[0]:
+            by_size.setdefault((type(files), about, *sizes), []).append(number)
+    copies: dict[int, int] = {}
+    for numbers in by_size.values():
+        first: dict[str, int] = {}
+        for number in numbers if len(numbers) > 1 else ():
+            files = found[number]
+            try:
+                content = _hash_of(files.tracks, files.tables, "hash of tables")
+            except DataError:  # reported when the recording is opened
+                continue
+            if first.setdefault(content, number) != number:
+                copies[number] = first[content]
+    return dict(sorted(copies.items()))
+
+
+def _sizes(paths: Sequence[Path]) -> tuple[int, ...] | None:
+    """The sizes of files in bytes; None if one is missing."""
+    try:
+        return tuple(path.stat().st_size for path in paths)
+    except OSError:
+        return None
+
+
 def _files_hash(path: Path, sources: tuple[Path, ...], state: ReaderState) -> str:
     key = " ".join(map(str, sources))
     if key not in state.hashes:
-
-        def make() -> CacheEntry:
-            digests = "".join(cache.digest(path) for path in sources)
-            return {"hash": hashlib.sha256(digests.encode()).hexdigest()}, {}
-
-        facts, _ = cached(path, sources, make, "hash")
-        state.hashes[key] = str(facts["hash"])
+        state.hashes[key] = _hash_of(path, sources, "hash")
     return state.hashes[key]
+
+
+def _hash_of(path: Path, sources: Sequence[Path], salt: str) -> str:
+    """A hash of the content of files, from the cache if it is there; see `cached`."""
+
+    def make() -> CacheEntry:
+        digests = "".join(cache.digest(path) for path in sources)
+        return {"hash": hashlib.sha256(digests.encode()).hexdigest()}, {}
+
+    return str(cached(path, sources, make, salt)[0]["hash"])
 
 
 def _place(
@@ -157,8 +220,9 @@ def _place(
             return state.places[files.name]
         files.check_complete()
         if isinstance(files, LevelxFiles):
-            meta = levelx.read_recording_meta(files.recording_meta)
+            meta = read_recording_meta(files.recording_meta)
             map_path, guesses = levelx.find_map(files, meta, state.maps_by_folder)
+            guesses = (*meta.repairs, *guesses)
         else:
             meta = interaction.read_meta(files)
             map_path, guesses = interaction.find_map(files, meta, state.maps_by_folder), ()
@@ -204,7 +268,7 @@ def _track_entry(files: LevelxFiles | InteractionFiles, meta: Meta) -> CacheEntr
     if isinstance(files, InteractionFiles):
         return _entry(*read_interaction(files), None)
     assert isinstance(meta, RecordingMeta)
-    table, scale = read_levelx(files), None
+    table, scale = read_levelx(files, meta.frame_rate_hz), None
     if files.background is not None:
         scale = _scale(files, files.background, meta, table)
         if scale is None:

@@ -10,7 +10,7 @@ from xml.parsers import expat
 import numpy as np
 from jaxtyping import Float
 
-from asp_env.data.readers.layout import shorten
+from asp_env.data.readers.layout import check_content, shorten
 from asp_env.errors import DataError
 from asp_env.stored import brief
 
@@ -67,6 +67,8 @@ def read_osm(path: Path) -> Osm:
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("error", DeprecationWarning)  # of codecs such as unicode_escape
+            with path.open("rb") as file:
+                check_content(path, file.read(1 << 10))
             _check_prolog(path)
             return _read(path)
     except (

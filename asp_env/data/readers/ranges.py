@@ -36,6 +36,9 @@ SIZE = Limit(largest=200.0, unit="metres")
 SPEED = Limit(largest=100.0, unit="m/s")
 """Velocity along one axis, or a speed limit."""
 
+HIGHEST_LIMIT_MPS = 45.0
+"""No speed limit is higher: 162 km/h. Larger numbers in m/s are km/h. Chosen by hand."""
+
 ACCELERATION = Limit(largest=1e5, unit="m/s²")
 """Acceleration along one axis; jumps of a tracker reach thousands of m/s²."""
 

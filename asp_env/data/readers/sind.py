@@ -19,6 +19,7 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float, Int8
 
+from asp_env.data.readers.compressed import plain_name
 from asp_env.data.readers.found import FoundRecording, RecordingTables, SignalChanges
 from asp_env.data.readers.interaction import measurements_of, read_measurements
 from asp_env.data.readers.lanelet2 import parse_lanelet2
@@ -73,7 +74,7 @@ _OF_VEHICLES = frozenset({"vx", "vy", "yaw_rad", "length", "width"})
 def find_recordings(folder: Path) -> Iterator[FoundRecording]:
     """The recordings in and below a folder, named `LOCATION/NAME` after their folders."""
     for place, names in walk(folder):
-        by_name = {name.lower(): place / name for name in names}
+        by_name = {plain_name(name): place / name for name in names}
         if VEHICLES not in by_name:
             continue
         lights = [path for name, path in by_name.items() if _LIGHTS.match(name)]
@@ -96,7 +97,7 @@ def read_sind(paths: tuple[Path, ...]) -> RecordingTables:
     Raises:
         DataError: a file is damaged.
     """
-    by_name = {path.name.lower(): path for path in paths}
+    by_name = {plain_name(path.name): path for path in paths}
     names = ClassNames()
     vehicles = _tracks(by_name[VEHICLES], names)
     ids = [vehicles["track_id"]]
@@ -117,6 +118,13 @@ def read_sind(paths: tuple[Path, ...]) -> RecordingTables:
             repairs.append(f"the lights are left out: {error}")
         else:
             signals = _placed(lights, *changes, by_name.get(STOP_LINES), repairs)
+        of_lights = sorted(
+            path.name
+            for path in lights.parent.iterdir()
+            if _LIGHTS.match(plain_name(path.name)) and plain_name(path.name) not in by_name
+        )
+        if of_lights:
+            repairs.append(f"{len(of_lights)} other files of lights not read: {shorten(of_lights)}")
     found = next((path for path in paths if map_suffix(path) == ".osm"), None)
     origin = Origin.at(latitude_deg=0.0, longitude_deg=0.0)
     return RecordingTables(
@@ -233,6 +241,11 @@ def _placed(
                     f"{', '.join(map(str, numbers))} as in {lights.name}"
                 )
             ends = [float(given[name][row]) for name in kinds]
+            if number in given["signal"][:row]:
+                raise DataError(
+                    f"{stop_lines}, line {row + 2}: a second stop line of signal {number}, "
+                    "expected one; remove one of the two"
+                )
             lines[numbers.index(number)] = np.reshape(ends, (2, 2))
     unknown = int(np.isnan(lines[:, 0, 0]).sum())
     if unknown:

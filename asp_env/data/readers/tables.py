@@ -13,9 +13,10 @@ from typing import Literal
 
 import numpy as np
 import pandas as pd
-from jaxtyping import Float, Int
+from jaxtyping import Bool, Float, Int
 
 from asp_env.data.readers.compressed import open_table
+from asp_env.data.readers.layout import check_content
 from asp_env.data.readers.ranges import Limit
 from asp_env.errors import DataError
 from asp_env.stored import brief
@@ -254,7 +255,8 @@ def read_clock(
 
     A frame lasts as long as the median step between rows of a track. The rate is a whole number if
     one explains all times to the millisecond, since 30 Hz are steps of 33 and 34 ms. Times that no
-    rate explains to the millisecond jitter.
+    rate explains to the millisecond jitter. Where the tracks have times of their own, these have to
+    be frames within each track only.
 
     Args:
         tracks: track of each row. Rows are sorted by track, then time.
@@ -294,10 +296,11 @@ def read_clock(
             )
         return clock
 
-    apart = np.diff(known_ms) / step_ms
-    counts = np.round(apart)
-    off = (counts < 1) | (np.abs(apart - counts) > JITTER + ROUNDING_MS / step_ms)
+    counts, off = _frames_apart(np.diff(known_ms), step_ms)
     if off.any():
+        counts, off_in_tracks = _frames_apart(steps_ms, step_ms)
+        if not off_in_tracks.any():
+            return _clock_of_each_track(tracks, times_ms, counts, step_ms)
         late = int(np.flatnonzero(times_ms == known_ms[int(off.argmax()) + 1])[0])
         raise DataError(
             located(late, "timestamp_ms is {time}")
@@ -321,6 +324,46 @@ def read_clock(
     )
 
 
+def _frames_apart(
+    steps_ms: Float[np.ndarray, " steps"], step_ms: float
+) -> tuple[Float[np.ndarray, " steps"], Bool[np.ndarray, " steps"]]:
+    """How many frames some steps last, and which of them are no whole number of frames."""
+    apart = steps_ms / step_ms
+    counts = np.round(apart)
+    return counts, (counts < 1) | (np.abs(apart - counts) > JITTER + ROUNDING_MS / step_ms)
+
+
+def _clock_of_each_track(
+    tracks: Int[np.ndarray, " rows"],
+    times_ms: Float[np.ndarray, " rows"],
+    counts: Float[np.ndarray, " steps"],
+    step_ms: float,
+) -> Clock:
+    """The clock of tracks with times of their own, which jitter or lie between those of others.
+
+    Args:
+        tracks: track of each row.
+        times_ms: time of each row.
+        counts: frames of each step between two rows of one track.
+        step_ms: mean duration of steps of one frame.
+    """
+    mean_hz = 1000.0 / step_ms
+    rate_hz = mean_hz
+    if abs(mean_hz - round(mean_hz)) < WHOLE_WITHIN * mean_hz:
+        rate_hz = float(round(mean_hz))
+    jittering = (times_ms - times_ms.min()) * (rate_hz / 1000.0)
+    begins = np.flatnonzero(np.diff(tracks, prepend=tracks[0] - 1))
+    apart = np.zeros(len(tracks))
+    apart[1:][np.diff(tracks) == 0] = counts
+    since_begin = np.cumsum(apart)
+    lengths = np.diff(begins, append=len(tracks))
+    offset = np.round(jittering[begins]) - since_begin[begins]
+    frames = since_begin + np.repeat(offset, lengths)
+    return Clock(
+        frames=frames.astype(np.int64), rate_hz=rate_hz, jittering=jittering, mean_hz=mean_hz
+    )
+
+
 def header_of(path: Path) -> list[str]:
     """The names of a table's columns, without spaces around them.
 
@@ -339,9 +382,10 @@ def header_of(path: Path) -> list[str]:
 
 
 def _check_encoding(path: Path) -> None:
-    """Refuses encodings and line ends that spreadsheets may write but no table here has."""
+    """Refuses web pages, and encodings and line ends that no table here has."""
     with open_table(path) as file:
         start = file.read(1 << 10)
+    check_content(path, start)
     if start.startswith(_UTF16) or b"\0" in start[:4]:
         raise DataError(
             f"{path}: is encoded in UTF-16 or UTF-32, expected UTF-8: save it as CSV in UTF-8"

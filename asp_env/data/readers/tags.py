@@ -76,13 +76,14 @@ def sign_mps(text: str) -> float | None:
     return None
 
 
-def vehicles_allowed(tags: Mapping[str, str]) -> bool | None:
+def vehicles_allowed(tags: Mapping[str, str]) -> tuple[bool | None, bool]:
     """Whether the participants of a lanelet include any vehicles.
 
     As in Lanelet2, one tag of a participant forbids all that no tag allows.
 
     Returns:
-        None if no tag names a participant, or none has a boolean value.
+        The answer, None if no tag names a participant or none has a boolean value; and whether all
+        such tags have one.
     """
     values = {
         key: boolean(value)
@@ -90,9 +91,10 @@ def vehicles_allowed(tags: Mapping[str, str]) -> bool | None:
         if key == "participant" or key.startswith("participant:")
     }
     known = {key: value for key, value in values.items() if value is not None}
+    are_all_known = len(known) == len(values)
     if not known:
-        return None
-    return any(allowed for key, allowed in known.items() if _covers_vehicles(key))
+        return None, are_all_known
+    return any(allowed for key, allowed in known.items() if _covers_vehicles(key)), are_all_known
 
 
 def two_way(tags: Mapping[str, str]) -> tuple[bool, bool]:

@@ -8,8 +8,6 @@ by however many processes they are computed.
 
 import hashlib
 import json
-import zipfile
-import zlib
 from collections.abc import Mapping
 from dataclasses import asdict
 from pathlib import Path
@@ -23,6 +21,7 @@ from asp_env.evaluation.closed_loop.containment import Fault
 from asp_env.files import atomic_file, remove_abandoned
 from asp_env.metrics.masked import Masked
 from asp_env.sim.world import Ending
+from asp_env.stored import parse_json, read_arrays
 
 CELLS = "cells"
 """Folder of the cells in that of a study."""
@@ -30,7 +29,7 @@ CELLS = "cells"
 FORMAT = 1
 """Version of the file format; part of every key."""
 
-_READ_ERRORS = (OSError, EOFError, ValueError, KeyError, TypeError, zipfile.BadZipFile, zlib.error)
+_READ_ERRORS = (OSError, ValueError, KeyError, TypeError)
 
 
 def key_of(dependencies: Mapping[str, Any]) -> str:
@@ -92,9 +91,9 @@ class CellFolder:
         """
         path = self.path(key)
         try:
-            with path.open("rb") as raw, np.load(raw, allow_pickle=False) as file:
-                header = json.loads(file["header"].tobytes())
-                value, valid = file["value"], file["valid"]
+            arrays = read_arrays(path)
+            header = parse_json(arrays["header"].tobytes())
+            value, valid = arrays["value"], arrays["valid"]
             count = len(header["endings"])
             if value.shape != (len(header["metrics"]), count) or valid.shape != value.shape:
                 raise ValueError("its arrays do not fit each other")

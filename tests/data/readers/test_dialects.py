@@ -106,6 +106,19 @@ def test_case_ids_of_many_digits_name_their_recordings(tmp_path: Path, first: in
     assert names == tuple(f"{interaction_files.PLACE}_train/{first + n}" for n in range(2))
 
 
+def test_case_ids_that_are_not_exact_are_refused(tmp_path: Path) -> None:
+    """2**53 and 2**53 + 1 are one number in double precision."""
+    cars = interaction_files.some_cars()
+    path = tmp_path / "train" / f"{interaction_files.PLACE}_train.csv"
+    path.parent.mkdir()
+    pd.concat([cars.assign(case_id=2**53 + n) for n in range(2)]).to_csv(path, index=False)
+    interaction_files.write_map(tmp_path)
+    with pytest.raises(
+        DataError, match=r"case_id is '9007199254740992', .* expected a number from"
+    ):
+        open_data(tmp_path)[0]
+
+
 def test_a_choice_between_maps_is_reported(tmp_path: Path) -> None:
     folder = write_folder(tmp_path / "set")
     second = folder / "maps" / "old" / "location1.osm"
@@ -116,6 +129,9 @@ def test_a_choice_between_maps_is_reported(tmp_path: Path) -> None:
         "map maps/lanelets/01_place/location1.osm is used, the first one, not "
         "maps/old/location1.osm"
     )
+    second.rename(folder / "maps" / "lanelets" / "01_place" / "location1 (1).osm")
+    (line,) = open_data(folder)[0].repairs
+    assert line.startswith("map maps/lanelets/01_place/location1.osm is used, the first one, not ")
 
 
 def test_a_map_that_is_found_by_its_place_is_reported(tmp_path: Path) -> None:

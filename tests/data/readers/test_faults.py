@@ -9,7 +9,7 @@ import pytest
 from asp_env.cli import main
 from asp_env.data.source import open_data
 from asp_env.errors import AspEnvError, DataError
-from tests.data.levelx_files import write_folder, write_map
+from tests.data.levelx_files import two_lane_road, write_folder, write_map
 
 META, TRACKS, RECORDING = "00_tracksMeta.csv", "00_tracks.csv", "00_recordingMeta.csv"
 
@@ -229,6 +229,12 @@ FAULTS = {
     "another kind of file": (binary_tracks, [TRACKS]),
     "no map": (remove_map, ["no map for location 1", "location1.osm"]),
     "map without lanelets": (set_map("<osm></osm>"), ["location1.osm", "has no lanelets"]),
+    "map is a pointer": (set_map("version https://git-lfs.github.com/spec/v1\n"), ["git lfs pull"]),
+    "map is a web page": (set_map("\n<!DOCTYPE html>\n<html></html>"), ["is a web page"]),
+    "map without bounds": (
+        set_map(two_lane_road().replace("role='left'", "role='Left'")),
+        ["location1.osm", "none of its 2 lanelets has both bounds", "roles 'left' and 'right'"],
+    ),
     "map that is no XML": (set_map("lat,lon\n1,2\n"), ["location1.osm", "is not XML"]),
     "map that is cut": (set_map("<osm><node id='1'"), ["location1.osm", "is not XML"]),
     "map that is empty": (set_map(""), ["location1.osm", "is not XML"]),

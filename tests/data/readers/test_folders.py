@@ -42,7 +42,8 @@ def test_hidden_and_temporary_files_are_ignored(folder: Path, prefix: str) -> No
     for path in [path for path in folder.rglob("*") if path.is_file()]:
         path.with_name(prefix + path.name).write_bytes(FORK)
     (folder / ".DS_Store").write_bytes(FORK)
-    shutil.copytree(folder / "data", folder / "__MACOSX" / "data")
+    for name in ("__MACOSX", "$RECYCLE.BIN", "#recycle", "lost+found"):
+        shutil.copytree(folder / "data", folder / name / "data")
     found = open_data(folder)
     assert found.names == ("00",)
     np.testing.assert_array_equal(found[0].states, expected.states)
@@ -240,3 +241,36 @@ def test_a_table_without_rows_has_no_tracks(tmp_path: Path, empty: str) -> None:
     else:
         other.write_text(header)
     assert len(open_data(data)[0]) == (1 if empty == "vehicle" else 3)
+
+
+@pytest.mark.parametrize(
+    ("content", "expected"),
+    [
+        (
+            "version https://git-lfs.github.com/spec/v1\noid sha256:0\n",
+            "fetch it by `git lfs pull`",
+        ),
+        (
+            "<!DOCTYPE html>\n<html><body>Login</body></html>\n",
+            "is a web page instead of",
+        ),
+    ],
+)
+def test_what_downloads_leave_in_the_place_of_a_table(
+    folder: Path, content: str, expected: str
+) -> None:
+    (folder / "data" / "00_tracks.csv").write_text(content)
+    with pytest.raises(DataError, match=f"00_tracks.csv: .*{expected}"):
+        open_data(folder)[0]
+
+
+@pytest.mark.parametrize("name", ["00_*", "00_tracks.csv", "location1.osm"])
+def test_links_to_files_that_do_not_exist(folder: Path, name: str) -> None:
+    """All files of a recording, as in a clone of git-annex, its tracks, or its map."""
+    for path in list(folder.rglob(name)):
+        path.unlink()
+        path.symlink_to(folder / ".git" / path.name)
+    recordings = open_data(folder)
+    assert recordings.names == ("00",)
+    with pytest.raises(DataError, match="is a link to a file that does not exist; fetch that file"):
+        recordings[0]

@@ -11,6 +11,7 @@ from hypothesis import strategies as st
 from asp_env.data.readers.tables import find_line, number_ids, read_table
 from asp_env.data.recording import Recording
 from asp_env.data.source import open_data
+from asp_env.errors import DataError
 from tests.data import interaction_files, levelx_files
 
 
@@ -115,6 +116,15 @@ def test_frames_in_milliseconds(tmp_path: Path, rate_hz: float) -> None:
     np.testing.assert_array_equal(recording.states, plain.states)
     assert recording.repairs[0].startswith("frames count milliseconds")
     assert len(recording.repairs) == 2  # and the gaps
+
+
+@pytest.mark.parametrize("unit", [5, 40_000])
+def test_frames_that_most_rows_skip_are_refused(tmp_path: Path, unit: int) -> None:
+    """Every fifth frame, from other frames on in each track, or microseconds."""
+    tracks = some_tracks(np.arange(100) * unit)
+    tracks.loc[tracks["trackId"] == 1, "frame"] += 2
+    with pytest.raises(DataError, match=f"most rows are {unit:,} frames after the row before"):
+        opened(tmp_path, tracks)
 
 
 def test_every_fifth_frame(tmp_path: Path) -> None:

@@ -15,20 +15,20 @@ from asp_env.data.readers import tables
 from asp_env.data.readers.layout import TrackTable
 from asp_env.data.readers.levelx import (
     LevelxFiles,
-    RecordingMeta,
     find_map,
     find_recordings,
     metres_per_pixel,
     read_levelx,
-    read_recording_meta,
 )
+from asp_env.data.readers.levelx_meta import RecordingMeta, read_recording_meta
+from asp_env.data.source import open_data
 from tests.data.levelx_files import track_rows, write_folder, write_map, write_recording
 
 
 def read(folder: Path) -> TrackTable:
     """The tracks of a folder's only recording."""
     (files,) = find_recordings(folder)
-    return read_levelx(files)
+    return read_levelx(files, read_recording_meta(files.recording_meta).frame_rate_hz)
 
 
 def recordings_with_metadata(folder: Path) -> list[tuple[LevelxFiles, RecordingMeta]]:
@@ -327,6 +327,29 @@ def test_start_times(tmp_path: Path, text: str, expected: float | None) -> None:
     row[header.index("startTime")] = text
     path.write_text(",".join(header) + "\n" + ",".join(row) + "\n")
     assert read_recording_meta(path).start_hour == expected
+
+
+@pytest.mark.parametrize(
+    ("column", "text", "expected"),
+    [("startTime", text, f"startTime is {text!r}") for text in ("abc", "25:99", "24", "8:75")]
+    + [("weekday", text, f"weekday is {text!r}") for text in ("abc", "3", "Montag")]
+    + [("orthoPxToMeter", "1,5 cm", "orthoPxToMeter is '1,5 cm'")]
+    + [("startTime", text, None) for text in ("", "NaN", "-1", "11:30")]
+    + [("weekday", text, None) for text in ("", "NaN", "Mon", "TUESDAY", "thurs")]
+    + [("orthoPxToMeter", text, None) for text in ("", "0", "-1", "NaN", "0.0126")],
+)
+def test_optional_metadata_that_cannot_be_read(
+    tmp_path: Path, column: str, text: str, expected: str | None
+) -> None:
+    """They are reported; empty cells and the texts of unknown values are not."""
+    data = write_recording(tmp_path)
+    write_map(tmp_path)
+    path = data / "00_recordingMeta.csv"
+    pd.read_csv(path).assign(**{column: text}).to_csv(path, index=False)
+    lines = open_data(tmp_path)[0].repairs
+    assert [line.split(", expected")[0] for line in lines] == (
+        [] if expected is None else [f"00_recordingMeta.csv: {expected}"]
+    )
 
 
 def test_without_start_time(tmp_path: Path) -> None:

@@ -77,7 +77,8 @@ def test_a_speed_is_no_sign() -> None:
 )
 def test_participants(tags: dict[str, str], allowed: bool | None) -> None:
     """One tag of a participant forbids all that no tag allows."""
-    assert vehicles_allowed(tags) is allowed
+    known = all(boolean(value) is not None for value in tags.values())
+    assert vehicles_allowed(tags) == (allowed, known)
 
 
 @pytest.mark.parametrize(
@@ -148,6 +149,7 @@ def test_an_element_may_refer_to_the_lanelet(tmp_path: Path) -> None:
     ("tags", "extra", "repair"),
     [
         ({"one_way": "maybe"}, "", "1 lanelets with an unknown value of one_way are one-way: 2"),
+        ({"participant:vehicle": "maybe"}, "", "1 lanelets with an unknown value of a participant"),
         ({"maxspeed": "walk"}, "", "1 lanelets with the unknown speed limit 'walk', which is not"),
         ({}, element(9, sign_type="x"), "1 regulatory elements for speed left out, since they ha"),
         ({}, element(9, sign_type="5", dynamic="1"), "1 regulatory elements for speed left out, s"),

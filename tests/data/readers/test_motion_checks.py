@@ -299,3 +299,11 @@ def test_a_speed_limit_in_kmh_is_an_error(tmp_path: Path, cell: str) -> None:
     path.write_text(path.read_text().replace(",13.9,", f",{cell},"))
     with pytest.raises(DataError, match=f"speedLimit is '?{cell}"):
         open_data(tmp_path)[0]
+
+
+def test_speeds_of_any_size_are_compared() -> None:
+    """Numbers at the end of the range, of an agent that stands: no overflow, one line."""
+    frames = np.arange(50)
+    motion = motion_of(np.zeros(50, dtype=np.int64), frames, np.zeros((50, 2)), 10.0)
+    (line,) = check_speeds(motion, np.full(50, 1e308), 10.0, "file")
+    assert line.startswith("the speeds of 1 of 1 moving tracks are")

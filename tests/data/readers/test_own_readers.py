@@ -1,9 +1,11 @@
 """Readers of geo-trax and SinD, and readers of other packages."""
 
-from collections.abc import Iterator
+import gzip
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 
 import numpy as np
+import pandas as pd
 import pytest
 
 from asp_env import registry
@@ -75,6 +77,74 @@ def test_a_bad_time_names_its_line(tmp_path: Path) -> None:
         open_data(tmp_path / "songdo")[0]
 
 
+def test_unknown_classes_and_time_zones(tmp_path: Path) -> None:
+    """Unknown numbers become `other` and are counted; several time zones are an error."""
+    path = write_geo_trax(tmp_path / "songdo")
+    table = pd.read_csv(path).assign(Vehicle_Class=-1)
+    table.to_csv(path, index=False)
+    recording = open_data(tmp_path / "songdo")[0]
+    assert recording.classes.tolist() == [AgentClass.OTHER] * 2
+    assert "2 tracks of the unknown class '-1' are read as 'other'" in recording.repairs
+    table.loc[::2, "Timestamp"] += "+09:00"
+    table.loc[1::2, "Timestamp"] += "Z"
+    table.to_csv(path, index=False)
+    with pytest.raises(DataError, match="Timestamp has several time zones, expected one or none"):
+        open_data(tmp_path / "songdo")[0]
+
+
+def coarse_times(path: Path, digits: int, columns: Sequence[str]) -> None:
+    """Cuts the fractions of the seconds of time stamps, and keeps some columns."""
+    table = pd.read_csv(path)
+    width = len("2022-10-07 17:52:13") + (digits and digits + 1)
+    table["Timestamp"] = table["Timestamp"].str[:width]
+    table[list(columns)].to_csv(path, index=False)
+
+
+@pytest.mark.parametrize(("digits", "seconds"), [(0, 45.0), (1, 45.0), (0, 11.0)])
+def test_times_of_whole_seconds_follow_from_frames(
+    tmp_path: Path, digits: int, seconds: float
+) -> None:
+    """10 m/s and 29.97 Hz, or 30 Hz within 11 s, which differs by 0.1 %; the guess is reported."""
+    path = write_geo_trax(tmp_path / "songdo", seconds=seconds)
+    exact = open_data(tmp_path / "songdo")[0]
+    coarse_times(path, digits, GEO_TRAX.split(","))
+    (recording,) = open_data(tmp_path / "songdo")
+    rate_hz = 29.97 if seconds > 40 else 30.0
+    (line,) = [line for line in recording.repairs if "a guess" in line]
+    assert f"at {rate_hz:g} Hz, a guess from " in line
+    np.testing.assert_allclose(recording.track(0)[:, 3], 10.0, atol=0.06)
+    np.testing.assert_allclose(recording.track(0)[-1], exact.track(0)[-1], atol=0.12)
+    assert len(recording.track(0)) == pytest.approx(len(exact.track(0)), abs=1)
+
+
+@pytest.mark.parametrize(
+    ("seconds", "without", "change", "expected"),
+    [
+        (20.0, "Frame_Number", {}, "and there is no column Frame_Number; expected fractions of"),
+        (5.0, "", {}, r"lasts 120 frames from .* to its last change; expected at least 200"),
+        (20.0, "", {"Frame_Number": 0}, "and so has Frame_Number; expected one row for each"),
+    ],
+)
+def test_times_of_whole_seconds_without_a_rate(
+    tmp_path: Path, seconds: float, without: str, change: dict[str, int], expected: str
+) -> None:
+    path = write_geo_trax(tmp_path / "songdo", seconds=seconds)
+    coarse_times(path, 0, [name for name in GEO_TRAX.split(",") if name != without])
+    pd.read_csv(path).assign(**change).to_csv(path, index=False)
+    with pytest.raises(DataError, match=f"same time in several rows of a track, .*{expected}"):
+        open_data(tmp_path / "songdo")[0]
+
+
+def test_times_of_whole_seconds_that_no_camera_has(tmp_path: Path) -> None:
+    """Every frame counts as seven: 210 Hz."""
+    path = write_geo_trax(tmp_path / "songdo", seconds=20.0)
+    coarse_times(path, 0, GEO_TRAX.split(","))
+    table = pd.read_csv(path)
+    table.assign(Frame_Number=7 * table["Frame_Number"]).to_csv(path, index=False)
+    with pytest.raises(DataError, match=r"makes 210\.00 Hz, which is no camera's rate"):
+        open_data(tmp_path / "songdo")[0]
+
+
 @pytest.mark.data
 def test_the_published_sample_of_geo_trax_is_read() -> None:
     """144 vehicles at 29.97 Hz, of which one is too short."""
@@ -124,6 +194,28 @@ def write_sind(folder: Path, *, stop_lines: bool) -> Path:
     if stop_lines:
         (place / "stop_lines.csv").write_text("signal,x1,y1,x2,y2\n2,40,-23.5,40,-20\n")
     return folder
+
+
+def test_sind_with_compressed_tables_and_several_files_of_lights(tmp_path: Path) -> None:
+    """The states are those of the plain tables; the file of lights that is not read is named."""
+    folder = write_sind(tmp_path / "sind", stop_lines=False)
+    plain = open_data(folder)[0]
+    place = folder / "Tianjin" / "8_2_1"
+    for path in list(place.glob("*_smoothed_tracks.csv")):
+        path.with_name(f"{path.name}.gz").write_bytes(gzip.compress(path.read_bytes()))
+        path.unlink()
+    (place / "Traffic_Lights_2.csv").write_bytes((place / "Traffic_Lights.csv").read_bytes())
+    (recording,) = open_data(folder)
+    np.testing.assert_array_equal(recording.states, plain.states)
+    assert "1 other files of lights not read: Traffic_Lights_2.csv" in recording.repairs
+
+
+def test_two_stop_lines_of_one_signal(tmp_path: Path) -> None:
+    folder = write_sind(tmp_path / "sind", stop_lines=True)
+    path = folder / "Tianjin" / "8_2_1" / "stop_lines.csv"
+    path.write_text(path.read_text() + "2,50,-23.5,50,-20\n")
+    with pytest.raises(DataError, match=r"line 3: a second stop line of signal 2, expected one"):
+        open_data(folder)[0]
 
 
 @pytest.mark.parametrize("stop_lines", [False, True])

@@ -3,6 +3,7 @@
 from pathlib import Path
 
 import numpy as np
+import pandas as pd
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
@@ -240,6 +241,28 @@ def test_jittering_times(tmp_path: Path, off_ms: float, step_ms: float, to_hz: f
     expected = 10.0 + 12.0 * times - 0.75 * times**2
     np.testing.assert_allclose(recording.states[:, 0], expected, atol=4e-3)
     np.testing.assert_allclose(recording.states[:, 3], 12.0 - 1.5 * times, atol=0.05)
+
+
+def test_tracks_with_times_of_their_own(tmp_path: Path) -> None:
+    """Each has its phase and jitter, 5 m/s: all positions are those at the common frames."""
+    rng = np.random.default_rng(2)
+    tables = []
+    for track, phase_ms in enumerate((0.0, 31.0, 66.0)):
+        times_ms = phase_ms + 100.0 * np.arange(60) + rng.uniform(-4, 4, 60) * (track > 0)
+        table = interaction_files.rows(track, np.zeros((60, 4)))
+        table["timestamp_ms"], table["y"], table["vx"] = times_ms, -21.75, 5.0
+        table["x"] = 5.0 + 20.0 * track + 5.0 * times_ms / 1000
+        tables.append(table)
+    interaction_files.write_recording(tmp_path, vehicles=pd.concat(tables))
+    interaction_files.write_map(tmp_path)
+    recording = open_data(tmp_path)[0]
+    assert (recording.frame_rate_hz, len(recording)) == (10.0, 3)
+    assert any("ms off frames of 10 Hz" in line for line in recording.repairs)
+    for track in range(3):
+        states = recording.track(track)
+        times = (recording.first_frames[track] + np.arange(len(states))) / 10
+        np.testing.assert_allclose(states[:, 0], 5.0 + 20.0 * track + 5.0 * times, atol=1e-3)
+        np.testing.assert_allclose(states[:, 3], 5.0, atol=1e-2)
 
 
 def test_9_99_hz_without_jitter(tmp_path: Path) -> None:

@@ -44,6 +44,15 @@ def test_frames_are_recovered_from_times(
     assert clock.step_s == 1 / clock.rate_hz
 
 
+def test_tracks_may_have_times_of_their_own() -> None:
+    """10 Hz; the second track lies between the frames of the first one and has a gap."""
+    clock = clock_of([0, 100, 203, 300], [130, 230, 428, 530])
+    assert clock.rate_hz == 10.0
+    assert clock.frames.tolist() == [0, 1, 2, 3, 1, 2, 4, 5]
+    assert clock.jittering is not None
+    np.testing.assert_allclose(clock.jittering, [0, 1, 2.03, 3, 1.3, 2.3, 4.28, 5.3])
+
+
 @pytest.mark.parametrize(
     ("tracks", "expected"),
     [
@@ -53,7 +62,7 @@ def test_frames_are_recovered_from_times(
         ([[0, 5_000, 10_000]], "makes 0.2 Hz"),
         ([[0, 100, 200, 260, 360]], "row 3: timestamp_ms is 260.0, 60 ms after the previous time"),
         ([[0, 100, 101, 200]], "row 2: a second row of track 0 at 101.0 ms, less than a frame"),
-        ([[0, 100, 200], [50, 150]], "row 3: timestamp_ms is 50.0, 50 ms after"),
+        ([[0, 100, 200], [50, 190]], "row 3: timestamp_ms is 50.0, 50 ms after"),
         ([[0, 100, 200, 301.5 + 40, 400]], "expected multiples of 100 ms"),
     ],
 )

@@ -31,6 +31,7 @@ from asp_env.evaluation.study.study import Study, StudyResult, run_study, write_
 from predictors.physical import ConstantVelocity
 from tests.crossing_files import ON_ROAD, write_crossing
 from tests.sim.worlds import car
+from tests.test_stored import write_member
 
 
 @pytest.fixture(scope="module")
@@ -169,9 +170,14 @@ def test_a_damaged_cell_is_named(data: str, tmp_path: Path) -> None:
     given = settings(data, traffic=("log",), methods=("idm",))
     run_study(given, tmp_path)
     path = next((tmp_path / "cells").rglob("*.npz"))
-    path.write_bytes(path.read_bytes()[:100])
-    with pytest.raises(DataError, match=f"{path.name}: not a readable cell .* remove it"):
-        run_study(given, tmp_path)
+    claim = "{'descr': '<f8', 'fortran_order': False, 'shape': (1000000000000,), }"
+    for damage in (
+        lambda: path.write_bytes(path.read_bytes()[:100]),
+        lambda: write_member(path, claim.encode()),
+    ):
+        damage()
+        with pytest.raises(DataError, match=f"{path.name}: not a readable cell .* remove it"):
+            run_study(given, tmp_path)
     path.unlink()
     run_study(given, tmp_path)
 

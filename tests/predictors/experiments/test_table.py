@@ -16,7 +16,7 @@ import pytest
 from rich.console import Console
 
 from asp_env.cli import main
-from asp_env.errors import AspEnvError
+from asp_env.errors import AspEnvError, DataError
 from asp_env.evaluation import statistics
 from predictors.experiments.errors import METRICS, VIOLATIONS, Errors, stamp_of
 from predictors.experiments.results import (
@@ -200,6 +200,8 @@ def test_errors_can_be_saved_and_loaded(tmp_path: Path) -> None:
     assert stamp_of(path) == "s"
     path.write_bytes(path.read_bytes()[:-40])
     assert stamp_of(path) is None
+    with pytest.raises(DataError, match=r"errors\.npz: not readable errors of forecasts"):
+        Errors.load(path)
     assert stamp_of(tmp_path / "none.npz") is None
 
 
