@@ -181,7 +181,7 @@ class PDMPlanner:
     def _propose(self, scene: Scene, routes: Routes, agents: _Agents) -> _Proposals:
         shape, steps = (len(routes.counts), len(self._profiles)), agents.states.shape[2]
         egos = np.ascontiguousarray(scene.states[:, EGO, -1])
-        sizes = scene.sizes[:, EGO]
+        sizes = np.ascontiguousarray(scene.sizes[:, EGO])  # `_act` is compiled for each layout
         lengths = np.maximum(sizes[:, 0], 0.1)
         search_everywhere = np.full(shape[0], -1.0)
         start = route_coordinates(scene.route, scene.route_valid, egos, search_everywhere)
@@ -200,7 +200,7 @@ class PDMPlanner:
                 state, sizes, arcs, offset, before, self._profiles, scene.dt_s,
                 routes, paths, agents, k, law, actions[:, :, k],
             )  # fmt: skip
-            before = actions[:, :, k, 0]
+            before = np.ascontiguousarray(actions[:, :, k, 0])
             state = forward(state, actions[:, :, k], lengths[:, None], scene.dt_s)
             states[:, :, k] = state
             mean_offset += np.abs(offset) / steps
