@@ -15,7 +15,7 @@ from rich.table import Table
 from tyro.constructors import ConstructorRegistry, PrimitiveConstructorSpec, PrimitiveTypeInfo
 
 from asp_env import registry
-from asp_env.console import text_console
+from asp_env.console import printable, text_console
 from asp_env.errors import AspEnvError, LeftOutWarning
 from asp_env.installation.version import version_line
 
@@ -132,7 +132,7 @@ def _one_line_warnings(*, strict: bool) -> Iterator[None]:
     shown: set[str] = set()
 
     def line(message: object, *_args: object, **_options: object) -> str:
-        text = f"asp-env: warning: {' '.join(str(message).split())}\n"
+        text = f"asp-env: warning: {printable(' '.join(str(message).split()))}\n"
         if text in shown:
             return ""
         shown.add(text)
@@ -210,7 +210,7 @@ def _print_plugs(command: Any) -> None:
 
 
 def _report(message: str) -> int:
-    sys.stderr.write(f"asp-env: {' '.join(message.split())}\n")
+    sys.stderr.write(f"asp-env: {printable(' '.join(message.split()))}\n")
     return BAD_INPUT
 
 

@@ -7,7 +7,7 @@ import pytest
 from rich.table import Table
 
 from asp_env.cli import main
-from asp_env.console import page_console
+from asp_env.console import page_console, printable
 from tests.data.levelx_files import write_folder
 
 NAME = "a[/b] [bold]c:car:$d^$&<e>"
@@ -40,6 +40,35 @@ def test_commands_take_such_folders(tmp_path: Path, capsys: pytest.CaptureFixtur
     assert f"{data}/none does not exist" in capsys.readouterr().err
 
 
+@pytest.mark.parametrize(
+    ("text", "shown"),
+    [
+        ("\x1b[31mred\x07", r"\x1b[31mred\x07"),
+        ("a\x9b1m\u202eb", r"a\x9b1m\u202eb"),
+        ("a\tb\nü 道 ₃ \\x1b", "a\tb\nü 道 ₃ \\x1b"),
+    ],
+)
+def test_characters_that_control_terminals_are_shown_as_escapes(text: str, shown: str) -> None:
+    assert printable(text) == shown
+
+
+def test_files_do_not_control_the_terminal(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """A weekday, the name of a folder, and the name of a missing one in an error."""
+    data = tmp_path / "a\x1b[31m"
+    write_folder(data, recordings=1)
+    path = next(data.rglob("00_recordingMeta.csv"))
+    path.write_text(path.read_text().replace("Mon", "\x1b[32mMon"))
+    assert main(["inspect", str(data)]) == 0
+    assert main(["inspect", str(data / "none")]) == 2
+    printed = capsys.readouterr()
+    assert "\x1b" not in printed.out + printed.err
+    assert r"\x1b[32mMon" in printed.out
+    assert r"\x1b[31m" in printed.out
+    assert r"a\x1b[31m/none does not exist" in printed.err
+
+
 def test_every_console_is_of_this_kind() -> None:
     """Others would read names as markup."""
     root = Path(__file__).parents[1]
@@ -48,6 +77,6 @@ def test_every_console_is_of_this_kind() -> None:
         path.relative_to(root).as_posix()
         for room in rooms
         for path in (root / room).rglob("*.py")
-        if re.search(r"(?<!: )\bConsole[,(]|\bget_console\(", path.read_text())
+        if re.search(r"\bConsole\(|\bget_console\(", path.read_text())
     ]
-    assert found == ["asp_env/console.py"]
+    assert found == []

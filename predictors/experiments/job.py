@@ -10,6 +10,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal
 
+from asp_env.console import printable
 from asp_env.data import cache
 from asp_env.data.histories import History, histories
 from asp_env.data.predictor import load_predictor
@@ -199,7 +200,7 @@ def run_job(job: Job) -> float:
         return job.execute()
     except AspEnvError as error:
         sys.stdout.flush()
-        sys.stderr.write(f"asp-env: {' '.join(str(error).split())}\n")
+        sys.stderr.write(f"asp-env: {printable(' '.join(str(error).split()))}\n")
         raise
     except Exception:
         sys.stdout.flush()
