@@ -158,12 +158,13 @@ def reads_past(predictor: Predictor) -> bool:
 
 def feature_size(predictor: Predictor) -> int:
     """Number of features of each target in a predictor's forecasts; 0 if they have none."""
-    return predictor.feature_size if isinstance(predictor, FeaturePredictor) else 0
+    # `isinstance` would compute it twice, at each level of predictors that wrap others.
+    return getattr(predictor, "feature_size", 0)
 
 
 def needs_simulation(predictor: Predictor) -> bool:
     """Whether a predictor is to be given a simulated future."""
-    return isinstance(predictor, InteractivePredictor) and predictor.needs_simulation
+    return getattr(predictor, "needs_simulation", False)
 
 
 @runtime_checkable

@@ -1,6 +1,7 @@
 """Which predictors are evaluated, and which part of DATA they are evaluated on."""
 
 import glob
+import hashlib
 import re
 from collections import Counter
 from collections.abc import Callable, Sequence
@@ -28,6 +29,9 @@ GUARDED = "guarded"
 
 _WRAPPERS = re.compile(r"(delayed:\d+:|most-probable:)*")
 """Names of predictors that change the forecast of another one, before its name."""
+
+LONGEST_LABEL_BYTES = 120
+"""File systems take names of 255 bytes; with a planner, labels are of two of these."""
 
 PartChoice = Literal["auto", "train", "validation", "test", "all"]
 
@@ -139,11 +143,22 @@ def short_names(names: Sequence[str]) -> dict[str, str]:
 
     A label is the name without its run folder (`mtp`), as `split_name` cuts it off. Where that is
     ambiguous, the last part of the folder is added (`mtp 1`), and where that is ambiguous too, the
-    whole path (`mtp a-1`).
+    whole path (`mtp a-1`). Very long ones are shortened, see `file_label`.
     """
     labels = {name: split_name(name)[0] for name in names}
     labels = _lengthen(labels, lambda run: PurePath(run).name)
-    return _lengthen(labels, lambda run: run.strip("/").replace("/", "-"))
+    labels = _lengthen(labels, lambda run: run.strip("/").replace("/", "-"))
+    return {name: file_label(label) for name, label in labels.items()}
+
+
+def file_label(label: str) -> str:
+    """The label, or the begin of a long one with a hash of it: the name of a folder of rollouts."""
+    content = label.encode()
+    if len(content) <= LONGEST_LABEL_BYTES:
+        return label
+    digest = hashlib.sha256(content).hexdigest()[:8]
+    begin = content[: LONGEST_LABEL_BYTES - len(digest) - 4].decode(errors="ignore")
+    return f"{begin}… {digest}"
 
 
 def split_name(name: str) -> tuple[str, str]:

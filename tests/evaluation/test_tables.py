@@ -260,6 +260,15 @@ def test_short_names_are_as_short_as_they_can_be():
     }
 
 
+def test_long_names_have_short_labels_that_differ():
+    """Two runs `1` in folders of 300 characters of 3 bytes each."""
+    names = [f"mtp:{'道' * 300}{end}/1" for end in "ab"]
+    labels = list(short_names(names).values())
+    assert all(label.startswith("mtp 道道") for label in labels)
+    assert max(len(label.encode()) for label in labels) <= 120
+    assert labels[0] != labels[1]
+
+
 def test_short_names_contain_numbers():
     """The numbers of controls and delays are part of the label, and run folders are not."""
     names = {
