@@ -15,7 +15,7 @@ from rich.table import Table
 from tyro.constructors import ConstructorRegistry, PrimitiveConstructorSpec, PrimitiveTypeInfo
 
 from asp_env import registry
-from asp_env.console import printable, text_console
+from asp_env.console import print_with_any_encoding, printable, text_console
 from asp_env.errors import AspEnvError, LeftOutWarning
 from asp_env.installation.version import version_line
 
@@ -89,8 +89,10 @@ def main(argv: Sequence[str] | None = None) -> int:
         The exit status: 0 on success or that of the command, 2 with one line on stderr for bad
         input, 130 when interrupted.
     """
-    if argv is None and "OMP_WAIT_POLICY" not in os.environ:
-        os.environ.setdefault("GOMP_SPINCOUNT", SPIN_COUNT)
+    if argv is None:
+        print_with_any_encoding()
+        if "OMP_WAIT_POLICY" not in os.environ:
+            os.environ.setdefault("GOMP_SPINCOUNT", SPIN_COUNT)
     args = list(sys.argv[1:] if argv is None else argv)
     if args[:1] == [VERSION]:
         sys.stdout.write(f"{version_line()}\n")

@@ -4,8 +4,11 @@ They print text as it is: names of folders, recordings and predictors may hold b
 which rich reads as markup and as emoji otherwise, and characters that control terminals.
 """
 
+import codecs
 import io
 import re
+import sys
+import unicodedata
 from typing import Any
 
 from rich.console import Console
@@ -22,6 +25,35 @@ _CONTROLS = re.compile(r"[\x00-\x08\x0b-\x1f\x7f-\x9f\u200e\u200f\u202a-\u202e\u
 def printable(text: str) -> str:
     r"""The text with escapes such as `\x1b` in the place of characters that control terminals."""
     return _CONTROLS.sub(lambda found: found[0].encode("unicode_escape").decode("ascii"), text)
+
+
+_SIMILAR = str.maketrans({"\u2212": "-", "\u2013": "-", "\u2014": "-", "\u00d7": "x"})
+"""Letters for minus signs, dashes and the sign of multiplication."""
+
+
+def similar(error: UnicodeError) -> tuple[str, int]:
+    """Letters that every encoding has in the place of those that an encoding lacks, else `?`.
+
+    Raises:
+        UnicodeError: the error is not one of encoding.
+    """
+    if not isinstance(error, UnicodeEncodeError):
+        raise error
+    missing = error.object[error.start : error.end].translate(_SIMILAR)
+    letters = unicodedata.normalize("NFKD", missing)
+    shown = (each for each in letters if not unicodedata.combining(each))
+    return "".join(each if each.isascii() else "?" for each in shown), error.end
+
+
+def print_with_any_encoding() -> None:
+    """Makes the standard output and the standard error take text that their encodings lack.
+
+    Terminals and files of other encodings than UTF-8 would end a command at `₃` or `−`.
+    """
+    codecs.register_error("asp_env.similar", similar)
+    for stream in (sys.stdout, sys.stderr):
+        if isinstance(stream, io.TextIOWrapper):
+            stream.reconfigure(errors="asp_env.similar")
 
 
 class _TextConsole(Console):

@@ -1,13 +1,16 @@
 """Commands print names of folders, recordings and predictors as they are."""
 
+import os
 import re
+import subprocess
+import sys
 from pathlib import Path
 
 import pytest
 from rich.table import Table
 
 from asp_env.cli import main
-from asp_env.console import page_console, printable
+from asp_env.console import page_console, printable, similar
 from tests.data.levelx_files import write_folder
 
 NAME = "a[/b] [bold]c:car:$d^$&<e>"
@@ -67,6 +70,26 @@ def test_files_do_not_control_the_terminal(
     assert r"\x1b[32mMon" in printed.out
     assert r"\x1b[31m" in printed.out
     assert r"a\x1b[31m/none does not exist" in printed.err
+
+
+def test_letters_that_an_encoding_lacks_have_similar_ones() -> None:
+    text = "MAE₃ \u22120.03 1\u20132 m² … 道 ü"
+    error = UnicodeEncodeError("ascii", text, 0, len(text), "")
+    assert similar(error) == ("MAE3 -0.03 1-2 m2 ... ? u", len(text))
+
+
+@pytest.mark.parametrize("encoding", ["ascii", "latin-1"])
+def test_a_command_prints_in_encodings_without_some_letters(encoding: str, tmp_path: Path) -> None:
+    """The tables of errors have subscripts."""
+    write_folder(tmp_path / "data", recordings=1)
+    command = [
+        *(sys.executable, "-m", "asp_env.cli", "evaluate", str(tmp_path / "data")),
+        *("--planner", "none", "--predictors", "constant-velocity", "--out", str(tmp_path / "out")),
+    ]
+    environment = {**os.environ, "PYTHONIOENCODING": encoding, "PYTHONUTF8": "0"}
+    done = subprocess.run(command, capture_output=True, env=environment, check=False)
+    assert (done.returncode, done.stderr) == (0, b"")
+    assert b"MAE3" in done.stdout
 
 
 def test_every_console_is_of_this_kind() -> None:
