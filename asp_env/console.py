@@ -48,7 +48,7 @@ def similar(error: UnicodeError) -> tuple[str, int]:
 def print_with_any_encoding() -> None:
     """Makes the standard output and the standard error take text that their encodings lack.
 
-    Terminals and files of other encodings than UTF-8 would end a command at `₃` or `−`.
+    Terminals and files of other encodings than UTF-8 would end a command at `₃`.
     """
     codecs.register_error("asp_env.similar", similar)
     for stream in (sys.stdout, sys.stderr):

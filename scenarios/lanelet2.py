@@ -177,7 +177,7 @@ def write_map(
         members = [("outer", first_way + way) for way in ring]
         tags = {"type": "multipolygon", "subtype": area.subtype}
         parts.append(_relation(number, members, tags))
-    path.write_text("".join([*parts, "</osm>\n"]))
+    path.write_text("".join([*parts, "</osm>\n"]), encoding="utf-8")
 
 
 def _relation(number: int, members: list[tuple[str, int]], tags: dict[str, str]) -> str:

@@ -95,7 +95,7 @@ def write_recording_meta(path: Path, meta: Meta, tracks: list[Track]) -> None:
         *(f"{value:.2f}" for value in meta.utm_origin_m), f"{meta.metres_per_ortho_pixel:.5f}",
     )  # fmt: skip
     rows = (RECORDING_META_COLUMNS, values)
-    path.write_text("".join(",".join(map(str, row)) + "\n" for row in rows))
+    path.write_text("".join(",".join(map(str, row)) + "\n" for row in rows), encoding="utf-8")
 
 
 def write_tracks_meta(path: Path, recording: int, tracks: list[Track]) -> None:
@@ -105,7 +105,7 @@ def write_tracks_meta(path: Path, recording: int, tracks: list[Track]) -> None:
         length, width = track.written_size_m
         frames = f"{track.first_frame},{track.last_frame},{len(track.xy)}"
         rows.append(f"{recording},{number},{frames},{width:.2f},{length:.2f},{track.kind}")
-    path.write_text("\n".join(rows) + "\n")
+    path.write_text("\n".join(rows) + "\n", encoding="utf-8")
 
 
 def write_tracks(path: Path, recording: int, tracks: list[Track]) -> None:
@@ -120,7 +120,7 @@ def write_tracks(path: Path, recording: int, tracks: list[Track]) -> None:
 
         path.write_bytes(lzma.compress(_without_derived(text).encode(), preset=XZ_PRESET))
     else:
-        path.write_text(text)
+        path.write_text(text, encoding="utf-8")
 
 
 def _without_derived(text: str) -> str:

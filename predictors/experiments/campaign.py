@@ -33,7 +33,7 @@ class Costs:
         self._path = path
         self._cells: dict[str, dict[str, float]] = {}
         if path.exists():
-            self._cells = json.loads(path.read_text())["cells"]
+            self._cells = json.loads(path.read_text(encoding="utf-8"))["cells"]
 
     @property
     def total_cpu_s(self) -> float:
@@ -218,6 +218,8 @@ def _reason(error: BaseException, log: Path) -> str:
     """The last line of the log, or the signal that ended the process."""
     if isinstance(error, WorkerExitError) and error.status < 0:
         return f"killed by signal {-error.status}; see {log}"
-    lines = [line.strip() for line in log.read_text(errors="replace").splitlines()]
+    lines = [
+        line.strip() for line in log.read_text(encoding="utf-8", errors="replace").splitlines()
+    ]
     stated = [line.removeprefix("asp-env: ") for line in lines if line]
     return f"{stated[-1] if stated else error}; see {log}"

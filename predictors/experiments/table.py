@@ -425,6 +425,6 @@ def _claimed(out: Path, fixed: dict[str, Any], *, exclusive: bool) -> Iterator[N
 
 def _read_plan(path: Path) -> dict[str, Any]:
     try:
-        return dict(json.loads(path.read_text()))
+        return dict(json.loads(path.read_text(encoding="utf-8")))
     except (TypeError, ValueError) as error:
         raise AspEnvError(f"{path}: cannot be read ({error}); choose another --out") from error

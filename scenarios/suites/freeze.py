@@ -66,7 +66,7 @@ def freeze(folder: Path, path: Path) -> None:
     found = choose_scenarios(recordings, FILTER, dt_s=DEFAULT_DT_S, history=history)
     save_scenarios(path, found.evenly_spaced(MOST_SCENARIOS), recordings)
     facts = json.dumps({"suite": json.loads((folder / MADE).read_text())})
-    path.write_text(facts[:-1] + ", " + path.read_text()[1:])
+    path.write_text(facts[:-1] + ", " + path.read_text(encoding="utf-8")[1:], encoding="utf-8")
 
 
 if __name__ == "__main__":

@@ -247,7 +247,7 @@ def simulate(
 
 def _positions(path: Path) -> pd.DataFrame:
     columns = ["time", "name", "x", "y"]
-    with path.open() as lines:
+    with path.open(encoding="utf-8") as lines:
         empty = lines.readline().count(";") < len(columns) - 1
     if empty:
         return pd.DataFrame({column: [] for column in columns})
