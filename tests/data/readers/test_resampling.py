@@ -57,7 +57,7 @@ def circling(time_s: np.ndarray) -> np.ndarray:
 @pytest.mark.parametrize("rate_hz", RATES_HZ)
 @pytest.mark.parametrize("first", [0, 7])
 def test_constant_acceleration_is_exact(rate_hz: float, first: int) -> None:
-    """All but single precision: positions to 10 µm, headings and speeds to 1e-6."""
+    """All but single precision: positions to 0.01 mm, headings and speeds to 1e-6."""
     frames = first + np.arange(int(5 * rate_hz))
     table = table_of(braking(frames / rate_hz), first_frames=(first,))
     found = resample(table, rate_hz, 20.0)
