@@ -15,7 +15,7 @@ from typing import Any
 
 import jaxtyping
 
-CHECKED_CALLS = 5
+CHECKED_CALLS = 3
 
 _calls: Counter[object] = Counter()
 _check_every_call = jaxtyping.jaxtyped
