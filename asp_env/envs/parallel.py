@@ -218,11 +218,13 @@ class ParallelReplayEnv(ParallelEnv[str, Any, Any]):
     that are present during the whole history and move by at least 1 m until the scenario, or their
     own track, ends. Vehicles that stand all the time or appear later are traffic.
 
-    `possible_agents` never changes: it has as many agents as the scenario with the most agents.
-    After `reset`, `agents` are the first of them, as many as the scenario has. An agent is present
-    until its episode ends, and absent from then on. Without `pad_absent`, `agents` are the present
-    ones, and the list shrinks. With `pad_absent`, `agents` are all of `possible_agents` until no
-    agent is present, for tools that need a fixed population.
+    `possible_agents` never changes: it has as many agents as the scenario with the most agents. The
+    first of them, as many as the scenario has, are present. An agent is present until its episode
+    ends, and absent from then on. After `reset`, `agents` are all of `possible_agents`, as tools
+    for PettingZoo expect; those that the scenario does not have are terminated in the first step,
+    with zeros as observations and the reward 0. From then on, `agents` are the present ones, and
+    the list shrinks. With `pad_absent`, `agents` are all of `possible_agents` until no agent is
+    present, for tools that need a fixed population. `present_agents` are the present ones.
 
     ## Action Space
     That of `ReplayEnv` for each agent.
@@ -389,7 +391,7 @@ entry is a vector, images stay images |
         self._episodes.begin([*views, *padding], [rng] * self._max_agents, reset_mask)
         self._in_episode = self.possible_agents[: len(views)]
         self._present = self._in_episode.copy()
-        self.agents = (self.possible_agents if self._pad_absent else self._present).copy()
+        self.agents = self.possible_agents.copy()
         return self._observe(), self._infos()
 
     def step(
@@ -441,6 +443,8 @@ entry is a vector, images stay images |
             all_terminated = terminated[present].all()
             terminated = np.where(present, terminated, all_terminated) & (not remaining)
             truncated = np.where(present, truncated, ~all_terminated) & (not remaining)
+        else:  # those that the scenario does not have end in the first step
+            terminated, truncated = terminated | ~present, truncated & present
         returned = (
             self._observe(),
             self._by_agent(np.where(present, result.reward, 0.0)),
@@ -469,6 +473,11 @@ entry is a vector, images stay images |
                 f"{', '.join(self._in_episode)}"
             )
         return self._episodes.scene().situation(self._rows[agent])
+
+    @property
+    def present_agents(self) -> list[str]:
+        """The agents that are present now, in the order of `possible_agents`."""
+        return self._present.copy()
 
     def state(self) -> Float[np.ndarray, "agents 7"]:
         """Returns the states of all possible agents in the recording's frame.
@@ -557,6 +566,7 @@ entry is a vector, images stay images |
         observed = self._episodes.observe(rows)
         if self._pad_absent:
             observed[PRESENT] = np.ones((len(rows), 1), dtype=np.int8)
+        if len(self.agents) > len(rows):
             observed = {
                 name: _pad(values, rows, self._max_agents) for name, values in observed.items()
             }
@@ -577,14 +587,13 @@ entry is a vector, images stay images |
                 if isinstance(values, np.ndarray) and values.dtype != object
             }
         infos = {agent: info_of(rows, self._rows[agent]) for agent in self.agents}
-        if self._pad_absent:
+        if len(self.agents) > len(self._present):
             empty = _empty(infos[self._present[0]])
-            present = set(self._present)
-            infos = {
-                agent: (info if agent in present else copy.deepcopy(empty))
-                | {PRESENT: agent in present}
-                for agent, info in infos.items()
-            }
+            for agent in set(self.agents).difference(self._present):
+                infos[agent] = copy.deepcopy(empty)
+        if self._pad_absent:
+            for agent, info in infos.items():
+                info[PRESENT] = agent in self._present
         return infos
 
     def _by_agent(self, values: np.ndarray) -> dict[str, Any]:

@@ -54,12 +54,6 @@ def queue(tmp_path_factory: pytest.TempPathFactory) -> str:
     return str(write_crossing(folder, drives=(drives,)))
 
 
-FEWER_AGENTS = pytest.mark.filterwarnings("ignore:No agents present but not all possible_agents")
-"""PettingZoo's test warns of episodes that do not have all possible agents, which its interface
-allows; with `pad_absent` there are none."""
-
-
-@FEWER_AGENTS
 @pytest.mark.parametrize(
     "options",
     [{"observations": COMPONENTS}, {"traffic": "idm", "classes": ("car", "van"), "max_agents": 3}],
@@ -77,7 +71,6 @@ def test_pettingzoo_tests_pass_without_warnings_with_padding(crossing, options):
     parallel_seed_test(lambda: _make(crossing, pad_absent=True, **options), num_cycles=5)
 
 
-@FEWER_AGENTS
 @pytest.mark.filterwarnings("ignore:Observation numpy array is all zeros")
 @pytest.mark.parametrize("pad_absent", [False, True])
 def test_the_conversion_to_agents_in_turn_passes(crossing, pad_absent):
@@ -94,11 +87,40 @@ def test_possible_agents_never_change(crossing):
     for scenario in range(len(env.scenarios)):
         env.reset(options={"scenario": scenario})
         padded.reset(options={"scenario": scenario})
-        assert env.possible_agents == padded.possible_agents == padded.agents == possible
-        assert env.agents == possible[: len(env.agents)]
-        counts.add(len(env.agents))
+        assert env.possible_agents == padded.possible_agents == possible
+        assert env.agents == padded.agents == possible
+        assert env.present_agents == possible[: len(env.present_agents)]
+        counts.add(len(env.present_agents))
     assert len(counts) > 1
     assert max(counts) <= len(possible)
+
+
+def _absent(env: ParallelReplayEnv) -> list[str]:
+    return [agent for agent in env.possible_agents if agent not in env.present_agents]
+
+
+@pytest.mark.parametrize("flatten", [False, True, "parts"])
+def test_agents_that_the_scenario_does_not_have_end_in_the_first_step(crossing, flatten):
+    """With zeros, the reward 0 and infos with the keys of others, whatever their actions are."""
+    env = _make(crossing, flatten=flatten)
+    for scenario in range(len(env.scenarios)):
+        first = env.reset(options={"scenario": scenario})
+        if absent := _absent(env):
+            break
+    assert env.agents == env.possible_agents
+    seen, rewards, terminated, truncated, infos = env.step(dict.fromkeys(env.agents, np.ones(2)))
+    for observations, about in (first, (seen, infos)):
+        assert list(observations) == list(about) == env.possible_agents
+        for agent in absent:
+            observation = observations[agent]
+            assert env.observation_space(agent).contains(observation)
+            parts = observation.values() if isinstance(observation, dict) else [observation]
+            assert not any(np.any(part) for part in parts)
+            assert about[agent].keys() == about["vehicle_0"].keys()
+    for agent in absent:
+        assert (rewards[agent], terminated[agent], truncated[agent]) == (0.0, True, False)
+    assert env.agents == env.present_agents
+    assert not set(absent) & set(env.step(_zero_actions(env))[0])
 
 
 def test_a_step_without_actions_after_the_end_returns_five_empty_dicts(queue):
@@ -209,7 +231,6 @@ def test_flat_observations_are_those_of_gymnasium(crossing, pad_absent):
         seen, flat = one.step(_zero_actions(one))[0], other.step(_zero_actions(other))[0]
 
 
-@FEWER_AGENTS
 @pytest.mark.data
 def test_pettingzoo_test_passes_on_real_traffic():
     """Karlsruhe, with waiting, crossing and parked agents."""
@@ -233,7 +254,7 @@ def test_agents_observe_as_egos_of_the_single_environment(crossing):
     compared = 0
     for scenario in range(len(env.scenarios)):
         seen, infos = env.reset(options={"scenario": scenario})
-        for agent in env.agents:
+        for agent in env.present_agents:
             start = {
                 "scenario": scenario,
                 "ego": int(infos[agent]["scenario"].split("-")[1]),
@@ -304,7 +325,7 @@ def test_standing_vehicles_are_traffic(tmp_path):
     )
     env = _make(str(write_crossing(tmp_path, drives=(drives,))))
     env.reset(options={"scenario": 0})
-    assert env.agents == ["vehicle_0"]
+    assert env.present_agents == ["vehicle_0"]
     assert list(_states(env, "vehicle_0")) == [1, 2]
 
 
@@ -350,7 +371,7 @@ def test_selection_of_agents(crossing):
         env = _make(crossing, classes=classes)
         for scenario in range(len(env.scenarios)):
             env.reset(options={"scenario": scenario})
-            assert {int(env.scene(agent).classes[0, 0]) for agent in env.agents} <= kinds
+            assert {int(env.scene(agent).classes[0, 0]) for agent in env.present_agents} <= kinds
             assert env.scene("vehicle_0").ids[0, 0] == env.scenarios[scenario].ego_id
         assert 0 < len(env.scenarios) < len(unrestricted.scenarios)
     few = _make(crossing, ids=(1, 3))
@@ -361,10 +382,10 @@ def test_selection_of_agents(crossing):
         pair.reset(options={"scenario": scenario})
         unrestricted.reset(options={"scenario": scenario})
         ego, *others = (
-            unrestricted.scene(agent).states[0, 0, -1, :2] for agent in unrestricted.agents
+            unrestricted.scene(agent).states[0, 0, -1, :2] for agent in unrestricted.present_agents
         )
         away = [math.dist(ego, other) for other in others]
-        if "vehicle_1" in pair.agents:
+        if "vehicle_1" in pair.present_agents:
             second = pair.scene("vehicle_1").states[0, 0, -1, :2]
             assert math.dist(ego, second) == min(away)
 
