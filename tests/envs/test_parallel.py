@@ -95,18 +95,19 @@ def test_possible_agents_never_change(crossing):
     assert max(counts) <= len(possible)
 
 
-def _absent(env: ParallelReplayEnv) -> list[str]:
-    return [agent for agent in env.possible_agents if agent not in env.present_agents]
+def _num_present(env: ParallelReplayEnv, scenario: int) -> int:
+    env.reset(options={"scenario": scenario})
+    return len(env.present_agents)
 
 
 @pytest.mark.parametrize("flatten", [False, True, "parts"])
 def test_agents_that_the_scenario_does_not_have_end_in_the_first_step(crossing, flatten):
     """With zeros, the reward 0 and infos with the keys of others, whatever their actions are."""
     env = _make(crossing, flatten=flatten)
-    for scenario in range(len(env.scenarios)):
-        first = env.reset(options={"scenario": scenario})
-        if absent := _absent(env):
-            break
+    fewest = min(range(len(env.scenarios)), key=lambda number: _num_present(env, number))
+    first = env.reset(options={"scenario": fewest})
+    absent = [agent for agent in env.agents if agent not in env.present_agents]
+    assert absent
     assert env.agents == env.possible_agents
     seen, rewards, terminated, truncated, infos = env.step(dict.fromkeys(env.agents, np.ones(2)))
     for observations, about in (first, (seen, infos)):
